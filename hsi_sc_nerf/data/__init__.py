@@ -1,0 +1,1 @@
+"""From raw ENVI cubes to a packed dataset, and from there to training batches."""

@@ -1,0 +1,1 @@
+"""Spatial scores and pictures to check a reconstruction by."""

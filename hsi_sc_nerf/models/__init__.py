@@ -1,0 +1,1 @@
+"""Losses, metrics, the model and its two-stage training."""

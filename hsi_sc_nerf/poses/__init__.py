@@ -1,0 +1,1 @@
+"""Camera poses from a camera that stands still before a turntable."""

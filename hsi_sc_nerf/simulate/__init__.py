@@ -1,0 +1,1 @@
+"""Turntable sessions with known truth, rendered from a scene file."""
