@@ -1,0 +1,89 @@
+"""Nerfacto's field with a spectrum instead of a colour: the variant C1, sigma0 of HS-NeRF that the paper follows.
+
+One density that does not depend on wavelength (paper, section "Model Formulation"), and an n-channel radiance that
+depends on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.field_components.activations import trunc_exp
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.fields.density_fields import HashMLPDensityField
+from nerfstudio.fields.nerfacto_field import NerfactoField
+from torch import Tensor, nn
+
+from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
+
+
+def _positions_in_box(
+    ray_samples: RaySamples, aabb: Float[Tensor, "2 3"]
+) -> tuple[Float[Tensor, "*bs 3"], Float[Tensor, "*bs 1"]]:
+    """Sample positions in [0, 1]^3 of the scene box, and 1 inside it, 0 outside (where positions are zeroed)."""
+    positions = SceneBox.get_normalized_positions(ray_samples.frustums.get_positions(), aabb)
+    inside = ((positions > 0.0) & (positions < 1.0)).all(dim=-1, keepdim=True)
+    return positions * inside, inside.to(positions)
+
+
+class SpectralField(NerfactoField):
+    """Nerfacto's field whose radiance head has one channel a band; bounded by the scene box, no contraction.
+
+    Args:
+        aabb: scene box, (2, 3), scene units.
+        num_bands: channels of the radiance.
+        hidden_dim_color: width of the radiance head.
+        num_layers_color: layers of the radiance head.
+        **nerfacto: everything else that `NerfactoField` takes.
+    """
+
+    def __init__(
+        self,
+        aabb: Float[Tensor, "2 3"],
+        num_bands: int,
+        hidden_dim_color: int = 64,
+        num_layers_color: int = 3,
+        **nerfacto,
+    ) -> None:
+        super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
+        self.mlp_head = MLP(
+            in_dim=self.direction_encoding.get_out_dim() + self.geo_feat_dim + self.appearance_embedding_dim,
+            num_layers=num_layers_color,
+            layer_width=hidden_dim_color,
+            out_dim=num_bands,
+            activation=nn.ReLU(),
+            out_activation=nn.Sigmoid(),
+            implementation="torch",
+        )
+        fuse_hash_encodings(self)
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
+        """Density and geometry features; positions carry a gradient only where normals are asked for."""
+        positions, inside = _positions_in_box(ray_samples, self.aabb)
+        if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
+            positions.requires_grad_()
+        self._sample_locations = positions
+        hidden = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
+        before_activation, features = torch.split(hidden, [1, self.geo_feat_dim], dim=-1)
+        self._density_before_activation = before_activation
+        density = self.average_init_density * trunc_exp(before_activation.to(positions)) * inside
+        return density, features
+
+    def density_gradient(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Gradient of the log density at points in scene units; its negative points out of the surface."""
+        extent = self.aabb[1] - self.aabb[0]
+        with torch.enable_grad():
+            normalised = ((positions - self.aabb[0]) / extent).detach().requires_grad_()
+            log_density = self.mlp_base(normalised)[:, 0]
+            (gradient,) = torch.autograd.grad(log_density.sum(), normalised)
+        return gradient / extent
+
+
+class SpectralProposalField(HashMLPDensityField):
+    """Nerfacto's proposal density with the fused hash grid."""
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        fuse_hash_encodings(self)

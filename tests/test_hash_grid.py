@@ -1,0 +1,42 @@
+import pytest
+import torch
+from nerfstudio.field_components.encodings import HashEncoding
+
+from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+
+
+def _pair(device):
+    torch.manual_seed(0)
+    options = {"num_levels": 5, "min_res": 4, "max_res": 61, "log2_hashmap_size": 9, "implementation": "torch"}
+    reference, fused = HashEncoding(**options), FusedHashEncoding(**options)
+    fused.load_state_dict(reference.state_dict())
+    return reference.to(device), fused.to(device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_fused_grid_equals_nerfstudio(device):
+    reference, fused = _pair(device)
+    x = torch.rand(200, 3, device=device)
+    torch.testing.assert_close(fused.pytorch_fwd(x), reference.pytorch_fwd(x), rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_equal_nerfstudio(device):
+    reference, fused = _pair(device)
+    upstream = torch.randn(200, reference.get_out_dim(), device=device)
+    gradients = []
+    for encoding in (reference, fused):
+        x = torch.rand(200, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+        (encoding.pytorch_fwd(x) * upstream).sum().backward()
+        gradients.append((encoding.hash_table.grad, x.grad))
+    torch.testing.assert_close(gradients[1][0], gradients[0][0], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(gradients[1][1], gradients[0][1], rtol=1e-3, atol=1e-5)
+
+
+def test_fuse_replaces_torch_encodings_only():
+    module = torch.nn.Sequential(_pair("cpu")[0], torch.nn.Linear(10, 2))
+    fuse_hash_encodings(module)
+    assert type(module[0]) is FusedHashEncoding
+    assert type(module[1]) is torch.nn.Linear
