@@ -1,0 +1,178 @@
+"""Numerically safe norms, ratios, roots, logarithms and spectral angles (torch); losses and metrics rest on these.
+
+Two rules hold for every function here:
+
+- The arithmetic runs in a wider type, float32 for float16 and float64 for float32 and bfloat16, so that squares,
+  products and reciprocals of any finite input neither overflow nor vanish and nothing cancels. Results are float32
+  (float64 for float64 input). Float64 input has nothing wider: it is good for magnitudes of 1e-150 to 1e150.
+- Finite input gives finite values and finite gradients; what would leave the range of its type stops at the largest
+  number of that type. NaN and infinity in the input are not hidden: they come out as they would anywhere else.
+
+A **zero spectrum** has no direction. Its cosine with anything is taken as 0, as in the paper's formulas with their
+small constant in the denominator: the spectral angle is pi / 2, one minus the cosine is 1, and the gradient is 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def _wider(dtype: torch.dtype) -> torch.dtype:
+    return torch.float32 if dtype == torch.float16 else torch.float64
+
+
+def _within_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Cast to ``dtype``; finite values beyond its range become its largest number, non-finite ones stay."""
+    if values.dtype == dtype:
+        return values
+    largest = torch.finfo(dtype).max
+    return torch.where(values.isfinite(), values.clamp(-largest, largest), values).to(dtype)
+
+
+class _Widen(torch.autograd.Function):
+    """Cast to the wider type; the gradient is cast back without overflowing."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor) -> Tensor:
+        ctx.dtype = values.dtype
+        return values.to(_wider(values.dtype))
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        return _within_range(gradient, ctx.dtype)
+
+
+def widen(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Cast to the type that safe arithmetic runs in: float32 for float16, else float64.
+
+    A gradient that flows back stays within the range of the type of ``values``.
+    """
+    return _Widen.apply(values)
+
+
+def narrow(values: Float[Tensor, "*shape"], *inputs: Tensor) -> Float[Tensor, "*shape"]:
+    """Cast a result to float32, or to float64 if one of the ``inputs`` it came from was float64.
+
+    Finite values beyond the range become the largest number of the type.
+    """
+    double = any(source.dtype == torch.float64 for source in inputs)
+    return _within_range(values, torch.float64 if double else torch.float32)
+
+
+def _root(values: Tensor) -> Tensor:
+    positive = values > 0
+    return torch.where(positive, torch.where(positive, values, 1.0).sqrt(), 0.0 * values)
+
+
+def safe_sqrt(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Square root; 0 with gradient 0 for 0 and for what rounding made negative."""
+    return narrow(_root(widen(values)), values)
+
+
+def safe_norm(values: Float[Tensor, "*shape"], dim: int = -1, keepdim: bool = False) -> Float[Tensor, "*rest"]:
+    """Euclidean norm along ``dim``; its gradient at the zero vector is 0."""
+    return narrow(_root(widen(values).square().sum(dim, keepdim)), values)
+
+
+def safe_ratio(
+    numerator: Float[Tensor, "*shape"],
+    denominator: Float[Tensor, "*shape"],
+    minimum: float = 0.0,
+    fallback: float = 0.0,
+) -> Float[Tensor, "*shape"]:
+    """``numerator / denominator`` where ``|denominator| > minimum``, else ``fallback`` with gradient 0.
+
+    The shapes broadcast. A dead band of a white reference, for instance, divides nothing.
+    """
+    wide = widen(denominator)
+    usable = ~(wide.abs() <= minimum)
+    ratio = torch.where(usable, widen(numerator), fallback) / torch.where(usable, wide, 1.0)
+    return narrow(ratio, numerator, denominator)
+
+
+def safe_log10(values: Float[Tensor, "*shape"], minimum: float = 1e-30) -> Float[Tensor, "*shape"]:
+    """Base-10 logarithm of ``max(values, minimum)``; the gradient is 0 below ``minimum`` (> 0)."""
+    wide = widen(values)
+    below = wide <= minimum
+    return narrow(torch.where(below, math.log10(minimum), torch.where(below, 1.0, wide).log10()), values)
+
+
+def _direction(spectra: Tensor, dim: int, norm_floor: float) -> tuple[Tensor, Tensor]:
+    """Spectra divided by max(norm, floor), and by how much their squared length falls short of 1 (``dim`` kept).
+
+    The shortfall is exactly 0 for spectra at or above the floor, whatever the rounding of the division.
+    """
+    squared = spectra.square().sum(dim, keepdim=True)
+    zero = squared == 0
+    norm = torch.where(zero, 1.0, squared).sqrt().clamp_min(norm_floor)
+    direction = torch.where(zero, 0.0 * spectra, spectra / norm)
+    short = zero | (squared < norm_floor**2)
+    return direction, torch.where(short, 1.0 - direction.square().sum(dim, keepdim=True), 0.0)
+
+
+def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: int = -1) -> Float[Tensor, "*rest"]:
+    """Angle between spectra along ``dim``, radians in [0, pi] (Kruse et al. 1993; paper, Eq. SAM).
+
+    Not from the arc cosine, whose rounding hides angles below 3e-4 in float32, but from the difference and the sum
+    of the unit vectors, ``2 atan2(|u - v|, |u + v|)`` (Kahan, "How Futile are Mindless Assessments of Roundoff",
+    2006), which is accurate at every angle and does not depend on the spectra's scale. Against a zero spectrum the
+    angle is pi / 2. The gradient is 0 where the spectra are parallel, opposite or zero.
+    """
+    u, u_short = _direction(widen(a), dim, 0.0)
+    v, v_short = _direction(widen(b), dim, 0.0)
+    undirected = ((u_short > 0) | (v_short > 0)).squeeze(dim)
+    difference = _root((u - v).square().sum(dim))
+    total = torch.where(undirected, 1.0, _root((u + v).square().sum(dim)))
+    angle = torch.where(undirected, math.pi / 2, 2.0 * torch.atan2(difference, total))
+    return narrow(angle, a, b)
+
+
+def one_minus_cosine(
+    a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: int = -1, norm_floor: float = 0.0
+) -> Float[Tensor, "*rest"]:
+    """One minus the cosine of the spectral angle along ``dim``, in [0, 2], without cancellation: ``|u - v|² / 2``.
+
+    Args:
+        a: Spectra.
+        b: Spectra of the same shape.
+        dim: The dimension that holds the bands.
+        norm_floor: Norms below this count as this, which bounds the gradient, 1 / norm otherwise. Such a spectrum's
+            cosine shrinks to 0 with it. Spectra above the floor are not touched: scale does not matter.
+    """
+    u, u_short = _direction(widen(a), dim, norm_floor)
+    v, v_short = _direction(widen(b), dim, norm_floor)
+    return narrow(0.5 * ((u - v).square().sum(dim) + (u_short + v_short).squeeze(dim)), a, b)
+
+
+def select_pixels(
+    values: Float[Tensor, "*pixels bands"], mask: Bool[Tensor, "*pixels"] | None
+) -> Float[Tensor, "n bands"]:
+    """The spectra of the pixels that the mask selects (all without one), one a row.
+
+    What is left out, NaN included, touches neither values nor gradients of what follows.
+
+    Raises:
+        ValueError: the mask is not boolean, or its shape is not that of the pixels.
+    """
+    if mask is None:
+        return values.reshape(-1, values.shape[-1])
+    if mask.dtype != torch.bool or mask.shape != values.shape[:-1]:
+        raise ValueError(
+            f"a mask for spectra of shape {tuple(values.shape)} is boolean with shape {tuple(values.shape[:-1])}, "
+            f"not {mask.dtype} with shape {tuple(mask.shape)}"
+        )
+    return values[mask]
+
+
+def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | None = None) -> Float[Tensor, ""]:
+    """Mean over the selected values (all without a mask); 0 with gradient 0 where nothing is selected.
+
+    Raises:
+        ValueError: the mask is not boolean, or its shape is not that of the values.
+    """
+    selected = widen(select_pixels(values[..., None], mask))
+    return narrow(selected.sum() / max(selected.numel(), 1), values)

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hsi_sc_nerf.models.losses import DIRECTION_FLOOR, angular_loss, hsi_loss
+
+LOSSES = [hsi_loss, angular_loss]
+
+
+def pair(shape: tuple[int, ...] = (5, 6, 31)) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
+
+
+def half_mask() -> torch.Tensor:
+    return (torch.arange(30) % 3 == 0).reshape(5, 6)
+
+
+@pytest.mark.parametrize("mask", [None, half_mask()], ids=["all", "masked"])
+def test_losses_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    squares, angles = [], []
+    for row in range(5):
+        for column in range(6):
+            if mask is not None and not mask[row, column]:
+                continue
+            p, t = predicted[row, column].double().numpy(), target[row, column].double().numpy()
+            squares.append(np.sum((p - t) ** 2) / 31)
+            angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
+    assert hsi_loss(predicted, target, mask).item() == pytest.approx(np.mean(squares), rel=1e-6)
+    assert angular_loss(predicted, target, mask).item() == pytest.approx(np.mean(angles), rel=1e-6)
+
+
+def test_hsi_loss_does_not_depend_on_the_number_of_bands() -> None:
+    for bands in (1, 204):
+        assert hsi_loss(torch.full((7, bands), 0.5), torch.full((7, bands), 0.3)).item() == pytest.approx(0.04)
+
+
+def test_angular_loss_knows_shape_only() -> None:
+    predicted, target = pair()
+    assert angular_loss(0.3 * target, target).item() == pytest.approx(0, abs=1e-12)
+    assert angular_loss(-target, target).item() == pytest.approx(2)
+    assert angular_loss(0.01 * predicted, target).item() == pytest.approx(angular_loss(predicted, target).item())
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_match_finite_differences(loss) -> None:
+    predicted, target = (values.double() for values in pair((2, 3, 5)))
+    mask = torch.tensor([[True, False, True], [True, True, False]])
+    assert torch.autograd.gradcheck(lambda values: loss(values, target, mask), (predicted.requires_grad_(),))
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_an_empty_mask_costs_nothing(loss) -> None:
+    predicted, target = pair()
+    predicted.requires_grad_()
+    value = loss(predicted, target, torch.zeros(5, 6, dtype=torch.bool))
+    value.backward()
+    assert value.item() == 0
+    assert not predicted.grad.any()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_pixels_outside_the_mask_may_be_anything(loss) -> None:
+    predicted, target = pair()
+    expected = loss(predicted, target, half_mask())
+    target[~half_mask()] = float("nan")
+    predicted.requires_grad_()
+    value = loss(predicted, target, half_mask())
+    value.backward()
+    assert value.item() == expected.item()
+    assert torch.isfinite(predicted.grad).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-30, 1e-6, 1.0, 6e4, 1e30, 3e38])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_and_gradients_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
+    predicted, target = pair()
+    largest = torch.finfo(dtype).max
+    predicted = (scale * predicted.double()).clamp(max=largest).to(dtype).requires_grad_()
+    for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
+        predicted.grad = None
+        value = loss(predicted, against)
+        value.backward()
+        assert value.dtype == torch.float32
+        assert torch.isfinite(value)
+        assert torch.isfinite(predicted.grad).all()
+
+
+def test_a_dark_spectrum_pulls_no_harder_than_the_floor_allows() -> None:
+    target = torch.rand(1, 204)
+    for scale in (0.0, 1e-30, 1e-7, 1e-5):
+        predicted = torch.full((1, 204), scale, requires_grad=True)
+        angular_loss(predicted, target).backward()
+        assert predicted.grad.norm().item() <= 1.001 / (DIRECTION_FLOOR * math.sqrt(204))
+    assert angular_loss(torch.zeros(1, 204), target).item() == 1
+
+
+def test_non_finite_predictions_are_not_hidden() -> None:
+    predicted, target = pair()
+    for bad in (float("nan"), float("inf")):
+        predicted[0, 0, 0] = bad
+        assert not torch.isfinite(hsi_loss(predicted, target))
+        assert not torch.isfinite(angular_loss(predicted, target))
