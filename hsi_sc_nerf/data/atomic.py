@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
 
 from hsi_sc_nerf.errors import InputError
 
@@ -36,3 +42,25 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
     finally:
         for source in temporary:
             source.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write ``content`` as readable JSON, whole or not at all.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    with atomic_write(path) as (temporary,):
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:
+    """Write an 8-bit gray or RGB picture, whole or not at all.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(in_opencv_order))
+    with atomic_write(path) as (temporary,):
+        temporary.write_bytes(encoded.tobytes())

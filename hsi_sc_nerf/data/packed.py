@@ -1,0 +1,244 @@
+"""The packed dataset on disk (docs/architecture.md): calibrated frames that training reads pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.data.envi import open_cube, write_cube
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+
+# Reflectance 1 in the packed cubes' uint16, as their headers say ("reflectance scale factor").
+REFLECTANCE_SCALE = 65535
+TRANSFORMS_NAME = "transforms.json"
+
+
+@dataclass(frozen=True)
+class Container:
+    """The upright cylinder that the object stands on, metres."""
+
+    diameter_m: float
+    height_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class PackedFrame:
+    """One frame: paths and pose; pixels are read on request.
+
+    Attributes:
+        capture: name of the capture it was made from.
+        image_path: pseudo-RGB picture.
+        mask_path: foreground mask.
+        cube_path: header of the reflectance cube.
+        angle_deg: the turntable's angle relative to the first frame, counter-clockwise seen from above.
+        reprojection_error_px: root mean square of the marker corners in this frame.
+        camera_to_world: pose in the object frame, OpenGL axes, metres.
+    """
+
+    capture: str
+    image_path: Path
+    mask_path: Path
+    cube_path: Path
+    angle_deg: float
+    reprojection_error_px: float
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+    def cube(self) -> UInt16[np.ndarray, "lines samples bands"]:
+        """Memory map of reflectance times ``REFLECTANCE_SCALE``."""
+        return open_cube(self.cube_path).memmap()
+
+    def mask(self) -> Bool[np.ndarray, "lines samples"]:
+        """True on the object."""
+        mask = cv2.imread(str(self.mask_path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise InputError(f"{self.mask_path}: is no readable mask; process the session again.")
+        return mask > 127
+
+    def pseudo_rgb(self) -> UInt8[np.ndarray, "lines samples 3"]:
+        """The pseudo-RGB picture."""
+        image = cv2.imread(str(self.image_path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise InputError(f"{self.image_path}: is no readable picture; process the session again.")
+        return image[..., ::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class PackedDataset:
+    """What ``transforms.json`` says.
+
+    Attributes:
+        root: the dataset's folder.
+        intrinsics: of the one camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        wavelengths_nm: band centres.
+        pseudo_rgb_nm: the three bands of the pictures.
+        object_name: what was on the turntable.
+        scene_box_m: minimum and maximum of everything that turns, object frame.
+        object_box_m: minimum and maximum of the object alone, object frame.
+        background_reflectance: median spectrum of the chamber behind the object.
+        container: what the object stands on, if its size is known.
+        frames: in capture order.
+        fingerprint: of the session and the settings that this was made from.
+    """
+
+    root: Path
+    intrinsics: PinholeIntrinsics
+    distortion: Float[np.ndarray, "4"]
+    wavelengths_nm: Float[np.ndarray, "bands"]
+    pseudo_rgb_nm: Float[np.ndarray, "3"]
+    object_name: str
+    scene_box_m: Float[np.ndarray, "2 3"]
+    object_box_m: Float[np.ndarray, "2 3"]
+    background_reflectance: Float[np.ndarray, "bands"]
+    container: Container | None
+    frames: tuple[PackedFrame, ...]
+    fingerprint: str | None = None
+
+    @property
+    def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
+        """All poses, in frame order."""
+        return np.stack([frame.camera_to_world for frame in self.frames])
+
+
+def is_packed(path: Path) -> bool:
+    """Whether ``path`` is the folder (or the ``transforms.json``) of a packed hyperspectral dataset."""
+    try:
+        return "wavelengths_nm" in json.loads(_transforms_path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def open_packed(path: Path) -> PackedDataset:
+    """Open a packed dataset by its folder or its ``transforms.json``.
+
+    Raises:
+        InputError: there is no ``transforms.json``, it is no JSON, a key is missing or unreadable, no frame is
+            listed, or a frame's file is missing.
+    """
+    path = _transforms_path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no packed dataset here; make one with `hsi-sc-nerf process`.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        dataset = _parse_transforms(path.parent, content)
+    except KeyError as error:
+        raise InputError(f"{path}: lacks the key {error}; process the session again.") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); process the session again.") from error
+    if not dataset.frames:
+        raise InputError(f"{path}: lists no frames; process the session again.")
+    for frame in dataset.frames:
+        for file in (frame.image_path, frame.mask_path, frame.cube_path):
+            if not file.is_file():
+                raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
+    return dataset
+
+
+def write_transforms(dataset: PackedDataset) -> Path:
+    """Write ``transforms.json`` into the dataset's folder, whole or not at all, and return its path.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+
+    def relative(path: Path) -> str:
+        return path.relative_to(dataset.root).as_posix()
+
+    k1, k2, p1, p2 = (float(c) for c in dataset.distortion)
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        **asdict(dataset.intrinsics),
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "object": dataset.object_name,
+        "pseudo_rgb_nm": dataset.pseudo_rgb_nm.tolist(),
+        "scene_box_m": dataset.scene_box_m.tolist(),
+        "object_box_m": dataset.object_box_m.tolist(),
+        "container": None if dataset.container is None else asdict(dataset.container),
+        "fingerprint": dataset.fingerprint,
+        "wavelengths_nm": dataset.wavelengths_nm.tolist(),
+        "background_reflectance": dataset.background_reflectance.tolist(),
+        "frames": [
+            {
+                "file_path": relative(frame.image_path),
+                "mask_path": relative(frame.mask_path),
+                "cube_path": relative(frame.cube_path),
+                "capture": frame.capture,
+                "angle_deg": float(frame.angle_deg),
+                "reprojection_error_px": float(frame.reprojection_error_px),
+                "transform_matrix": frame.camera_to_world.tolist(),
+            }
+            for frame in dataset.frames
+        ],
+    }
+    path = _transforms_path(dataset.root)
+    write_json(path, content)
+    return path
+
+
+def write_packed_cube(
+    header_path: Path,
+    reflectance: Float[np.ndarray, "lines samples bands"],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+) -> None:
+    """Write reflectance in [0, 1] as a 16-bit BIP ENVI cube (rounded to 1 / ``REFLECTANCE_SCALE``).
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    counts = np.clip(reflectance, 0.0, 1.0)
+    counts *= REFLECTANCE_SCALE
+    write_cube(
+        header_path,
+        np.rint(counts, out=counts).astype(np.uint16),
+        wavelengths_nm=wavelengths_nm,
+        interleave="bip",
+        data_suffix=".bip",
+        extra_header={"reflectance scale factor": REFLECTANCE_SCALE},
+    )
+
+
+def _transforms_path(path: Path) -> Path:
+    path = Path(path)
+    return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
+
+
+def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
+    intrinsics = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
+    container = content["container"]
+    wavelengths_nm = np.array(content["wavelengths_nm"], dtype=float)
+    return PackedDataset(
+        root=root,
+        intrinsics=PinholeIntrinsics(**intrinsics),
+        distortion=np.array([content[key] for key in ("k1", "k2", "p1", "p2")], dtype=float),
+        wavelengths_nm=wavelengths_nm,
+        pseudo_rgb_nm=np.array(content["pseudo_rgb_nm"], dtype=float).reshape(3),
+        object_name=str(content["object"]),
+        scene_box_m=np.array(content["scene_box_m"], dtype=float).reshape(2, 3),
+        object_box_m=np.array(content["object_box_m"], dtype=float).reshape(2, 3),
+        background_reflectance=np.array(content["background_reflectance"], float).reshape(wavelengths_nm.shape),
+        container=None if container is None else Container(container["diameter_m"], container["height_m"]),
+        frames=tuple(
+            PackedFrame(
+                capture=str(frame["capture"]),
+                image_path=root / frame["file_path"],
+                mask_path=root / frame["mask_path"],
+                cube_path=root / frame["cube_path"],
+                angle_deg=float(frame["angle_deg"]),
+                reprojection_error_px=float(frame["reprojection_error_px"]),
+                camera_to_world=np.array(frame["transform_matrix"], dtype=float).reshape(4, 4),
+            )
+            for frame in content["frames"]
+        ),
+        fingerprint=content.get("fingerprint"),
+    )
