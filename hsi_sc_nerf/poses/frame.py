@@ -1,0 +1,87 @@
+"""From the adjusted machine to the object frame, and the figures that tell how good it is."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.poses.adjust import angle_slopes
+from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, rotation_about_z
+from hsi_sc_nerf.poses.initialise import Observations, Turntable, square_corners
+
+# A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
+# in marker sides.
+_FACES_UP_COSINE = 0.97
+_COPLANAR_SIDES = 0.2
+
+
+def layout(turntable: Turntable, side_m: float) -> Float[np.ndarray, "m 4 3"]:
+    """Corners of the markers in the turntable's frame."""
+    rotations, shifts = turntable.marker_poses[:, :3, :3], turntable.marker_poses[:, None, :3, 3]
+    return np.einsum("mij,kj->mki", rotations, square_corners(side_m)) + shifts
+
+
+def on_disc(turntable: Turntable, side_m: float) -> Bool[np.ndarray, "m"]:
+    """Which markers lie on the disc: the lowest group that faces up and shares one height."""
+    up = turntable.marker_poses[:, 2, 2] > _FACES_UP_COSINE
+    if not up.any():
+        return up
+    height = turntable.marker_poses[:, 2, 3]
+    return up & (height < height[up].min() + _COPLANAR_SIDES * side_m)
+
+
+def disc_height_m(turntable: Turntable, side_m: float) -> float:
+    """Height of the disc in the turntable's frame; without markers on a disc that of the lowest marker corner."""
+    corners = layout(turntable, side_m)
+    flat = on_disc(turntable, side_m)
+    return float(np.median(corners[flat, :, 2].mean(-1)) if flat.any() else corners[..., 2].min())
+
+
+def disc_tilt_deg(turntable: Turntable, side_m: float) -> float | None:
+    """Angle between the axis and the normal of the plane through the disc's markers; None below three markers."""
+    flat = on_disc(turntable, side_m)
+    if flat.sum() < 3:
+        return None
+    points = layout(turntable, side_m)[flat].reshape(-1, 3)
+    normal = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+    return float(np.rad2deg(np.arctan2(np.hypot(normal[0], normal[1]), abs(normal[2]))))
+
+
+def camera_to_world(turntable: Turntable, disc_m: float) -> Float[np.ndarray, "f 4 4"]:
+    """Camera-to-world in the object frame (OpenGL axes): z = 0 on the disc, x towards the first frame's camera."""
+    first = np.eye(4)
+    first[:3, :3] = turntable.camera_rotation.T
+    first[:3, 3] = [turntable.distance_m, 0.0, -disc_m]
+    first = first @ OPENCV_TO_OPENGL
+    return np.stack([rotation_about_z(-np.rad2deg(a)) @ first for a in turntable.angles_rad])
+
+
+def loop_closure_deg(
+    turntable: Turntable,
+    observations: Observations,
+    residual_px: Float[np.ndarray, "n 4 2"],
+    weights: Float[np.ndarray, "n 8 8"],
+    centre_px: tuple[float, float],
+    side_m: float,
+) -> float | None:
+    """What is left of a full turn after adding up the steps between neighbouring frames, the last to the first too.
+
+    Each step is measured from the markers that its two frames share alone, so errors add up as they do in any chain,
+    unlike the adjusted angles, which close by construction. None where two neighbours share no marker.
+    """
+    slopes = np.einsum("nij,nj->ni", weights, angle_slopes(turntable, observations, centre_px, side_m))
+    residual = np.einsum("nij,nj->ni", weights, residual_px.reshape(-1, 8))
+    stiffness = (slopes**2).sum(-1)
+    own = -(slopes * residual).sum(-1) / stiffness
+    by_frame = [
+        dict(zip(observations.marker[rows].tolist(), zip(own[rows], stiffness[rows], strict=True), strict=True))
+        for rows in (observations.frame == f for f in turntable.frames)
+    ]
+    left = 0.0
+    for here, there in zip(by_frame, by_frame[1:] + by_frame[:1], strict=True):
+        shared = here.keys() & there.keys()
+        if not shared:
+            return None
+        weight = {m: 1.0 / (1.0 / here[m][1] + 1.0 / there[m][1]) for m in shared}
+        left += sum(weight[m] * (there[m][0] - here[m][0]) for m in shared) / sum(weight.values())
+    return float(np.rad2deg(left))

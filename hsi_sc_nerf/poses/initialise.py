@@ -1,0 +1,203 @@
+"""A first guess of camera, axis, angles and marker layout, from each marker's pose in each frame alone.
+
+Centres of markers run on circles about one axis. A wrong focal length stretches these circles along the viewing
+direction, so the focal length is the one that leaves them round; and centres hardly suffer from the two-fold
+ambiguity of a small square's pose, which the layout then resolves: in the object's frame a marker stands still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.poses.geometry import rotation_about_z
+
+# Fields of view over the width that are tried: from a tele lens to a very wide one.
+_FOV_RANGE_DEG = (5.0, 90.0)
+_FOV_STEPS = 40
+_HORIZONTAL_COSINE = 0.95
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Corners of markers in frames: one row a marker seen in a frame."""
+
+    frame: Int[np.ndarray, "n"]
+    marker: Int[np.ndarray, "n"]
+    corners_px: Float[np.ndarray, "n 4 2"]
+    covariance_px2: Float[np.ndarray, "n 8 8"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def select(self, keep: np.ndarray) -> Observations:
+        """The rows that ``keep`` (a mask or indices) picks."""
+        return Observations(self.frame[keep], self.marker[keep], self.corners_px[keep], self.covariance_px2[keep])
+
+
+@dataclass(frozen=True)
+class Turntable:
+    """Camera and motion as the adjustment knows them.
+
+    The frame: z is the turntable's axis, up; the camera sits at (``distance_m``, 0, 0). ``frames`` and ``markers``
+    say which frame and which marker the rows of ``angles_rad`` and ``marker_poses`` belong to. The first angle is 0.
+    """
+
+    focal_px: float
+    camera_rotation: Float[np.ndarray, "3 3"]  # from this frame to OpenCV's camera axes
+    distance_m: float
+    frames: Int[np.ndarray, "f"]
+    angles_rad: Float[np.ndarray, "f"]
+    markers: Int[np.ndarray, "m"]
+    marker_poses: Float[np.ndarray, "m 4 4"]  # marker to object
+
+
+def square_corners(side_m: float) -> Float[np.ndarray, "4 3"]:
+    """A marker's corners in its own frame (x right, y up, z out of the paper), in ArUco's order."""
+    return side_m / 2 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
+    """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
+    frames, f = np.unique(frame, return_inverse=True)
+    markers, m = np.unique(marker, return_inverse=True)
+    size = len(frames) + len(markers)
+    links = coo_array((np.ones(len(f)), (f, m + len(frames))), shape=(size, size))
+    _, label = connected_components(links, directed=False)
+    counts = np.bincount(label[: len(frames)])
+    return label[f] == np.argmax(counts)
+
+
+def initialise(observations: Observations, centre_px: tuple[float, float], width_px: int, side_m: float) -> Turntable:
+    """First guess from linked observations (``linked_rows``) of markers that each are in two or more frames."""
+    fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
+    focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
+    trials = [_Circles(observations, f, centre_px, side_m) for f in focals]
+    return min(trials, key=lambda t: t.error_px).turntable()
+
+
+class _Circles:
+    """The circles that the markers' centres describe, for one focal length."""
+
+    def __init__(self, observations: Observations, focal_px: float, centre_px: tuple[float, float], side_m: float):
+        self.frames, self.f = np.unique(observations.frame, return_inverse=True)
+        self.markers, self.m = np.unique(observations.marker, return_inverse=True)
+        self.focal_px = focal_px
+        self.rotations, self.centres = _marker_poses(observations.corners_px, focal_px, centre_px, side_m)
+        self._fit()
+        ratio = focal_px * side_m / self.centres[:, 2]
+        scale = np.log(self.predicted[:, 2] / self.centres[:, 2]) * ratio
+        depth = np.maximum(self.predicted[:, 2], 1e-6)
+        shift = focal_px * (self.predicted[:, :2] / depth[:, None] - self.centres[:, :2] / self.centres[:, 2:])
+        self.error_px = float(np.sqrt(np.mean(np.minimum((shift**2).sum(-1) + scale**2, 100.0))))
+
+    def _fit(self):
+        counts = np.bincount(self.m)
+        means = np.stack([np.bincount(self.m, self.centres[:, k]) / counts for k in range(3)], -1)
+        axis = np.linalg.svd(self.centres - means[self.m], full_matrices=False)[2][2]
+        # The camera looks down on the turntable: it is above the markers along the axis.
+        axis = axis * -np.sign(axis @ means.mean(0))
+        x = np.cross(axis, [0.0, 0.0, 1.0])
+        x = x / np.linalg.norm(x)
+        self.basis = np.stack([x, np.cross(axis, x), axis])
+        points = self.centres @ self.basis.T
+        # |p|^2 = 2 c.p + (r_m^2 - |c|^2): one centre c for all, one radius a marker.
+        design = np.zeros((len(points), 2 + len(self.markers)))
+        design[:, :2] = 2 * points[:, :2]
+        design[np.arange(len(points)), 2 + self.m] = 1.0
+        solution = np.linalg.lstsq(design, (points[:, :2] ** 2).sum(-1), rcond=None)[0]
+        self.on_axis = solution[:2]
+        radius = np.sqrt(np.maximum(solution[2:] + self.on_axis @ self.on_axis, 1e-12))
+        turn = np.exp(1j * np.arctan2(*(points[:, :2] - self.on_axis).T[::-1]))
+        of_frame, of_marker = _angles(self.f, self.m, turn)
+        self.angles = np.angle(of_frame)
+        around = radius[self.m] * of_frame[self.f] * of_marker[self.m]
+        height = np.bincount(self.m, points[:, 2]) / counts
+        ideal = np.stack([around.real + self.on_axis[0], around.imag + self.on_axis[1], height[self.m]], -1)
+        self.predicted = ideal @ self.basis
+
+    def turntable(self) -> Turntable:
+        """The guess in the adjustment's frame."""
+        foot = self.basis[:2].T @ self.on_axis
+        distance = np.linalg.norm(foot)
+        z = self.basis[2]
+        x = -foot / distance
+        camera_rotation = np.stack([x, np.cross(z, x), z], -1)
+        camera = np.array([distance, 0.0, 0.0])
+        angles = self.angles - self.angles[0]
+        back = np.stack([rotation_about_z(-np.rad2deg(a))[:3, :3] for a in angles])
+        in_room = self.centres @ camera_rotation + camera
+        centres = np.einsum("nij,nj->ni", back[self.f], in_room)
+        rotations = np.einsum("nij,kj,nckl->ncil", back[self.f], camera_rotation.T, self.rotations)
+        poses = np.tile(np.eye(4), (len(self.markers), 1, 1))
+        for k in range(len(self.markers)):
+            rows = self.m == k
+            poses[k, :3, :3] = _steadiest(rotations[rows])
+            poses[k, :3, 3] = np.median(centres[rows], axis=0)
+        start = Turntable(self.focal_px, camera_rotation, float(distance), self.frames, angles, self.markers, poses)
+        up = poses[:, 2, 2]
+        flat = np.abs(up) > _HORIZONTAL_COSINE
+        return turned_over(start) if flat.any() and up[flat].sum() < 0 else start
+
+
+def turned_over(turntable: Turntable) -> Turntable:
+    """The same machine with the axis pointing the other way (a half turn about x)."""
+    half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    return Turntable(
+        turntable.focal_px,
+        turntable.camera_rotation @ half_turn[:3, :3],
+        turntable.distance_m,
+        turntable.frames,
+        -turntable.angles_rad,
+        turntable.markers,
+        half_turn @ turntable.marker_poses,
+    )
+
+
+def _marker_poses(corners_px, focal_px, centre_px, side_m):
+    """Both poses of each square: rotations (n, 2, 3, 3) and the better one's centre (n, 3), OpenCV camera axes."""
+    k = np.array([[focal_px, 0, centre_px[0]], [0, focal_px, centre_px[1]], [0, 0, 1.0]])
+    square = square_corners(side_m)
+    rotations, centres = [], []
+    for corners in corners_px:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(square, corners, k, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+        rotations.append(Rotation.from_rotvec(np.array([turns[0].ravel(), turns[-1].ravel()])).as_matrix())
+        centres.append(shifts[0].ravel())
+    return np.array(rotations), np.array(centres)
+
+
+def _angles(f, m, turn):
+    """Unit complex numbers a_f, b_m with a_f b_m close to ``turn``: along the links first, then averaged."""
+    of_frame = np.zeros(f.max() + 1, complex)
+    of_marker = np.zeros(m.max() + 1, complex)
+    of_frame[np.bincount(f).argmax()] = 1.0
+    for _ in range(2 * (len(of_frame) + len(of_marker))):
+        known = of_frame[f] != 0
+        of_marker = _mean_direction(m[known], turn[known] * of_frame[f[known]].conj(), len(of_marker))
+        known = of_marker[m] != 0
+        before = of_frame
+        of_frame = _mean_direction(f[known], turn[known] * of_marker[m[known]].conj(), len(of_frame))
+        if before.all() and np.abs(of_frame - before).max() < 1e-6:
+            break
+    return of_frame, of_marker
+
+
+def _mean_direction(index, numbers, size):
+    total = np.bincount(index, numbers.real, size) + 1j * np.bincount(index, numbers.imag, size)
+    length = np.abs(total)
+    return np.where(length > 1e-12, total / np.maximum(length, 1e-12), 0.0)
+
+
+def _steadiest(rotations):
+    """Of all frames' two candidates the one that the other frames' candidates agree with best."""
+    n = len(rotations)
+    flat = rotations.reshape(2 * n, 9)
+    distance = np.linalg.norm(flat[:, None] - flat[None], axis=-1).reshape(2 * n, n, 2).min(-1)
+    best = np.argmin(np.minimum(distance, 0.5).sum(-1))
+    return flat[best].reshape(3, 3)

@@ -1,0 +1,61 @@
+"""A picture of the estimated poses: is this what stood on the table?"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hsi_sc_nerf.poses.estimate import TurntablePoses
+from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX
+
+_ARROW_SHARE = 0.15
+
+
+def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
+    """Draw cameras and markers in space and from above, and the reprojection error by frame, into a picture file."""
+    path = Path(path)
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    eyes = poses.camera_to_world[poses.used, :3, 3]
+    arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_SHARE * np.linalg.norm(eyes[0])
+    squares = [np.vstack([corners, corners[:1]]) for corners in poses.marker_corners_m.values()]
+
+    space = figure.add_subplot(1, 3, 1, projection="3d")
+    space.scatter(*eyes.T, c=np.arange(len(eyes)), cmap="viridis", s=12)
+    space.quiver(*eyes.T, *arrows.T, color="tab:red", linewidth=0.8)
+    for square in squares:
+        space.plot(*square.T, color="black", linewidth=0.8)
+    space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="Cameras in the object frame")
+    space.set_aspect("equal")
+
+    top = figure.add_subplot(1, 3, 2)
+    top.scatter(eyes[:, 0], eyes[:, 1], c=np.arange(len(eyes)), cmap="viridis", s=12)
+    top.quiver(
+        eyes[:, 0], eyes[:, 1], arrows[:, 0], arrows[:, 1],
+        angles="xy", scale_units="xy", scale=1, color="tab:red", width=0.003,
+    )  # fmt: skip
+    for square in squares:
+        top.plot(square[:, 0], square[:, 1], color="black", linewidth=0.8)
+    top.annotate(poses.names[int(np.flatnonzero(poses.used)[0])], (eyes[0, 0], eyes[0, 1]), fontsize=8)
+    top.set(xlabel="x (m)", ylabel="y (m)", title="From above")
+    top.set_aspect("equal")
+
+    error = figure.add_subplot(1, 3, 3)
+    index = np.arange(len(poses.names))
+    error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color="tab:blue")
+    left_out = index[~poses.used]
+    error.plot(left_out, np.zeros(len(left_out)), "x", color="tab:red", label="left out", clip_on=False)
+    error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
+    error.set(xlabel="frame", ylabel="reprojection error (px)", title=f"Overall {poses.overall_error_px:.3f} px")
+    error.legend()
+
+    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        figure.savefig(temporary, dpi=110)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,96 @@
+"""The pose report: what was found, how well it fits, and what to be wary of, ready for JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.poses.estimate import TurntablePoses
+
+# The paper's target for the reprojection error (section "Pose Estimation").
+REPROJECTION_TARGET_PX = 1.0
+# A session is a full turn if no more than this many of its steps are missing from 360 degrees.
+_STEPS_SHORT_OF_A_TURN = 1.5
+
+
+def pose_report(poses: TurntablePoses) -> dict:
+    """Figures and warnings of an estimate; numbers that are unknown are None."""
+    angles = poses.angles_deg[poses.used]
+    steps = np.diff(angles)
+    full_turn = is_full_turn(angles)
+    found_direction = "ccw" if np.median(steps) > 0 else "cw"
+    warnings = list(poses.warnings)
+    if poses.overall_error_px > REPROJECTION_TARGET_PX:
+        warnings.append(
+            f"the reprojection error of {poses.overall_error_px:.2f} px is above {REPROJECTION_TARGET_PX} px"
+        )
+    if poses.nominal_direction and poses.nominal_direction != found_direction:
+        warnings.append(
+            f"the session says that the turntable turns {poses.nominal_direction}, the images show {found_direction}"
+        )
+    deviation = _step_deviation(poses)
+    if deviation is not None and deviation > 0.25 * abs(poses.nominal_step_deg or np.inf):
+        warnings.append(f"an angle departs from the nominal steps by {deviation:.1f} degrees")
+    if poses.dropped:
+        warnings.append(f"{len(poses.dropped)} of {len(poses.names)} frames could not be posed and are left out")
+    rotation = poses.camera_to_world[poses.used][0][:3, :3]
+    return {
+        "intrinsics": asdict(poses.intrinsics),
+        "distortion": list(poses.distortion),
+        "blur_px": poses.blur_px,
+        "reprojection_error_px": {
+            "overall": poses.overall_error_px,
+            "target": REPROJECTION_TARGET_PX,
+            "above_target": poses.overall_error_px > REPROJECTION_TARGET_PX,
+            "frames": {n: _number(e) for n, e in zip(poses.names, poses.reprojection_error_px, strict=True)},
+        },
+        "angles_deg": {n: _number(a) for n, a in zip(poses.names, poses.angles_deg, strict=True)},
+        "steps_deg": {
+            "nominal": poses.nominal_step_deg,
+            "median": float(np.median(steps)),
+            "smallest": float(steps.min()),
+            "largest": float(steps.max()),
+            "largest_deviation_from_nominal": deviation,
+        },
+        "direction": {"nominal": poses.nominal_direction, "found": found_direction},
+        "full_turn": full_turn,
+        "loop_closure_deg": poses.loop_closure_deg if full_turn else None,
+        # How far the axis leans from the image's upright, and how far the camera looks down.
+        "axis_tilt_in_image_deg": float(np.rad2deg(np.arctan2(rotation[2, 0], rotation[2, 1]))),
+        "camera_looks_down_deg": float(np.rad2deg(np.arcsin(rotation[2, 2]))),
+        "axis_tilt_to_disc_deg": poses.disc_tilt_deg,
+        "frames": {
+            "total": len(poses.names),
+            "used": int(poses.used.sum()),
+            "dropped": dict(sorted(poses.dropped.items())),
+            "markers": dict(zip(poses.names, poses.markers_per_frame, strict=True)),
+        },
+        "marker_dictionary": poses.dictionary,
+        "disc_markers": list(poses.disc_markers),
+        "marker_corners_m": {str(m): c.tolist() for m, c in sorted(poses.marker_corners_m.items())},
+        "warnings": warnings,
+    }
+
+
+def is_full_turn(angles_deg: np.ndarray) -> bool:
+    """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""
+    widest_step = np.abs(np.diff(angles_deg)).max()
+    return bool(abs(angles_deg[-1] - angles_deg[0]) >= 360.0 - _STEPS_SHORT_OF_A_TURN * widest_step)
+
+
+def _step_deviation(poses: TurntablePoses) -> float | None:
+    """Largest departure of a used frame's angle from its index times the nominal step, degrees."""
+    if poses.nominal_step_deg is None:
+        return None
+    index = np.flatnonzero(poses.used)
+    angles = poses.angles_deg[poses.used]
+    step = np.copysign(poses.nominal_step_deg, np.median(np.diff(angles)))
+    away = angles - step * (index - index[0])
+    return float(np.abs((away + 180.0) % 360.0 - 180.0).max())
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
