@@ -1,0 +1,77 @@
+"""From a scene's description to the things that are rendered: the object, its support, the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, turntable_camera_to_world
+from hsi_sc_nerf.simulate import shapes, target, texture
+from hsi_sc_nerf.simulate.render import Part, Renderer
+from hsi_sc_nerf.simulate.scene import Camera, Scene, Turntable
+
+
+def intrinsics(camera: Camera) -> PinholeIntrinsics:
+    """The pinhole camera of the scene: square image, principal point in its middle."""
+    focal_px = camera.size_px / 2.0 / np.tan(np.deg2rad(camera.field_of_view_deg) / 2.0)
+    centre = camera.size_px / 2.0
+    return PinholeIntrinsics(camera.size_px, camera.size_px, focal_px, focal_px, centre, centre)
+
+
+def first_camera(camera: Camera) -> Float[np.ndarray, "4 4"]:
+    """Camera-to-world of the first frame: above the x axis, looking at the turntable's axis."""
+    elevation = np.deg2rad(camera.elevation_deg)
+    aim = np.array([0.0, 0.0, camera.aim_height_m])
+    return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
+
+
+def turntable_angles_deg(turntable: Turntable) -> Float[np.ndarray, "n"]:
+    """Angle of each frame, degrees, 0 first, positive counter-clockwise."""
+    sign = 1.0 if turntable.direction == "ccw" else -1.0
+    return sign * np.arange(turntable.frames) * 360.0 / turntable.frames
+
+
+def camera_poses(scene: Scene) -> Float[np.ndarray, "n 4 4"]:
+    """Camera-to-world of each frame, object frame."""
+    first = first_camera(scene.camera)
+    return np.stack([turntable_camera_to_world(first, angle) for angle in turntable_angles_deg(scene.turntable)])
+
+
+def object_part(scene: Scene) -> Part:
+    """The object, standing on the container's lid."""
+    rng = np.random.default_rng(scene.seed)
+    thing = scene.object
+    shape = {"pear": shapes.pear, "apple": shapes.apple, "maize": shapes.maize}[thing.shape](thing.height_m, rng)
+    if thing.shape == "maize":
+        materials, weights = texture.MAIZE_MATERIALS, texture.maize_weights(shape, thing, rng)
+    else:
+        materials, weights = texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng)
+    on_lid = shape.mesh.moved(np.array([0.0, 0.0, scene.container.height_m]))
+    return Part(on_lid, materials, weights, is_object=True)
+
+
+def support_parts(scene: Scene) -> list[Part]:
+    """Disc, container, and the markers on both.
+
+    Raises:
+        InputError: the markers do not fit, or their dictionary does not exist.
+    """
+    parts = [
+        _plain(target.disc_mesh(scene.turntable), "disc"),
+        _plain(target.container_mesh(scene.container), "container_plastic"),
+    ]
+    on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
+    for number, frame in (on_container | on_disc).items():
+        mesh, ink = target.marker_mesh(frame, number, scene.markers)
+        parts.append(Part(mesh, ("paper", "marker_ink"), np.stack([~ink, ink], axis=-1).astype(float)))
+    parts += [_plain(target.plaque_back(frame, scene.markers), "paper") for frame in on_container.values()]
+    return parts
+
+
+def build_renderer(scene: Scene) -> Renderer:
+    """The renderer of the whole scene."""
+    return Renderer([object_part(scene), *support_parts(scene)])
+
+
+def _plain(mesh: target.Mesh, material: str) -> Part:
+    return Part(mesh, (material,), np.ones((len(mesh.vertices), 1)))

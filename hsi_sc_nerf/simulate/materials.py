@@ -1,0 +1,117 @@
+"""Reflectance spectra of the materials, 397-1003 nm, built from the absorption features that shape real ones.
+
+A plant surface is a flat scatterer dimmed by absorbers: reflectance = plateau * 10 ** -(absorbance of the
+pigments + water). Band positions after Merzlyak et al. (2003), "Reflectance spectral features and
+non-destructive estimation of chlorophyll, carotenoid and anthocyanin content in apple fruit", and the 970 nm
+overtone of water after Peñuelas et al. (1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+Spectrum = Float[np.ndarray, "bands"]
+
+
+@dataclass(frozen=True)
+class PlantTissue:
+    """Pigment amounts of a plant surface, as absorbance at each pigment's strongest peak."""
+
+    plateau: float
+    """Reflectance of the near-infrared plateau, about 800-900 nm."""
+    chlorophyll: float = 0.0
+    carotenoid: float = 0.0
+    anthocyanin: float = 0.0
+    brown: float = 0.0
+    """Oxidised phenols: absorbance at 400 nm of an exponential tail towards the red."""
+    water: float = 0.0
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A non-plant material: nearly flat, with a gentle rise from blue to near-infrared."""
+
+    level: float
+    """Reflectance at 700 nm."""
+    slope_per_um: float = 0.0
+    blue_loss: float = 0.0
+    """Share lost at 400 nm (binders and whiteners absorb there), gone by 450 nm."""
+
+
+MATERIALS: dict[str, PlantTissue | Plain] = {
+    "pear_skin": PlantTissue(0.66, chlorophyll=0.62, carotenoid=0.62, brown=0.10, water=0.075),
+    "pear_blush": PlantTissue(0.64, chlorophyll=0.30, carotenoid=0.52, anthocyanin=0.55, brown=0.12, water=0.075),
+    "apple_skin": PlantTissue(0.68, chlorophyll=0.34, carotenoid=0.55, brown=0.06, water=0.080),
+    "apple_blush": PlantTissue(0.64, chlorophyll=0.26, carotenoid=0.60, anthocyanin=1.05, brown=0.10, water=0.080),
+    "bruise": PlantTissue(0.44, chlorophyll=0.16, carotenoid=0.45, anthocyanin=0.12, brown=0.55, water=0.125),
+    "lenticel": PlantTissue(0.72, chlorophyll=0.12, carotenoid=0.26, brown=0.14, water=0.055),
+    "stem": PlantTissue(0.42, chlorophyll=0.10, carotenoid=0.12, brown=0.80, water=0.030),
+    "kernel_yellow": PlantTissue(0.82, carotenoid=0.95, brown=0.07, water=0.040),
+    "kernel_white": PlantTissue(0.84, carotenoid=0.16, brown=0.07, water=0.040),
+    "kernel_purple": PlantTissue(0.62, carotenoid=0.35, anthocyanin=1.0, brown=0.45, water=0.040),
+    "cob": PlantTissue(0.58, carotenoid=0.25, anthocyanin=0.10, brown=0.50, water=0.035),
+    "husk": PlantTissue(0.62, chlorophyll=0.28, carotenoid=0.34, brown=0.22, water=0.055),
+    "container_plastic": Plain(0.62, slope_per_um=0.05, blue_loss=0.12),
+    "paper": Plain(0.86, slope_per_um=0.04, blue_loss=0.25),
+    "marker_ink": Plain(0.045, slope_per_um=0.03),
+    "disc": Plain(0.78, slope_per_um=0.03, blue_loss=0.10),
+    # Sintered PTFE: 0.95-0.97, nearly flat.
+    "chamber": Plain(0.96, slope_per_um=0.01),
+    # Calibration is relative to the tarp, so an ideal tarp makes calibrated reflectance the true one.
+    "white_tarp": Plain(1.0),
+    "tarp_surround": Plain(0.12, slope_per_um=0.05),
+}
+
+
+def endmembers(names: Sequence[str], wavelengths_nm: Spectrum) -> Float[np.ndarray, "materials bands"]:
+    """Reflectance of the named materials at the given wavelengths, each in [0, 1].
+
+    Raises:
+        KeyError: a name is not in `MATERIALS`.
+    """
+    return np.stack([reflectance(MATERIALS[name], np.asarray(wavelengths_nm, float)) for name in names])
+
+
+def reflectance(material: PlantTissue | Plain, wavelengths_nm: Spectrum) -> Spectrum:
+    """Reflectance of one material, in [0, 1]."""
+    if isinstance(material, Plain):
+        tilt = 1.0 + material.slope_per_um * (wavelengths_nm - 700.0) / 1000.0
+        violet = 1.0 - material.blue_loss / (1.0 + np.exp((wavelengths_nm - 415.0) / 7.0))
+        return np.clip(material.level * tilt * violet, 0.0, 1.0)
+    absorbance = (
+        material.chlorophyll * _chlorophyll(wavelengths_nm)
+        + material.carotenoid * _carotenoid(wavelengths_nm)
+        + material.anthocyanin * _peak(wavelengths_nm, 550.0, 33.0)
+        + material.brown * np.exp(-(wavelengths_nm - 400.0) / 170.0)
+        + material.water * _water(wavelengths_nm)
+    )
+    return np.clip(material.plateau * 10.0**-absorbance, 0.0, 1.0)
+
+
+def _peak(wavelengths_nm: Spectrum, centre_nm: float, width_nm: float) -> Spectrum:
+    return np.exp(-0.5 * ((wavelengths_nm - centre_nm) / width_nm) ** 2)
+
+
+def _chlorophyll(w: Spectrum) -> Spectrum:
+    """Chlorophyll a and b in tissue: Soret bands, a low plateau in the green, the red band and its shoulder."""
+    return (
+        1.1 * _peak(w, 435.0, 24.0)
+        + 0.45 * _peak(w, 480.0, 20.0)
+        + 0.28 * _peak(w, 590.0, 36.0)
+        + 0.50 * _peak(w, 642.0, 17.0)
+        + 0.92 * _peak(w, 677.0, 14.0)
+    )
+
+
+def _carotenoid(w: Spectrum) -> Spectrum:
+    """Carotenoids: three overlapping bands in the blue that end sharply by about 530 nm."""
+    return 0.8 * _peak(w, 425.0, 22.0) + 0.85 * _peak(w, 452.0, 16.0) + 0.75 * _peak(w, 482.0, 17.0)
+
+
+def _water(w: Spectrum) -> Spectrum:
+    """Liquid water: the overtone at 970 nm and the weak one at 750-840 nm."""
+    return _peak(w, 970.0, 24.0) + 0.30 * _peak(w, 1010.0, 40.0) + 0.06 * _peak(w, 835.0, 18.0)

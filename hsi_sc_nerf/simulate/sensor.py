@@ -1,0 +1,53 @@
+"""From reflectance to counts: lamp spectrum, quantum efficiency, integration time, dark level, rounding."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from hsi_sc_nerf.simulate.scene import Sensor
+
+SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
+
+
+def band_centres_nm(bands: int) -> Float[np.ndarray, "bands"]:
+    """Band centres of a SPECIM IQ (204, as the instrument exports them), or as many spread evenly over them."""
+    text = resources.files(__package__).joinpath("specim_iq_band_centres_nm.csv").read_text(encoding="utf-8")
+    centres = np.array(text.split()[1:], float)
+    if bands == len(centres):
+        return centres
+    positions = np.linspace(0.0, len(centres) - 1.0, bands)
+    return np.round(np.interp(positions, np.arange(len(centres)), centres), 2)
+
+
+def lamp_photons(wavelengths_nm: Float[np.ndarray, "bands"], temperature_k: float) -> Float[np.ndarray, "bands"]:
+    """Photon spectrum of a tungsten lamp, relative: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
+    exponent = SECOND_RADIATION_CONSTANT_NM_K / (wavelengths_nm * temperature_k)
+    return (wavelengths_nm / 1000.0) ** -4 / np.expm1(exponent)
+
+
+def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
+    """Electrons per photon of a silicon sensor behind its grating, in [0, 1]: best near 600 nm, low at both ends."""
+    nodes_nm = [390.0, 420.0, 470.0, 530.0, 600.0, 680.0, 760.0, 840.0, 920.0, 980.0, 1010.0]
+    values = [0.24, 0.36, 0.52, 0.63, 0.67, 0.62, 0.52, 0.39, 0.25, 0.14, 0.09]
+    return np.interp(wavelengths_nm, nodes_nm, values)
+
+
+def white_signal(sensor: Sensor, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
+    """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count."""
+    signal = lamp_photons(wavelengths_nm, sensor.lamp_temperature_k) * quantum_efficiency(wavelengths_nm)
+    largest = 2**sensor.bit_depth - 1
+    return signal / signal.max() * (sensor.white_level * largest - sensor.dark_level)
+
+
+def expose(
+    weights: Float[np.ndarray, "*n materials"],
+    endmembers: Float[np.ndarray, "materials bands"],
+    sensor: Sensor,
+    signal_of_white: Float[np.ndarray, "bands"],
+) -> UInt16[np.ndarray, "*n bands"]:
+    """Counts of pixels that mix the materials by ``weights``."""
+    counts = weights @ (endmembers * signal_of_white) + sensor.dark_level
+    return np.clip(np.rint(counts), 0, 2**sensor.bit_depth - 1).astype(np.uint16)

@@ -1,0 +1,147 @@
+"""What carries the object: a disc with ArUco markers, and on it a container with more of them around its side.
+
+Each marker on the container is a flat plaque that stands off the curved wall, and each on the disc lies flat in
+z = 0, so that the known corner positions are exact.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.mesh import Mesh, cylinder, quads
+from hsi_sc_nerf.simulate.scene import Container, Markers, Turntable
+
+PLAQUE_STANDOFF_M = 0.0005
+PLAQUE_THICKNESS_M = 0.0003
+DISC_THICKNESS_M = 0.006
+PRINT_HEIGHT_M = 0.0003
+"""How far the disc lies below the markers printed on it."""
+QUIET_ZONE_MODULES = 0.7
+"""White paper around a marker, in modules (the disc and the container around it are bright as well)."""
+
+# A marker's corners in its own plane (u right, v up), in OpenCV's order: upper left, then clockwise.
+UNIT_CORNERS = np.array([(-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)])
+
+MarkerLayout = dict[int, Float[np.ndarray, "4 3"]]
+MarkerFrame = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre, unit u, unit v
+
+
+def marker_frames(
+    markers: Markers, container: Container, turntable: Turntable
+) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
+    """Centre, right and up of each marker on the container and on the disc, by marker number, object frame.
+
+    The container has the numbers from 0, the disc goes on after them.
+
+    Raises:
+        InputError: the markers do not fit on the container or on the disc.
+    """
+    paper = markers.side_m * paper_side_in_markers(markers)
+    apothem = container.diameter_m / 2.0 + PLAQUE_STANDOFF_M
+    if paper > container.height_m or (
+        markers.on_container > 2 and paper > 2.0 * apothem * np.tan(np.pi / markers.on_container)
+    ):
+        raise InputError(
+            f"{markers.on_container} markers of {markers.side_m:g} m do not fit around the container; "
+            "make markers.side_m or markers.on_container smaller."
+        )
+    on_container = {}
+    for number in range(markers.on_container):
+        azimuth = 2.0 * np.pi * number / markers.on_container
+        outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        centre = apothem * outwards + np.array([0.0, 0.0, container.height_m / 2.0])
+        on_container[number] = (centre, sideways, np.array([0.0, 0.0, 1.0]))
+
+    # As far in as the plaques and the neighbours allow: the inner edges touch no plaque's corner or each other.
+    plaque_corner = np.hypot(apothem, paper / 2.0)
+    neighbours = paper / 2.0 / np.tan(np.pi / max(markers.on_disc, 3))
+    inner_edge = max(plaque_corner, neighbours) + 0.001
+    if markers.on_disc and np.hypot(inner_edge + paper, paper / 2.0) > turntable.disc_diameter_m / 2.0:
+        raise InputError(
+            f"{markers.on_disc} markers of {markers.side_m:g} m do not fit on the disc around the container; "
+            "make markers.side_m smaller or turntable.disc_diameter_m larger."
+        )
+    on_disc = {}
+    for number in range(markers.on_disc):
+        azimuth = 2.0 * np.pi * (number + 0.5) / markers.on_disc
+        outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        # Read from outside, like a text that lies on a table before its reader.
+        on_disc[markers.on_container + number] = ((inner_edge + paper / 2.0) * outwards, sideways, -outwards)
+    return on_container, on_disc
+
+
+def marker_layout(markers: Markers, container: Container, turntable: Turntable) -> MarkerLayout:
+    """The four corners of each marker's black square in OpenCV's order, metres, object frame."""
+    on_container, on_disc = marker_frames(markers, container, turntable)
+    return {number: _corners(frame, markers.side_m) for number, frame in (on_container | on_disc).items()}
+
+
+def marker_mesh(frame: MarkerFrame, number: int, markers: Markers) -> tuple[Mesh, np.ndarray]:
+    """A marker as flat squares, one a module, in its frame of white paper; and which vertices are ink."""
+    dictionary = aruco_dictionary(markers)
+    modules = dictionary.markerSize + 2
+    image = cv2.aruco.generateImageMarker(dictionary, number, modules, borderBits=1)
+    edges = np.linspace(-0.5, 0.5, modules + 1)
+    quiet = paper_side_in_markers(markers) / 2.0
+    edges = np.concatenate([[-quiet], edges, [quiet]])
+    ink = np.pad(image == 0, 1)
+    left, right = np.meshgrid(edges[:-1], edges[:-1])[0], np.meshgrid(edges[1:], edges[1:])[0]
+    top, bottom = -np.meshgrid(edges[:-1], edges[:-1])[1], -np.meshgrid(edges[1:], edges[1:])[1]
+    in_plane = np.stack(
+        [np.stack(corner, axis=-1) for corner in ((left, bottom), (right, bottom), (right, top), (left, top))], axis=2
+    ).reshape(-1, 4, 2)
+    return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
+
+
+def plaque_back(frame: MarkerFrame, markers: Markers) -> Mesh:
+    """The back of a plaque, so that ink is not seen through the paper."""
+    centre, u, v = frame
+    behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
+    corners = _to_object_frame(UNIT_CORNERS * paper_side_in_markers(markers), behind, markers.side_m)
+    return quads(corners[None])
+
+
+def container_mesh(container: Container) -> Mesh:
+    """The container with its flat lid, standing on the disc."""
+    return cylinder(container.diameter_m, container.height_m)
+
+
+def disc_mesh(turntable: Turntable) -> Mesh:
+    """The turntable's disc, just below the markers that lie in z = 0."""
+    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M).moved(
+        np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M])
+    )
+
+
+def aruco_dictionary(markers: Markers) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of the given name.
+
+    Raises:
+        InputError: OpenCV has no such dictionary, or it has too few markers.
+    """
+    name = markers.dictionary
+    if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+        raise InputError(f"markers.dictionary {name!r} is no ArUco dictionary; use a name like DICT_5X5_50.")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    if len(dictionary.bytesList) < markers.on_container + markers.on_disc:
+        raise InputError(f"{name} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary.")
+    return dictionary
+
+
+def paper_side_in_markers(markers: Markers) -> float:
+    """Side of a marker's paper over the side of its black square."""
+    return 1.0 + 2.0 * QUIET_ZONE_MODULES / (aruco_dictionary(markers).markerSize + 2)
+
+
+def _corners(frame: MarkerFrame, side_m: float) -> Float[np.ndarray, "4 3"]:
+    return _to_object_frame(UNIT_CORNERS, frame, side_m)
+
+
+def _to_object_frame(in_plane: Float[np.ndarray, "*n 2"], frame: MarkerFrame, side_m: float) -> np.ndarray:
+    centre, u, v = frame
+    return centre + side_m * (in_plane[..., :1] * u + in_plane[..., 1:] * v)

@@ -1,0 +1,161 @@
+"""The truth beside a simulated session: written once, read back exactly (layout in docs/architecture.md)."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Float
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.simulate.scene import Scene
+from hsi_sc_nerf.simulate.target import MarkerLayout
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known about a simulated session; big arrays stay on disk until asked for."""
+
+    session_dir: Path
+    object: str
+    intrinsics: PinholeIntrinsics
+    captures: tuple[str, ...]
+    angles_deg: Float[np.ndarray, "n"]
+    camera_to_world: Float[np.ndarray, "n 4 4"]
+    """OpenGL axes, object frame, metres."""
+    marker_layout: MarkerLayout
+    """Four corners of each marker, metres, object frame, in OpenCV's order."""
+    wavelengths_nm: Float[np.ndarray, "bands"]
+    materials: tuple[str, ...]
+    endmembers: Float[np.ndarray, "materials bands"]
+    """Reflectance of each material."""
+    area_m2: float
+    volume_m3: float
+
+    @property
+    def mesh_path(self) -> Path:
+        """The object alone, PLY, object frame, metres."""
+        return self.session_dir / "truth" / "mesh.ply"
+
+    def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
+        """Share of each material in each pixel, summing to 1."""
+        return self._pixels(capture, "material_weights").astype(np.float32)
+
+    def object_coverage(self, capture: str) -> Float[np.ndarray, "lines samples"]:
+        """Share of each pixel that the object covers, in [0, 1]."""
+        return self._pixels(capture, "object").astype(np.float32)
+
+    def reflectance(self, capture: str) -> Float[np.ndarray, "lines samples bands"]:
+        """Noise-free reflectance, float32, in [0, 1]."""
+        return self.material_weights(capture) @ self.endmembers.astype(np.float32)
+
+    def _pixels(self, capture: str, key: str) -> np.ndarray:
+        with np.load(pixels_path(self.session_dir, capture)) as arrays:
+            return arrays[key]
+
+
+def load_truth(session_dir: str | Path) -> Truth:
+    """Read the truth of a simulated session.
+
+    Raises:
+        InputError: the folder holds no truth, or one that cannot be read.
+    """
+    session_dir = Path(session_dir)
+    path = session_dir / "truth" / "truth.json"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        with (session_dir / "truth" / "endmembers.csv").open(encoding="utf-8", newline="") as file:
+            table = np.array(list(csv.reader(file))[1:], float)
+        return Truth(
+            session_dir=session_dir,
+            object=values["object"],
+            intrinsics=PinholeIntrinsics(**values["intrinsics"]),
+            captures=tuple(frame["capture"] for frame in values["frames"]),
+            angles_deg=np.array([frame["angle_deg"] for frame in values["frames"]]),
+            camera_to_world=np.array([frame["camera_to_world"] for frame in values["frames"]]),
+            marker_layout={int(number): np.array(c) for number, c in values["marker_layout"].items()},
+            wavelengths_nm=np.array(values["wavelengths_nm"]),
+            materials=tuple(values["materials"]),
+            endmembers=table[:, 1:].T,
+            area_m2=values["mesh"]["area_m2"],
+            volume_m3=values["mesh"]["volume_m3"],
+        )
+    except FileNotFoundError as error:
+        raise InputError(f"{session_dir}: has no truth ({path.name} is missing); simulate the session.") from error
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise InputError(f"{path}: cannot be read ({error!r}); simulate the session again.") from error
+
+
+def write_truth(
+    session_dir: Path,
+    scene: Scene,
+    *,
+    intrinsics: PinholeIntrinsics,
+    captures: list[str],
+    angles_deg: Float[np.ndarray, "n"],
+    camera_to_world: Float[np.ndarray, "n 4 4"],
+    marker_layout: MarkerLayout,
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    materials: tuple[str, ...],
+    endmembers: Float[np.ndarray, "materials bands"],
+    mesh: Mesh,
+) -> None:
+    """Write everything but the pixels (`write_pixels` adds those, a frame at a time)."""
+    folder = session_dir / "truth"
+    folder.mkdir(parents=True, exist_ok=True)
+    values = {
+        "object": scene.object.shape,
+        "intrinsics": dataclasses.asdict(intrinsics),
+        "frames": [
+            {"capture": capture, "angle_deg": angle, "camera_to_world": pose.tolist()}
+            for capture, angle, pose in zip(captures, angles_deg.tolist(), camera_to_world, strict=True)
+        ],
+        "marker_layout": {str(number): corners.tolist() for number, corners in marker_layout.items()},
+        "wavelengths_nm": wavelengths_nm.tolist(),
+        "materials": list(materials),
+        "effects": list(scene.effects),
+        "container": dataclasses.asdict(scene.container),
+        "mesh": {"area_m2": mesh.area_m2(), "volume_m3": mesh.volume_m3()},
+    }
+    (folder / "truth.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    with (folder / "endmembers.csv").open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["wavelength_nm", *materials])
+        table.writerows(np.column_stack([wavelengths_nm, endmembers.T]).tolist())
+    write_mesh(folder / "mesh.ply", mesh)
+
+
+def write_pixels(
+    session_dir: Path,
+    capture: str,
+    material_weights: Float[np.ndarray, "lines samples materials"],
+    coverage: Float[np.ndarray, "lines samples"],
+) -> None:
+    """Write what each pixel of one frame sees; exact for weights that are multiples of 1 / 2048."""
+    path = pixels_path(session_dir, capture)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path, material_weights=material_weights.astype(np.float16), object=coverage.astype(np.float16)
+    )
+
+
+def pixels_path(session_dir: Path, capture: str) -> Path:
+    """Where a frame's pixels lie."""
+    return session_dir / "truth" / "pixels" / f"{capture}.npz"
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as binary PLY with its vertex normals."""
+    written = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles)
+    )
+    written.compute_vertex_normals()
+    if not o3d.io.write_triangle_mesh(str(path), written):
+        raise OSError(f"could not write {path}")
