@@ -1,0 +1,181 @@
+"""Foreground masks: the object on the container, without chamber, container, disc and markers.
+
+Plant tissue changes its reflectance strongly between 400 and 1000 nm (pigments, red edge), while Teflon, plastic,
+paper and ink are nearly flat: the spread of a pixel's spectrum tells them apart. What prints and labels may still
+feign is removed by geometry: the object stands on the container's lid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.data.packed import Container
+from hsi_sc_nerf.data.regions import ellipse_close_open, fill_holes, largest_component
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
+
+_HISTOGRAM_BINS = 512
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Settings of the foreground masks."""
+
+    spectral_bins: int = 24
+    """Neighbouring bands are averaged into this many bins before their spread is taken, which quiets noise."""
+    smoothing_px: float = 0.5
+    """Standard deviation of the Gaussian that smooths the bins over neighbouring pixels, pixels; 0 for none."""
+    threshold: float | None = None
+    """Spread of reflectance over the bins from which a pixel is the object's. Found over all frames if not given."""
+    min_contrast: float = 0.03
+    """Least difference between the mean spreads of object and background that is believed."""
+    morphology_fraction: float = 0.01
+    """Diameter of the ellipse that closes gaps, as a share of the image's shorter side (3 pixels at least)."""
+    overhang: float = 1.2
+    """The object may reach beyond the container's lid up to this many times its radius."""
+
+
+def foreground_score(
+    reflectance: Float[np.ndarray, "lines samples bands"], *, spectral_bins: int = 24, smoothing_px: float = 0.5
+) -> Float[np.ndarray, "lines samples"]:
+    """Standard deviation over spectral bins of the (slightly smoothed) reflectance: 0 for a flat spectrum.
+
+    Where a pixel is part object and part flat background the score is nearly its share times the object's score.
+    """
+    bands = reflectance.shape[-1]
+    edges = np.unique(np.linspace(0, bands, min(spectral_bins, bands) + 1).astype(int))
+    widths = np.diff(edges).astype(np.float32)
+    binned = np.add.reduceat(reflectance, edges[:-1], axis=-1) / widths
+    if smoothing_px > 0.0:
+        binned = np.stack([cv2.GaussianBlur(b, (0, 0), smoothing_px) for b in np.moveaxis(binned, -1, 0)], axis=-1)
+    return binned.std(axis=-1)
+
+
+def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tuple[float, float]:
+    """Otsu's threshold over all frames together, and the contrast: the difference of the two classes' means.
+
+    N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979). Scores are not
+    negative. A contrast of 0 means that all scores are the same.
+    """
+    top = max(float(score.max()) for score in scores)
+    if not top > 0.0:
+        return 0.0, 0.0
+    counts = sum(np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores)
+    edges = np.linspace(0.0, top, _HISTOGRAM_BINS + 1)
+    weights = counts / np.sum(counts)
+    below = np.cumsum(weights)[:-1]
+    moment = np.cumsum(weights * (edges[:-1] + edges[1:]) / 2.0)
+    split = (below > 0.0) & (below < 1.0)
+    low = np.divide(moment[:-1], below, out=np.zeros_like(below), where=split)
+    high = np.divide(moment[-1] - moment[:-1], 1.0 - below, out=np.zeros_like(below), where=split)
+    between = below * (1.0 - below) * (high - low) ** 2
+    # Empty bins between two clear classes tie: take the middle of the plateau.
+    best = np.flatnonzero(between >= between.max() * (1.0 - 1e-9))
+    middle = int(best[len(best) // 2])
+    return float(edges[middle + 1]), float(high[middle] - low[middle])
+
+
+def choose_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]], config: MaskConfig) -> float:
+    """The given threshold, or Otsu's where object and background are told apart.
+
+    Raises:
+        InputError: the spectra of object and background hardly differ.
+    """
+    if config.threshold is not None:
+        return config.threshold
+    threshold, contrast = otsu_threshold(scores)
+    if contrast < config.min_contrast:
+        raise InputError(
+            f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
+            "object is in view, or give a threshold with --masks.threshold."
+        )
+    return threshold
+
+
+def above_lid(
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"],
+    camera_to_world: Float[np.ndarray, "4 4"],
+    container: Container,
+    overhang: float = 1.2,
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that can show something standing on the lid: their rays pass over it before they meet the container.
+
+    "Over it" is the upright cylinder around the axis with ``overhang`` times the container's radius, from the lid
+    upwards.
+    """
+    origin, directions = pixel_rays(intrinsics, camera_to_world, _undistorted_pixels(intrinsics, distortion))
+    radius = container.diameter_m / 2.0
+    above = _intersect(
+        _cylinder_interval(origin, directions, overhang * radius),
+        _slab_interval(origin, directions, container.height_m, np.inf),
+    )
+    solid = _intersect(
+        _cylinder_interval(origin, directions, radius), _slab_interval(origin, directions, 0.0, container.height_m)
+    )
+    blocked = (solid[0] < solid[1]) & (solid[0] <= above[0])
+    return (above[0] < above[1]) & ~blocked
+
+
+def foreground_mask(
+    score: Float[np.ndarray, "lines samples"],
+    threshold: float,
+    *,
+    allowed: Bool[np.ndarray, "lines samples"] | None = None,
+    morphology_fraction: float = 0.01,
+) -> Bool[np.ndarray, "lines samples"]:
+    """Pixels above the threshold (inside ``allowed``): gaps closed, largest component, holes filled."""
+    mask = score > threshold
+    if allowed is not None:
+        mask &= allowed
+    closing_px = max(3, round(morphology_fraction * min(score.shape)))
+    mask = ellipse_close_open(mask, close_px=closing_px, open_px=0)
+    return fill_holes(largest_component(mask))
+
+
+_Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]
+
+
+def _undistorted_pixels(
+    intrinsics: PinholeIntrinsics, distortion: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "h w 2"]:
+    """Where each pixel's centre would be without lens distortion."""
+    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
+    pixels = np.stack([x, y], axis=-1)
+    if not np.any(distortion):
+        return pixels
+    matrix = intrinsics.matrix()
+    return cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, np.asarray(distortion), P=matrix).reshape(
+        pixels.shape
+    )
+
+
+def _cylinder_interval(
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float
+) -> _Interval:
+    """Ray parameters between which x² + y² <= radius² (an empty interval for a miss)."""
+    a = np.maximum(np.sum(directions[..., :2] ** 2, axis=-1), 1e-18)
+    b = np.sum(directions[..., :2] * origin[:2], axis=-1)
+    discriminant = b**2 - a * (np.sum(origin[:2] ** 2) - radius**2)
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    hit = discriminant > 0.0
+    return np.where(hit, (-b - root) / a, np.inf), np.where(hit, (-b + root) / a, -np.inf)
+
+
+def _slab_interval(
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], low: float, high: float
+) -> _Interval:
+    """Ray parameters between which low <= z <= high."""
+    slope = np.where(np.abs(directions[..., 2]) < 1e-12, 1e-12, directions[..., 2])
+    first, second = (low - origin[2]) / slope, (high - origin[2]) / slope
+    return np.minimum(first, second), np.maximum(first, second)
+
+
+def _intersect(a: _Interval, b: _Interval) -> _Interval:
+    """The common part of two intervals, in front of the camera."""
+    return np.maximum(np.maximum(a[0], b[0]), 0.0), np.minimum(a[1], b[1])

@@ -1,0 +1,31 @@
+"""Regions of an image: morphology and connected components on boolean masks."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
+
+def ellipse_close_open(
+    mask: Bool[np.ndarray, "lines samples"], *, close_px: int, open_px: int
+) -> Bool[np.ndarray, "lines samples"]:
+    """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is left out)."""
+    for operation, size in ((cv2.MORPH_CLOSE, close_px), (cv2.MORPH_OPEN, open_px)):
+        if size >= 2:
+            ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            mask = cv2.morphologyEx(mask.astype(np.uint8), operation, ellipse) > 0
+    return mask
+
+
+def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
+    """The largest 8-connected component; an empty mask stays empty."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    return labels == 1 + np.argmax(areas) if len(areas) else np.zeros_like(mask)
+
+
+def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
+    """The mask with everything that it encloses."""
+    return ndimage.binary_fill_holes(mask)

@@ -1,0 +1,100 @@
+"""Boxes around the object and the scene, from poses and masks: a coarse visual hull.
+
+A point of the object projects into the mask of each frame that sees it (A. Laurentini, "The visual hull concept
+for silhouette-based image understanding", IEEE TPAMI 16, 1994).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.data.packed import Container
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
+
+
+def focus_point(camera_to_worlds: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, "3"]:
+    """The point nearest (least squares) to the optical axes of all frames."""
+    origins, axes = camera_to_worlds[:, :3, 3], -camera_to_worlds[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    # Axes that are parallel (a partial turn of nearly nothing) leave a direction open: the shortest solution.
+    return np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, origins), rcond=None)[0]
+
+
+def carve(
+    points: Float[np.ndarray, "n 3"],
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    min_agreement: float = 0.95,
+) -> Bool[np.ndarray, "n"]:
+    """Which points lie in the masks of at least ``min_agreement`` of the frames that see them.
+
+    A point that no frame sees is not in the hull.
+    """
+    inside = np.zeros(len(points))
+    seen = np.zeros(len(points))
+    for mask, pose in zip(masks, camera_to_worlds, strict=True):
+        pixels, depth = project(points, pose, intrinsics)
+        in_image = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < (intrinsics.w, intrinsics.h)).all(axis=1)
+        x, y = pixels[in_image].astype(int).T
+        seen += in_image
+        inside[in_image] += mask[y, x]
+    return (seen > 0) & (inside >= min_agreement * seen)
+
+
+def object_box(
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    *,
+    min_z_m: float | None = None,
+    margin_m: float = 0.003,
+    resolution: int = 64,
+) -> Float[np.ndarray, "2 3"]:
+    """Minimum and maximum of the masks' visual hull (metres), widened by a voxel's half and ``margin_m``.
+
+    The hull is carved twice: in the cube that the cameras see, then in the bounds found there. Lens distortion is
+    neglected. ``min_z_m`` is a floor under the object (the container's lid), where it is known.
+
+    Raises:
+        InputError: no point projects into the masks: masks and poses do not fit each other.
+    """
+    centre = focus_point(camera_to_worlds)
+    distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).max()
+    reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
+    low, high = centre - reach, centre + reach
+    for _ in range(2):
+        step = (high - low) / resolution
+        ticks = [low[k] + step[k] * (np.arange(resolution) + 0.5) for k in range(3)]
+        points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        if min_z_m is not None:
+            points = points[points[:, 2] >= min_z_m - step[2] / 2.0]
+        hull = points[carve(points, masks, camera_to_worlds, intrinsics)]
+        if len(hull) == 0:
+            raise InputError(
+                "the foreground masks and the poses do not fit each other, so that no object is left in space; look "
+                "at report/masks.png and report/poses.png."
+            )
+        low, high = hull.min(axis=0) - step, hull.max(axis=0) + step
+    # The second carving left a whole voxel around the outermost centres; half of one is their own extent.
+    box = np.stack([low + step / 2.0 - margin_m, high - step / 2.0 + margin_m])
+    if min_z_m is not None:
+        box[0, 2] = max(box[0, 2], min_z_m)
+    return box
+
+
+def scene_box(
+    object_box_m: Float[np.ndarray, "2 3"],
+    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]],
+    container: Container | None,
+    margin_m: float = 0.005,
+) -> Float[np.ndarray, "2 3"]:
+    """Minimum and maximum of all that turns: object, markers and container, widened by ``margin_m``."""
+    points = [object_box_m, *marker_corners_m.values()]
+    if container is not None:
+        radius = container.diameter_m / 2.0
+        points.append(np.array([[-radius, -radius, 0.0], [radius, radius, container.height_m]]))
+    everything = np.concatenate(points)
+    return np.stack([everything.min(axis=0) - margin_m, everything.max(axis=0) + margin_m])
