@@ -1,0 +1,197 @@
+"""Spectral metrics of the paper (section "Evaluation Metrics"), as pure functions on reflectance in [0, 1].
+
+``predicted`` and ``target`` are images (h, w, bands); ``mask`` (h, w) selects the evaluated pixels Omega, all without
+one. The arithmetic is float64, in blocks, so that a large cube needs little memory beside itself; results are float32
+and finite for finite spectra.
+
+**An empty mask** holds nothing that could differ: it scores like identical images (angle and errors 0, SSIM 1, PSNR
+at its cap). That says nothing about a view; leave such a view out of a mean over views.
+
+Every function raises ValueError if the images differ in shape, or if the mask is not boolean or not (h, w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hsi_sc_nerf.numerics import masked_mean, narrow, safe_log10, safe_sqrt, select_pixels, spectral_angle
+
+# The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
+PSNR_DELTA = 1e-10
+# Stability constants of Wang et al. 2004 (K1 = 0.01, K2 = 0.03) for a dynamic range of 1, and their window.
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+SSIM_WINDOW_PX = 11
+SSIM_WINDOW_SIGMA_PX = 1.5
+
+# Values of one image in a block: 16 MiB a temporary in float64.
+_BLOCK_VALUES = 1 << 21
+
+Image = Float[Tensor, "h w bands"]
+Mask = Bool[Tensor, "h w"]
+
+
+def _blocks(predicted: Tensor, target: Tensor, dim: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Both images in slices along ``dim``."""
+    if predicted.shape != target.shape:
+        raise ValueError(f"the images differ in shape: {tuple(predicted.shape)} and {tuple(target.shape)}")
+    step = max(1, _BLOCK_VALUES * predicted.shape[dim] // max(1, predicted.numel()))
+    yield from zip(predicted.split(step, dim), target.split(step, dim), strict=True)
+
+
+def spectral_angle_map(predicted: Image, target: Image) -> Float[Tensor, "h w"]:
+    """The angle between the spectra of each pixel, radians in [0, pi]; pi / 2 where either spectrum is zero."""
+    return torch.cat([spectral_angle(p, t) for p, t in _blocks(predicted, target, 0)])
+
+
+def squared_error_map(predicted: Image, target: Image) -> Float[Tensor, "h w"]:
+    """Mean squared error over the bands of each pixel, float64."""
+    return torch.cat([(p.double() - t.double()).square().mean(-1) for p, t in _blocks(predicted, target, 0)])
+
+
+def spectral_angle_mapper(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Mean over pixels of the angle between the spectra, radians (paper, SAM; Kruse et al. 1993).
+
+    A pixel whose spectrum is zero on either side counts pi / 2, which is what the paper's delta makes of it.
+    """
+    return masked_mean(spectral_angle_map(predicted, target), mask)
+
+
+def spectral_rmse(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Root of the squared error's mean over pixels and bands (paper, spectral RMSE)."""
+    return narrow(safe_sqrt(masked_mean(squared_error_map(predicted, target), mask)), predicted)
+
+
+def pixel_mean_rmse(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Mean over pixels of each pixel's root mean squared error over the bands.
+
+    This is what the paper's released code prints as RMSE; it is never above ``spectral_rmse``, the text's.
+    """
+    return narrow(masked_mean(safe_sqrt(squared_error_map(predicted, target)), mask), predicted)
+
+
+def _over_pixels(
+    band_score: Callable[[Tensor, Tensor], Tensor], predicted: Tensor, target: Tensor, mask: Tensor | None
+) -> Float[Tensor, "bands"]:
+    """A score of each band from its selected pixels: ``band_score`` gets (n, some bands) float64 twice."""
+    scores = [
+        band_score(select_pixels(p, mask).double(), select_pixels(t, mask).double())
+        for p, t in _blocks(predicted, target, -1)
+    ]
+    return torch.cat(scores)
+
+
+def _mean(values: Float[Tensor, "n bands"]) -> Float[Tensor, "bands"]:
+    return values.sum(0) / max(values.shape[0], 1)
+
+
+def per_band_mse(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, "bands"]:
+    """Mean squared error over the pixels of each band, float64 (paper, MSE_b)."""
+    return _over_pixels(lambda p, t: _mean((p - t).square()), predicted, target, mask)
+
+
+def per_band_psnr(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, "bands"]:
+    """Peak signal-to-noise ratio of each band, dB, for a peak of 1; at most ``-10 log10(PSNR_DELTA)`` = 100 dB."""
+    return narrow(-10.0 * safe_log10(per_band_mse(predicted, target, mask) + PSNR_DELTA), predicted)
+
+
+def psnr(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Mean over bands of ``per_band_psnr`` (paper, PSNR_HSI): not the PSNR of the mean error."""
+    return per_band_psnr(predicted, target, mask).mean()
+
+
+def _ssim(mean_p: Tensor, mean_t: Tensor, variance_p: Tensor, variance_t: Tensor, covariance: Tensor) -> Tensor:
+    """SSIM from the moments (Wang et al. 2004, Eq. 13), in [-1, 1] even where rounding has bent the moments."""
+    variance_p, variance_t = variance_p.clamp_min(0), variance_t.clamp_min(0)
+    bound = (variance_p * variance_t).sqrt()
+    covariance = covariance.clamp(-bound, bound)
+    luminance = (2 * mean_p * mean_t + SSIM_C1) / (mean_p.square() + mean_t.square() + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
+
+
+def _ssim_over_pixels(p: Float[Tensor, "n bands"], t: Float[Tensor, "n bands"]) -> Float[Tensor, "bands"]:
+    mean_p, mean_t = _mean(p), _mean(t)
+    p, t = p - mean_p, t - mean_t
+    return _ssim(mean_p, mean_t, _mean(p.square()), _mean(t.square()), _mean(p * t))
+
+
+def per_band_ssim(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, "bands"]:
+    """SSIM of each band with means, variances and covariance over all the pixels of the mask: one window."""
+    return narrow(_over_pixels(_ssim_over_pixels, predicted, target, mask), predicted)
+
+
+def ssim(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Structural similarity, mean over bands, with moments "computed over pixels in Omega" (paper, SSIM_HSI).
+
+    Read to the letter: one window, the whole of Omega, however the pixels lie. It asks whether the object's contrast
+    is right as a whole, not whether details are in place; ``windowed_ssim`` does that.
+    """
+    return per_band_ssim(predicted, target, mask).mean()
+
+
+def _gaussian_weights(size: int, centres: Tensor) -> Float[Tensor, "centres size"]:
+    """One row a centre: the window's weights over a line of ``size`` pixels, cut at its ends and summing to 1."""
+    distance = torch.arange(size, dtype=torch.float64, device=centres.device) - centres[:, None]
+    weights = torch.exp(-0.5 * (distance / SSIM_WINDOW_SIGMA_PX).square())
+    weights = torch.where(distance.abs() <= SSIM_WINDOW_PX // 2, weights, 0.0)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def per_band_windowed_ssim(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, "bands"]:
+    """``windowed_ssim`` of each band."""
+    height, width, bands = predicted.shape
+    if mask is None:
+        mask = torch.ones(height, width, dtype=torch.bool, device=predicted.device)
+    if len(select_pixels(predicted[..., :1], mask)) == 0:
+        return narrow(predicted.new_ones(bands), predicted)
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    weights_rows, weights_columns = _gaussian_weights(height, rows), _gaussian_weights(width, columns)
+    centres = mask[rows][:, columns]
+
+    def local_mean(values: Float[Tensor, "some h w"]) -> Float[Tensor, "some rows columns"]:
+        return weights_rows @ (values @ weights_columns.T)
+
+    scores = []
+    for some_p, some_t in _blocks(predicted, target, -1):
+        p, t = some_p.double().movedim(-1, 0), some_t.double().movedim(-1, 0)
+        mean_p, mean_t = local_mean(p), local_mean(t)
+        local = _ssim(
+            mean_p,
+            mean_t,
+            local_mean(p.square()) - mean_p.square(),
+            local_mean(t.square()) - mean_t.square(),
+            local_mean(p * t) - mean_p * mean_t,
+        )
+        scores.append(local[:, centres].mean(1))
+    return narrow(torch.cat(scores), predicted)
+
+
+def windowed_ssim(predicted: Image, target: Image, mask: Mask | None = None) -> Float[Tensor, ""]:
+    """Mean SSIM over 11 x 11 Gaussian windows (sigma 1.5 px) and bands: the usual index of Wang et al. 2004.
+
+    A window counts if its centre lies in the mask; what it covers may lie outside. At the image's border the window
+    is cut and its weights are scaled to sum to 1, so that every pixel is a centre. The paper's formula, ``ssim``,
+    takes the moments over all pixels at once instead.
+    """
+    return per_band_windowed_ssim(predicted, target, mask).mean()
+
+
+def spectral_metrics(predicted: Image, target: Image, mask: Mask | None = None) -> dict[str, float]:
+    """Every metric of one view, by name.
+
+    ``sam`` (rad), ``rmse``, ``ssim`` and ``psnr`` (dB) are the paper's; ``rmse_pixel_mean`` and ``ssim_windowed`` are
+    other usual readings of the same names.
+    """
+    metrics = {
+        "sam": spectral_angle_mapper,
+        "rmse": spectral_rmse,
+        "rmse_pixel_mean": pixel_mean_rmse,
+        "ssim": ssim,
+        "ssim_windowed": windowed_ssim,
+        "psnr": psnr,
+    }
+    return {name: metric(predicted, target, mask).item() for name, metric in metrics.items()}
