@@ -1,0 +1,33 @@
+"""``hsi-sc-nerf process``: raw captures in, packed dataset out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from hsi_sc_nerf.data.process import ProcessConfig, process_session
+
+
+@dataclass(frozen=True)
+class ProcessCommand:
+    """Calibrate the captures of a turntable session, find their poses and masks, and pack them for training.
+
+    A run that stopped goes on where it was; the same session with the same settings is processed once.
+    """
+
+    session: tyro.conf.Positional[Path]
+    """Folder of the capture session."""
+    output_dir: Path
+    """Folder to write the dataset to."""
+    config: tyro.conf.OmitArgPrefixes[ProcessConfig] = field(default_factory=ProcessConfig)
+    """Settings; the defaults are the paper's where it prints them."""
+
+    def main(self) -> None:
+        """Run the command.
+
+        Raises:
+            InputError: the session cannot be used or the dataset cannot be written.
+        """
+        process_session(self.session, self.output_dir, self.config)

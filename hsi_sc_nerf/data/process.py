@@ -1,0 +1,271 @@
+"""From a capture session to a packed dataset: calibration, poses, masks, boxes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.atomic import write_json, write_png
+from hsi_sc_nerf.data.calibration import CalibrationConfig, WhiteReference, white_reference
+from hsi_sc_nerf.data.fingerprint import capture_files, fingerprint, session_fingerprint
+from hsi_sc_nerf.data.frames import FrameNotes, FramePaths, border_spectrum, finished_notes, process_frame
+from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask
+from hsi_sc_nerf.data.packed import (
+    TRANSFORMS_NAME,
+    Container,
+    PackedDataset,
+    PackedFrame,
+    is_packed,
+    open_packed,
+    write_transforms,
+)
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
+from hsi_sc_nerf.data.report import mask_picture, white_reference_picture
+from hsi_sc_nerf.data.scene_box import object_box, scene_box
+from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Session, open_session
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.estimate import TurntablePoses, estimate_turntable_poses
+from hsi_sc_nerf.poses.picture import draw_poses
+
+_log = logging.getLogger(__name__)
+
+PoseFunction = Callable[..., TurntablePoses]
+"""Called like ``poses.estimate.estimate_turntable_poses``."""
+
+
+@dataclass(frozen=True)
+class ProcessConfig:
+    """Settings of the way from raw captures to a packed dataset."""
+
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """White-reference calibration."""
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    """Foreground masks."""
+    pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
+    """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
+    marker_range_nm: tuple[float, float] = (450.0, 700.0)
+    """Markers are looked for in the mean image of these bands, nm (many inks are transparent beyond 700 nm)."""
+    object_margin_m: float = 0.003
+    """The object's box is widened by this, metres."""
+    scene_margin_m: float = 0.005
+    """The box of everything that turns is widened by this, metres."""
+    workers: int = 2
+    """Frames that are calibrated at the same time; each needs memory for three copies of a raw cube."""
+
+
+def process_session(
+    session_dir: Path,
+    output_dir: Path,
+    config: ProcessConfig | None = None,
+    progress: bool = True,
+    estimate_poses: PoseFunction = estimate_turntable_poses,
+) -> Path:
+    """Make the packed dataset ``output_dir`` (docs/architecture.md) from a capture session; returns its path.
+
+    The same session with the same settings is processed once: a second call returns at once. A run that stopped
+    goes on with the frames that are not finished. ``transforms.json`` is written last, so a dataset that has one is
+    whole.
+
+    Raises:
+        InputError: the session cannot be used (``open_session``, ``white_reference``), has no marker size, shows no
+            markers or no object; or the output cannot be written or holds another dataset.
+    """
+    config = config or ProcessConfig()
+    output_dir = Path(output_dir)
+    console = Console(stderr=True, quiet=not progress)
+    session = open_session(session_dir)
+    stamp = session_fingerprint(session, config)
+    if _is_done(output_dir, stamp):
+        console.print(f"{output_dir}: is up to date.")
+        return output_dir
+    if session.info.marker_side_m is None:
+        raise InputError(
+            f"{session.path / SESSION_INFO_NAME}: does not give marker_side_m, the side of a marker's black square "
+            "in metres, without which nothing has a size; add it."
+        )
+    _clear_transforms(output_dir)
+
+    white = white_reference(session.white, config.calibration)
+    white_reference_picture(
+        output_dir / "report" / "white_reference.png", session.white.cube, white, config.pseudo_rgb_nm
+    )
+    console.print(f"White reference: {int(white.mask.sum())} pixels of the tarp in {session.white.name}.")
+
+    names = [capture.name for capture in session.frames]
+    notes = _process_frames(session, output_dir, white, config, progress)
+    poses = estimate_poses(
+        [note.gray for note in notes],
+        names,
+        dictionary=session.info.marker_dictionary,
+        marker_side_m=session.info.marker_side_m,
+        nominal_step_deg=session.info.nominal_step_deg,
+        direction=session.info.direction,
+        progress=progress,
+    )
+    write_json(output_dir / "poses.json", poses.report())
+    draw_poses(poses, output_dir / "report" / "poses.png")
+    frames = _posed_frames(output_dir, names, poses)
+    mean_error_px = np.mean([frame.reprojection_error_px for frame in frames])
+    console.print(f"Poses: {len(frames)} of {len(names)} frames, {mean_error_px:.2f} px.")
+
+    container = _container(session)
+    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
+    scores = [note.score for note, used in zip(notes, poses.used, strict=True) if used]
+    masks = _make_masks(scores, camera_to_worlds, poses, container, config.masks)
+    for frame, mask in zip(frames, masks, strict=True):
+        write_png(frame.mask_path, mask.astype(np.uint8) * 255)
+    mask_picture(
+        output_dir / "report" / "masks.png",
+        [frame.pseudo_rgb() for frame in frames],
+        list(masks),
+        [frame.capture for frame in frames],
+    )
+    console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
+
+    bounds = object_box(
+        masks,
+        camera_to_worlds,
+        poses.intrinsics,
+        min_z_m=None if container is None else container.height_m,
+        margin_m=config.object_margin_m,
+    )
+    size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(bounds, axis=0)[0])
+    console.print(f"Object: inside a box of {size_mm} mm.")
+    dataset = PackedDataset(
+        root=output_dir,
+        intrinsics=poses.intrinsics,
+        distortion=np.array(poses.distortion, dtype=float),
+        wavelengths_nm=session.wavelengths_nm,
+        pseudo_rgb_nm=session.wavelengths_nm[nearest_bands(session.wavelengths_nm, config.pseudo_rgb_nm)],
+        object_name=session.info.object or session.path.resolve().name,
+        scene_box_m=scene_box(bounds, poses.marker_corners_m, container, config.scene_margin_m),
+        object_box_m=bounds,
+        background_reflectance=_background(frames, masks),
+        container=container,
+        frames=tuple(frames),
+        fingerprint=stamp,
+    )
+    write_transforms(dataset)
+    console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
+    return output_dir
+
+
+def _is_done(output_dir: Path, stamp: str) -> bool:
+    if not is_packed(output_dir):
+        return False
+    try:
+        return open_packed(output_dir).fingerprint == stamp
+    except InputError:  # an incomplete dataset is made again
+        return False
+
+
+def _clear_transforms(output_dir: Path) -> None:
+    """Take away an outdated ``transforms.json``: its frames are about to change."""
+    transforms = output_dir / TRANSFORMS_NAME
+    if transforms.exists() and not is_packed(output_dir):
+        raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
+    transforms.unlink(missing_ok=True)
+
+
+def _process_frames(
+    session: Session, output_dir: Path, white: WhiteReference, config: ProcessConfig, progress: bool
+) -> list[FrameNotes]:
+    """Notes of all frames, in order; frames that an earlier run finished are not touched."""
+    common = [
+        capture_files(session, session.white),
+        asdict(config.calibration),
+        [config.masks.spectral_bins, config.masks.smoothing_px],
+        [config.pseudo_rgb_nm, config.marker_range_nm],
+    ]
+
+    def work(index: int) -> FrameNotes:
+        capture = session.frames[index]
+        paths = FramePaths.of(output_dir, capture.name)
+        stamp = fingerprint([common, capture_files(session, capture)])
+        return finished_notes(paths, stamp) or process_frame(
+            capture,
+            paths,
+            stamp,
+            white,
+            config.calibration,
+            config.masks,
+            pseudo_rgb_nm=config.pseudo_rgb_nm,
+            marker_range_nm=config.marker_range_nm,
+        )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with (
+        Progress(*columns, console=Console(stderr=True), disable=not progress) as bar,
+        ThreadPoolExecutor(config.workers) as pool,
+    ):
+        task = bar.add_task("Calibrating frames", total=len(session.frames))
+        futures = [pool.submit(work, index) for index in range(len(session.frames))]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                bar.advance(task)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [future.result() for future in futures]
+
+
+def _container(session: Session) -> Container | None:
+    diameter, height = session.info.container_diameter_m, session.info.container_height_m
+    return None if diameter is None or height is None else Container(diameter, height)
+
+
+def _posed_frames(output_dir: Path, names: Sequence[str], poses: TurntablePoses) -> list[PackedFrame]:
+    """The frames that have a pose; each of the others gets a warning."""
+    frames = []
+    for i, name in enumerate(names):
+        if not poses.used[i]:
+            _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
+            continue
+        paths = FramePaths.of(output_dir, name)
+        frames.append(
+            PackedFrame(
+                capture=name,
+                image_path=paths.image,
+                mask_path=paths.mask,
+                cube_path=paths.cube,
+                angle_deg=float(poses.angles_deg[i]),
+                reprojection_error_px=float(poses.reprojection_error_px[i]),
+                camera_to_world=poses.camera_to_world[i],
+            )
+        )
+    return frames
+
+
+def _make_masks(
+    scores: Sequence[Float[np.ndarray, "h w"]],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    poses: TurntablePoses,
+    container: Container | None,
+    config: MaskConfig,
+) -> Bool[np.ndarray, "frames h w"]:
+    threshold = choose_threshold(scores, config)
+    distortion = np.array(poses.distortion, dtype=float)
+    masks = []
+    for score, pose in zip(scores, camera_to_worlds, strict=True):
+        allowed = above_lid(poses.intrinsics, distortion, pose, container, config.overhang) if container else None
+        masks.append(
+            foreground_mask(score, threshold, allowed=allowed, morphology_fraction=config.morphology_fraction)
+        )
+    return np.stack(masks)
+
+
+def _background(frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]) -> Float[np.ndarray, "bands"]:
+    """Median over frames of the spectra along the image's border; nan-free, 0 where no frame shows background."""
+    spectra = np.stack([border_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
+    shown = spectra[np.isfinite(spectra).all(axis=1)]
+    return np.median(shown, axis=0) if len(shown) else np.zeros(spectra.shape[1])
