@@ -1,0 +1,79 @@
+"""How well a reconstructed surface fits a known one (paper, section "Spatial Evaluation Metrics")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.paper import F_SCORE_THRESHOLD_M
+
+
+@dataclass(frozen=True)
+class SpatialScore:
+    """Precision, recall and their harmonic mean, each in percent, at one distance threshold."""
+
+    precision: float
+    recall: float
+    f_score: float
+
+
+def precision_recall_f_score(
+    reconstructed_m: Float[np.ndarray, "n 3"],
+    reference_m: Float[np.ndarray, "m 3"],
+    threshold_m: float = F_SCORE_THRESHOLD_M,
+) -> SpatialScore:
+    """Point-to-point precision, recall and F-score of a reconstruction against a reference, in the same frame.
+
+    Precision is the share of reconstructed points within ``threshold_m`` (included) of a reference point, recall the
+    share of reference points within it of a reconstructed one; the F-score is 2 P R / (P + R), and 0 where both are.
+    Distances to points overstate distances to the surface by up to the spacing: sample the reference densely.
+    An empty cloud scores 0.
+    """
+    if not len(reconstructed_m) or not len(reference_m):
+        return SpatialScore(0.0, 0.0, 0.0)
+    precision, recall = (
+        100.0 * float(np.mean(cKDTree(there).query(here, workers=-1)[0] <= threshold_m))
+        for here, there in ((reconstructed_m, reference_m), (reference_m, reconstructed_m))
+    )
+    total = precision + recall
+    return SpatialScore(precision, recall, 2 * precision * recall / total if total else 0.0)
+
+
+def sample_surface(
+    vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], count: int, seed: int = 0
+) -> Float[np.ndarray, "{count} 3"]:
+    """Points spread evenly over a triangle mesh's area.
+
+    Stratified: the mesh's area is cut into ``count`` equal shares in the order of the triangles, and each share gets
+    one point, so that every triangle gets its share to within one point. Uniform within a triangle (Osada et al.
+    2002, "Shape Distributions", section 3.2).
+
+    Raises:
+        ValueError: the mesh has no area.
+    """
+    corners = np.asarray(vertices_m, float)[triangles]
+    edges = corners[:, 1:] - corners[:, :1]
+    reach = np.cumsum(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1))
+    if not len(reach) or reach[-1] <= 0:
+        raise ValueError("sample_surface: the mesh has no area")
+    random = np.random.default_rng(seed)
+    shares = (np.arange(count) + random.random(count)) * (reach[-1] / count)
+    chosen = np.searchsorted(reach, shares, side="right").clip(max=len(reach) - 1)
+    root, along = np.sqrt(random.random(count))[:, None], random.random(count)[:, None]
+    return corners[chosen, 0] + root * ((1 - along) * edges[chosen, 0] + along * edges[chosen, 1])
+
+
+def distance_to_surface(
+    points_m: Float[np.ndarray, "n 3"], vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> Float[np.ndarray, "n"]:
+    """Unsigned distance of each point to the nearest point of a triangle mesh, metres (Open3D, float32)."""
+    import open3d  # heavy, and the scores above do without it
+
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        open3d.core.Tensor(np.asarray(vertices_m, np.float32)), open3d.core.Tensor(np.asarray(triangles, np.uint32))
+    )
+    return scene.compute_distance(open3d.core.Tensor(np.asarray(points_m, np.float32))).numpy()

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.evaluation.spatial import (
+    SpatialScore,
+    distance_to_surface,
+    precision_recall_f_score,
+    sample_surface,
+)
+
+# A square of 10 cm in the plane z = 0, as a mesh of two triangles.
+SQUARE = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def plane(side: int = 41, spacing_m: float = 0.0025, z_m: float = 0.0) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(side) * spacing_m, np.arange(side) * spacing_m)
+    return np.stack([x.ravel(), y.ravel(), np.full(side * side, z_m)], -1)
+
+
+def as_tuple(score: SpatialScore) -> tuple[float, float, float]:
+    return score.precision, score.recall, score.f_score
+
+
+@pytest.mark.parametrize(("offset_m", "percent"), [(0.0, 100), (0.001999, 100), (0.002001, 0), (0.5, 0)])
+def test_a_plane_moved_along_its_normal(offset_m: float, percent: float) -> None:
+    assert as_tuple(precision_recall_f_score(plane(z_m=offset_m), plane(), 0.002)) == (percent,) * 3
+
+
+def test_the_threshold_itself_counts() -> None:
+    assert as_tuple(precision_recall_f_score(np.array([[0.0, 0, 0.5]]), np.zeros((1, 3)), 0.5)) == (100, 100, 100)
+
+
+def test_a_missing_half_costs_recall_only() -> None:
+    reference = plane(40)
+    half = reference[reference[:, 0] < 0.0499]
+    score = precision_recall_f_score(half, reference, 0.002)
+    assert as_tuple(score) == pytest.approx((100, 50, 200 / 3))
+    assert as_tuple(precision_recall_f_score(reference, half, 0.002)) == pytest.approx((50, 100, 200 / 3))
+
+
+def test_outliers_cost_precision_only() -> None:
+    reference = plane(40)
+    cloud = np.concatenate([reference, plane(20, z_m=1.0)])
+    assert as_tuple(precision_recall_f_score(cloud, reference, 0.002)) == pytest.approx((80, 100, 1600 / 18))
+
+
+def test_a_plane_moved_in_itself_loses_its_rim() -> None:
+    shifted = plane(40) + np.array([0.0025 * 4, 0, 0])
+    assert as_tuple(precision_recall_f_score(shifted, plane(40), 0.001)) == pytest.approx((90, 90, 90))
+
+
+def test_gaussian_noise_along_the_normal() -> None:
+    noisy = plane(400, 0.0001)
+    noisy[:, 2] = np.random.default_rng(0).normal(0, 0.002, len(noisy))
+    score = precision_recall_f_score(noisy, plane(400, 0.0001), 0.002)
+    assert score.precision == pytest.approx(68.27, abs=0.5)
+
+
+def test_an_empty_cloud_scores_nothing() -> None:
+    assert as_tuple(precision_recall_f_score(np.zeros((0, 3)), plane(), 0.002)) == (0, 0, 0)
+    assert as_tuple(precision_recall_f_score(plane(), np.zeros((0, 3)), 0.002)) == (0, 0, 0)
+
+
+def test_samples_are_even_over_the_area_whatever_the_triangles() -> None:
+    # The same square with one of its halves cut into 64 slivers.
+    fan = np.linspace([0.1, 0.1, 0], [0, 0.1, 0], 65)
+    vertices = np.concatenate([SQUARE, fan])
+    triangles = np.array([[0, 1, 2], *([0, 4 + i, 5 + i] for i in range(64))])
+    points = sample_surface(vertices, triangles, 40_000, seed=1)
+    assert points.shape == (40_000, 3)
+    assert not points[:, 2].any()
+    counts = np.histogram2d(points[:, 0], points[:, 1], bins=4, range=[[0, 0.1], [0, 0.1]])[0]
+    np.testing.assert_allclose(counts, 2500, rtol=0.06)
+    assert abs(np.sum(points[:, 1] > points[:, 0]) - 20_000) <= 1
+
+
+def test_samples_repeat_with_the_seed() -> None:
+    same = [sample_surface(SQUARE, TRIANGLES, 100, seed=5) for _ in range(2)]
+    np.testing.assert_array_equal(*same)
+    assert (sample_surface(SQUARE, TRIANGLES, 100, seed=6) != same[0]).any()
+
+
+def test_a_mesh_without_area_is_refused() -> None:
+    for triangles in (np.zeros((0, 3), int), np.array([[0, 0, 0]])):
+        with pytest.raises(ValueError, match="no area"):
+            sample_surface(SQUARE, triangles, 10)
+
+
+def test_two_samplings_of_one_surface_agree() -> None:
+    a, b = (sample_surface(SQUARE, TRIANGLES, 20_000, seed) for seed in (0, 1))
+    assert precision_recall_f_score(a, b, 0.002).f_score > 99.9
+
+
+def test_distance_to_the_surface_not_to_its_vertices() -> None:
+    points = np.array([[0.05, 0.05, 0.003], [0.05, 0.05, -0.003], [0.05, 0.02, 0.0], [0.13, 0.05, 0.04]])
+    np.testing.assert_allclose(distance_to_surface(points, SQUARE, TRIANGLES), [0.003, 0.003, 0.0, 0.05], atol=1e-8)
+
+
+def test_scores_need_no_open3d() -> None:
+    program = "import sys, hsi_sc_nerf.evaluation.spatial as s; sys.exit('open3d' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
