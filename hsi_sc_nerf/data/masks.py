@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.data.packed import Container
-from hsi_sc_nerf.data.regions import ellipse_close_open, fill_holes, largest_component
+from hsi_sc_nerf.data.regions import dilate, ellipse_close_open, fill_holes, largest_component, touching
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
 
@@ -32,6 +32,8 @@ class MaskConfig:
     """Standard deviation of the Gaussian that smooths the bins over neighbouring pixels, pixels; 0 for none."""
     threshold: float | None = None
     """Spread of reflectance over the bins from which a pixel is the object's. Found over all frames if not given."""
+    weak_share: float = 0.5
+    """Parts that stick out of the object (a stem) are added from this share of the threshold; 1 for none."""
     min_contrast: float = 0.03
     """Least difference between the mean spreads of object and background that is believed."""
     morphology_fraction: float = 0.01
@@ -127,15 +129,22 @@ def foreground_mask(
     threshold: float,
     *,
     allowed: Bool[np.ndarray, "lines samples"] | None = None,
+    weak_share: float = 0.5,
     morphology_fraction: float = 0.01,
 ) -> Bool[np.ndarray, "lines samples"]:
-    """Pixels above the threshold (inside ``allowed``): gaps closed, largest component, holes filled."""
-    mask = score > threshold
-    if allowed is not None:
-        mask &= allowed
+    """Pixels above the threshold (inside ``allowed``): gaps closed, largest component, holes filled.
+
+    Parts above ``weak_share`` of the threshold that stick out of the object (a woody stem) are added; its rim, where
+    pixels are part background, does not grow. A share of 1 adds nothing.
+    """
+    allowed = np.ones(score.shape, dtype=bool) if allowed is None else allowed
     closing_px = max(3, round(morphology_fraction * min(score.shape)))
-    mask = ellipse_close_open(mask, close_px=closing_px, open_px=0)
-    return fill_holes(largest_component(mask))
+    closed = ellipse_close_open((score > threshold) & allowed, close_px=closing_px, open_px=0)
+    body = fill_holes(largest_component(closed))
+    weak = (score > weak_share * threshold) & allowed
+    rim = dilate(body, closing_px)
+    sticking_out = touching(weak & ~rim, dilate(rim, 3))
+    return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
 
 
 _Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]

@@ -259,7 +259,13 @@ def _make_masks(
     for score, pose in zip(scores, camera_to_worlds, strict=True):
         allowed = above_lid(poses.intrinsics, distortion, pose, container, config.overhang) if container else None
         masks.append(
-            foreground_mask(score, threshold, allowed=allowed, morphology_fraction=config.morphology_fraction)
+            foreground_mask(
+                score,
+                threshold,
+                allowed=allowed,
+                weak_share=config.weak_share,
+                morphology_fraction=config.morphology_fraction,
+            )
         )
     return np.stack(masks)
 

@@ -19,6 +19,20 @@ def ellipse_close_open(
     return mask
 
 
+def dilate(mask: Bool[np.ndarray, "lines samples"], size_px: int) -> Bool[np.ndarray, "lines samples"]:
+    """Dilation with an ellipse of the given diameter (odd)."""
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size_px, size_px))
+    return cv2.dilate(mask.astype(np.uint8), ellipse) > 0
+
+
+def touching(
+    mask: Bool[np.ndarray, "lines samples"], other: Bool[np.ndarray, "lines samples"]
+) -> Bool[np.ndarray, "lines samples"]:
+    """The 8-connected components of the mask that share a pixel with ``other``."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    return mask & np.isin(labels, np.unique(labels[mask & other]))
+
+
 def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
     """The largest 8-connected component; an empty mask stays empty."""
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)

@@ -34,7 +34,8 @@ def white_reference_picture(path: Path, cube: Cube, white: WhiteReference, rgb_n
 
     figure = Figure(figsize=(14, 7), layout="constrained")
     FigureCanvasAgg(figure)
-    tarp, deviation, mask = (figure.add_subplot(2, 3, column) for column in (1, 2, 3))
+    axes = figure.subplot_mosaic([["tarp", "deviation", "mask"], ["spectrum"] * 3])
+    tarp, deviation, mask, spectrum = (axes[name] for name in ("tarp", "deviation", "mask", "spectrum"))
     tarp.imshow(image)
     tarp.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2))
     tarp.set_title("White tarp and its coarse region")
@@ -44,7 +45,6 @@ def white_reference_picture(path: Path, cube: Cube, white: WhiteReference, rgb_n
     mask.imshow(outlined(image, kept))
     mask.set_title(f"Region kept: {int(white.mask.sum())} pixels")
 
-    spectrum = figure.add_subplot(2, 1, 2)
     spectrum.plot(cube.wavelengths_nm, white.measured, color="tab:gray", label="measured")
     spectrum.plot(cube.wavelengths_nm, white.spectrum, color="tab:blue", label="smoothed")
     spectrum.set(xlabel="wavelength (nm)", ylabel="counts above dark", title="White spectrum")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.data.packed import Container
+from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
 
@@ -28,20 +29,22 @@ def carve(
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
     min_agreement: float = 0.95,
-) -> Bool[np.ndarray, "n"]:
-    """Which points lie in the masks of at least ``min_agreement`` of the frames that see them.
+) -> Float[np.ndarray, "kept 3"]:
+    """The points that some frame sees and that lie outside the mask in few frames.
 
-    A point that no frame sees is not in the hull.
+    Few are at most ``1 - min_agreement`` of all frames: a wrong mask or pose may cut a piece off the object.
     """
-    inside = np.zeros(len(points))
-    seen = np.zeros(len(points))
+    allowed = int((1.0 - min_agreement) * len(masks) + 1e-9)
+    missed = np.zeros(len(points), dtype=int)
+    seen = np.zeros(len(points), dtype=bool)
     for mask, pose in zip(masks, camera_to_worlds, strict=True):
         pixels, depth = project(points, pose, intrinsics)
         in_image = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < (intrinsics.w, intrinsics.h)).all(axis=1)
         x, y = pixels[in_image].astype(int).T
-        seen += in_image
-        inside[in_image] += mask[y, x]
-    return (seen > 0) & (inside >= min_agreement * seen)
+        missed[in_image] += ~mask[y, x]
+        keep = missed <= allowed
+        points, missed, seen = points[keep], missed[keep], (seen | in_image)[keep]
+    return points[seen]
 
 
 def object_box(
@@ -51,18 +54,20 @@ def object_box(
     *,
     min_z_m: float | None = None,
     margin_m: float = 0.003,
-    resolution: int = 64,
+    resolution: int = 48,
 ) -> Float[np.ndarray, "2 3"]:
-    """Minimum and maximum of the masks' visual hull (metres), widened by a voxel's half and ``margin_m``.
+    """Minimum and maximum of the masks' visual hull (metres), widened by ``margin_m``.
 
-    The hull is carved twice: in the cube that the cameras see, then in the bounds found there. Lens distortion is
-    neglected. ``min_z_m`` is a floor under the object (the container's lid), where it is known.
+    The hull is carved twice: in the cube that the cameras see, then in the bounds found there. A voxel counts where
+    any part of it may lie in the masks (they are dilated by half its diagonal), so that thin parts are not lost
+    between the voxels' centres. Lens distortion is neglected. ``min_z_m`` is a floor under the object (the
+    container's lid), where it is known.
 
     Raises:
         InputError: no point projects into the masks: masks and poses do not fit each other.
     """
     centre = focus_point(camera_to_worlds)
-    distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).max()
+    distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).min()
     reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
     low, high = centre - reach, centre + reach
     for _ in range(2):
@@ -71,15 +76,17 @@ def object_box(
         points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
         if min_z_m is not None:
             points = points[points[:, 2] >= min_z_m - step[2] / 2.0]
-        hull = points[carve(points, masks, camera_to_worlds, intrinsics)]
+        half_diagonal_px = intrinsics.fl_x * np.linalg.norm(step) / 2.0 / distance
+        size_px = 2 * int(np.ceil(half_diagonal_px)) + 1
+        widened = np.stack([dilate(mask, size_px) for mask in masks])
+        hull = carve(points, widened, camera_to_worlds, intrinsics)
         if len(hull) == 0:
             raise InputError(
                 "the foreground masks and the poses do not fit each other, so that no object is left in space; look "
                 "at report/masks.png and report/poses.png."
             )
-        low, high = hull.min(axis=0) - step, hull.max(axis=0) + step
-    # The second carving left a whole voxel around the outermost centres; half of one is their own extent.
-    box = np.stack([low + step / 2.0 - margin_m, high - step / 2.0 + margin_m])
+        low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
+    box = np.stack([low - margin_m, high + margin_m])
     if min_z_m is not None:
         box[0, 2] = max(box[0, 2], min_z_m)
     return box
