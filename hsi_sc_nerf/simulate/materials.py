@@ -47,12 +47,12 @@ MATERIALS: dict[str, PlantTissue | Plain] = {
     "pear_blush": PlantTissue(0.64, chlorophyll=0.30, carotenoid=0.52, anthocyanin=0.55, brown=0.12, water=0.075),
     "apple_skin": PlantTissue(0.68, chlorophyll=0.34, carotenoid=0.55, brown=0.06, water=0.080),
     "apple_blush": PlantTissue(0.64, chlorophyll=0.26, carotenoid=0.60, anthocyanin=1.05, brown=0.10, water=0.080),
-    "bruise": PlantTissue(0.44, chlorophyll=0.16, carotenoid=0.45, anthocyanin=0.12, brown=0.55, water=0.125),
+    "bruise": PlantTissue(0.44, chlorophyll=0.08, carotenoid=0.25, anthocyanin=0.16, brown=0.85, water=0.125),
     "lenticel": PlantTissue(0.72, chlorophyll=0.12, carotenoid=0.26, brown=0.14, water=0.055),
     "stem": PlantTissue(0.42, chlorophyll=0.10, carotenoid=0.12, brown=0.80, water=0.030),
-    "kernel_yellow": PlantTissue(0.82, carotenoid=0.95, brown=0.07, water=0.040),
+    "kernel_yellow": PlantTissue(0.82, carotenoid=0.85, anthocyanin=0.05, brown=0.22, water=0.040),
     "kernel_white": PlantTissue(0.84, carotenoid=0.16, brown=0.07, water=0.040),
-    "kernel_purple": PlantTissue(0.62, carotenoid=0.35, anthocyanin=1.0, brown=0.45, water=0.040),
+    "kernel_purple": PlantTissue(0.60, carotenoid=0.30, anthocyanin=1.3, brown=0.55, water=0.040),
     "cob": PlantTissue(0.58, carotenoid=0.25, anthocyanin=0.10, brown=0.50, water=0.035),
     "husk": PlantTissue(0.62, chlorophyll=0.28, carotenoid=0.34, brown=0.22, water=0.055),
     "container_plastic": Plain(0.62, slope_per_um=0.05, blue_loss=0.12),
@@ -99,7 +99,7 @@ def _peak(wavelengths_nm: Spectrum, centre_nm: float, width_nm: float) -> Spectr
 def _chlorophyll(w: Spectrum) -> Spectrum:
     """Chlorophyll a and b in tissue: Soret bands, a low plateau in the green, the red band and its shoulder."""
     return (
-        1.1 * _peak(w, 435.0, 24.0)
+        1.1 * _peak(w, 418.0, 38.0)
         + 0.45 * _peak(w, 480.0, 20.0)
         + 0.28 * _peak(w, 590.0, 36.0)
         + 0.50 * _peak(w, 642.0, 17.0)
@@ -109,7 +109,7 @@ def _chlorophyll(w: Spectrum) -> Spectrum:
 
 def _carotenoid(w: Spectrum) -> Spectrum:
     """Carotenoids: three overlapping bands in the blue that end sharply by about 530 nm."""
-    return 0.8 * _peak(w, 425.0, 22.0) + 0.85 * _peak(w, 452.0, 16.0) + 0.75 * _peak(w, 482.0, 17.0)
+    return 0.8 * _peak(w, 412.0, 32.0) + 0.85 * _peak(w, 452.0, 16.0) + 0.75 * _peak(w, 482.0, 17.0)
 
 
 def _water(w: Spectrum) -> Spectrum:

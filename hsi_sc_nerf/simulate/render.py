@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
+import scipy.sparse
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.simulate.mesh import Mesh
 
+RAYS_AT_ONCE = 2**19
 WEIGHT_STEPS = 2048
 """Weights are multiples of 1 / 2048, which float16 holds exactly, so that stored weights sum to exactly 1."""
 
@@ -58,32 +60,46 @@ class Renderer:
 
         A pixel is the mean over ``supersampling`` x ``supersampling`` rays, evenly spaced (a box filter).
         """
-        s, h, w = supersampling, intrinsics.h, intrinsics.w
-        offsets = (np.arange(s) + 0.5) / s
-        # Subsamples of a pixel follow each other, so that a pixel is a run of s * s rays.
-        y, sub_y, x, sub_x = np.meshgrid(np.arange(h), offsets, np.arange(w), offsets, indexing="ij")
-        pixels = np.stack([x + sub_x, y + sub_y], axis=-1).transpose(0, 2, 1, 3, 4).reshape(-1, 2)
-        origin, directions = pixel_rays(intrinsics, camera_to_world, pixels)
-        rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=1).astype(np.float32)
-        hits = self._scene.cast_rays(o3d.core.Tensor(rays))
+        weights = np.empty((intrinsics.h, intrinsics.w, len(self.materials)), np.float32)
+        coverage = np.empty((intrinsics.h, intrinsics.w), np.float32)
+        # As many lines at once as keep the memory small.
+        lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
+        for first in range(0, intrinsics.h, lines):
+            rows = slice(first, min(first + lines, intrinsics.h))
+            pixels = _subpixels(rows, intrinsics.w, supersampling)
+            origin, directions = pixel_rays(intrinsics, camera_to_world, pixels)
+            of_rows, coverage_of_rows = self._mean_along_rays(origin, directions, supersampling**2)
+            weights[rows] = of_rows.reshape(-1, intrinsics.w, len(self.materials))
+            coverage[rows] = coverage_of_rows.reshape(-1, intrinsics.w)
+        return weights, coverage
 
+    def _mean_along_rays(
+        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
+    ) -> tuple[Float[np.ndarray, "pixels materials"], Float[np.ndarray, "pixels"]]:
+        """Weights and object share of pixels that are runs of ``rays_per_pixel`` rays."""
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = origin, directions
+        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         triangle = hits["primitive_ids"].numpy()
         hit = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
         triangle = triangle[hit]
-        uv = hits["primitive_uvs"].numpy()[hit]
-        barycentric = np.stack([1.0 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
-        of_hits = np.einsum("nk,nkm->nm", barycentric, self._weights[self._triangles[triangle]])
+        u, v = hits["primitive_uvs"].numpy()[hit].T
+        a, b, c = self._triangles[triangle].T
 
-        pixel = hit // (s * s)
-        starts = np.flatnonzero(np.diff(pixel, prepend=-1))
-        weights = np.zeros((h * w, len(self.materials)), np.float32)
-        coverage = np.zeros(h * w, np.float32)
-        if len(starts):
-            weights[pixel[starts]] = np.add.reduceat(of_hits, starts, axis=0)
-            coverage[pixel[starts]] = np.add.reduceat(self._is_object[triangle].astype(np.float32), starts)
-        weights /= s * s
+        # Each ray adds its hit's barycentric mix of three vertices to its pixel: one sparse matrix product.
+        pixel = hit // rays_per_pixel
+        pixels = len(directions) // rays_per_pixel
+        mix = scipy.sparse.csr_array(
+            (
+                np.concatenate([1.0 - u - v, u, v]) / rays_per_pixel,
+                (np.tile(pixel, 3), np.concatenate([a, b, c])),
+            ),
+            shape=(pixels, len(self._weights)),
+        )
+        weights = mix @ self._weights
         weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
-        return exact_weights(weights).reshape(h, w, -1), (coverage / (s * s)).reshape(h, w)
+        coverage = np.bincount(pixel, self._is_object[triangle], minlength=pixels) / rays_per_pixel
+        return exact_weights(weights), coverage
 
 
 def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray, "n materials"]:
@@ -95,3 +111,12 @@ def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray
     largest = steps.argmax(axis=1)
     steps[np.arange(len(steps)), largest] += WEIGHT_STEPS - steps.sum(axis=1)
     return (steps / WEIGHT_STEPS).astype(np.float32)
+
+
+def _subpixels(rows: slice, width: int, supersampling: int) -> Float[np.ndarray, "rays 2"]:
+    """Pixel coordinates of the rays through some lines of an image, those of a pixel one after the other."""
+    offsets = (np.arange(supersampling) + 0.5) / supersampling
+    y, x, sub_y, sub_x = np.meshgrid(
+        np.arange(rows.start, rows.stop), np.arange(width), offsets, offsets, indexing="ij"
+    )
+    return np.stack([x + sub_x, y + sub_y], axis=-1).reshape(-1, 2)

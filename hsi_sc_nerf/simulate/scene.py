@@ -7,6 +7,7 @@ physical effects beyond a matte object under even light (none exist yet).
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -150,6 +151,11 @@ def parse_scene(text: str, *, source: str, name: str) -> Scene:
         values.setdefault("name", name)
     scene = _read_dataclass(Scene, values, source, "")
     _check_ranges(scene, source, "")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", scene.name):
+        raise InputError(
+            f"{source}: name is {scene.name!r}, but must be of letters, digits, '_', '.' and '-', for captures are "
+            "named after it."
+        )
     if scene.effects:
         raise InputError(
             f"{source}: effect {scene.effects[0]!r} is unknown, for no effects exist yet; leave `effects` empty."

@@ -31,7 +31,7 @@ def lamp_photons(wavelengths_nm: Float[np.ndarray, "bands"], temperature_k: floa
 def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
     """Electrons per photon of a silicon sensor behind its grating, in [0, 1]: best near 600 nm, low at both ends."""
     nodes_nm = [390.0, 420.0, 470.0, 530.0, 600.0, 680.0, 760.0, 840.0, 920.0, 980.0, 1010.0]
-    values = [0.24, 0.36, 0.52, 0.63, 0.67, 0.62, 0.52, 0.39, 0.25, 0.14, 0.09]
+    values = [0.36, 0.44, 0.55, 0.63, 0.67, 0.62, 0.52, 0.39, 0.25, 0.14, 0.09]
     return np.interp(wavelengths_nm, nodes_nm, values)
 
 
@@ -49,5 +49,7 @@ def expose(
     signal_of_white: Float[np.ndarray, "bands"],
 ) -> UInt16[np.ndarray, "*n bands"]:
     """Counts of pixels that mix the materials by ``weights``."""
-    counts = weights @ (endmembers * signal_of_white) + sensor.dark_level
-    return np.clip(np.rint(counts), 0, 2**sensor.bit_depth - 1).astype(np.uint16)
+    counts = weights.astype(np.float32) @ (endmembers * signal_of_white).astype(np.float32)
+    counts += sensor.dark_level
+    np.rint(counts, out=counts)
+    return np.clip(counts, 0, 2**sensor.bit_depth - 1, out=counts).astype(np.uint16)

@@ -89,7 +89,7 @@ def maize(height_m: float, rng: np.random.Generator) -> Shape:
     vertices = mesh.vertices * np.stack([factor, factor, np.ones_like(factor)], axis=-1)
     bent = _bend(vertices, height_m, 0.03, rng)
     return Shape(
-        mesh=Mesh(bent, mesh.triangles),
+        mesh=Mesh(_stand(bent, height_m), mesh.triangles),
         stem=1.0 - smoothstep((z - low + 0.002) / 0.003),
         kernel=row * (int(along.max()) + 2) + np.floor(along).astype(int),
         groove=1.0 - smoothstep((dome - 0.25) / 0.3),
@@ -118,11 +118,14 @@ def _fruit(
     swell = 1.0 + 0.02 * np.cos(2.0 * azimuth + phase[0]) + lobe_depth * np.cos(lobes * azimuth + phase[1])
     vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
     vertices = _bend(vertices, height_m, bend, rng)
-    # The lowest part is sunk flat by 1 % of the height, so that the fruit rests on an area and not on a line.
-    sunk = vertices[:, 2].min() + 0.01 * height_m
-    vertices[:, 2] = np.maximum(vertices[:, 2], sunk) - sunk
-    vertices[:, 2] *= height_m / vertices[:, 2].max()
-    return Shape(mesh=Mesh(vertices, mesh.triangles), stem=on_stem.astype(float))
+    return Shape(mesh=Mesh(_stand(vertices, height_m), mesh.triangles), stem=on_stem.astype(float))
+
+
+def _stand(vertices: Float[np.ndarray, "v 3"], height_m: float) -> Float[np.ndarray, "v 3"]:
+    """Sink the lowest 1 % of the height flat into z = 0, to rest on an area and not on a line; keep the height."""
+    x, y, z = vertices.T
+    z = np.maximum(z - z.min() - 0.01 * height_m, 0.0)
+    return np.stack([x, y, z * height_m / z.max()], axis=-1)
 
 
 def _bend(

@@ -16,6 +16,7 @@ FRUIT_MATERIALS = {
 MAIZE_MATERIALS = ("kernel_yellow", "kernel_white", "kernel_purple", "cob", "husk")
 
 LENTICELS_PER_CM2 = 3.0
+STREAK_STRETCH = np.array([1.0, 1.0, 0.15])
 
 
 def fruit_weights(shape: Shape, fruit: Object, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
@@ -25,11 +26,12 @@ def fruit_weights(shape: Shape, fruit: Object, rng: np.random.Generator) -> Floa
     skin, blush, lenticel, bruise, stem = np.eye(5)
     weights = np.tile(skin, (len(points), 1))
 
-    # One sunny side, with streaks and mottles of two sizes.
+    # One sunny side that fades out, with mottles and with streaks that run from top to bottom.
     sun = rng.uniform(0.0, 2.0 * np.pi)
     facing = np.cos(np.arctan2(points[:, 1], points[:, 0]) - sun)
-    mottle = smooth_noise(points, 0.020, rng) + 0.8 * smooth_noise(points, 0.007, rng)
-    sunny = smoothstep(0.45 + 0.45 * facing + 0.35 * mottle - 0.3 * np.abs(height - 0.45))
+    streaks = smooth_noise(points * STREAK_STRETCH, 0.0045, rng)
+    mottle = smooth_noise(points, 0.018, rng)
+    sunny = smoothstep(0.48 + 0.50 * facing + 0.16 * mottle + 0.16 * streaks - 0.3 * np.abs(height - 0.45))
     weights = over(weights, blush, fruit.blush * sunny)
     # Skin is never one colour: a little blush pigment comes and goes everywhere.
     weights = over(weights, blush, fruit.blush * 0.25 * smoothstep(0.5 + smooth_noise(points, 0.010, rng)))
