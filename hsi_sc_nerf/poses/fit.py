@@ -13,6 +13,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from hsi_sc_nerf.poses.markers import marker_pattern
 
@@ -97,8 +98,7 @@ def fit_marker(
             return None
         homography = homography + step
         before = corners
-        located, corner_slope = _corners(homography, unit_corners)
-        corners = located * extent + centre
+        corners = _corners(homography, unit_corners) * extent + centre
         if not np.isfinite(corners).all() or np.abs(corners - corners_px).max() > largest_shift_px:
             return None
         raw = residual / root[:, 0]
@@ -111,7 +111,7 @@ def fit_marker(
     unexplained = float(np.sum(raw**2) / np.sum((values - values.mean()) ** 2))
     if unexplained > _LARGEST_UNEXPLAINED or white_over_black.min() <= 0.0:
         return None
-    to_corners = corner_slope * extent
+    to_corners = _corner_slopes(homography, unit_corners) * extent
     covariance = variance * to_corners @ np.linalg.solve(information, to_corners.T)
     return FittedMarker(corners, covariance + _MODEL_ERROR_PX**2 * np.eye(8), unexplained)
 
@@ -150,15 +150,14 @@ def _footprint(corners_px, cells, blur_px):
     side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
     area = 0.5 * abs(np.cross(corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]))
     narrowest_cell = area / side.max() / cells
-    samples = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
+    # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
+    spacing = max(1.0 / np.clip(np.ceil(4.0 / narrowest_cell), 2, 6), 0.4 * blur_px)
     reach = 0.5 + 2.5 * blur_px
-    count = int(np.ceil(2 * reach * samples))
+    count = int(np.ceil(2 * reach / spacing))
     position = (np.arange(count) + 0.5) / count * 2 * reach - reach
+    weight = np.ones(count)
     if blur_px > 0:
-        fine = np.linspace(-0.5, 0.5, 33)
-        weight = np.exp(-0.5 * ((position[:, None] - fine) / blur_px) ** 2).sum(-1)
-    else:
-        weight = np.ones(count)
+        weight = ndtr((position + 0.5) / blur_px) - ndtr((position - 0.5) / blur_px)
     weight = weight / weight.sum()
     grid = np.stack(np.meshgrid(position, position), -1).reshape(-1, 2)
     return grid, np.outer(weight, weight).ravel()
@@ -193,15 +192,18 @@ def _render(local, offsets, weights, homography, dictionary, marker):
 
 
 def _corners(homography, unit_corners):
-    """Where the marker's corners lie, and the derivatives of (x0, y0, x1, ...) by the homography."""
+    """Where the marker's corners lie."""
+    back = np.linalg.solve(np.append(homography, 1.0).reshape(3, 3), np.vstack([unit_corners.T, np.ones(4)]))
+    return (back[:2] / back[2]).T
+
+
+def _corner_slopes(homography, unit_corners):
+    """Derivatives of the corners (x0, y0, x1, ...) by the homography, which keeps their cells where they are."""
     h = np.append(homography, 1.0).reshape(3, 3)
-    back = np.column_stack([unit_corners, np.ones(4)]) @ np.linalg.inv(h).T
-    located = back[:, :2] / back[:, 2:]
-    slope = np.zeros((8, 8))
-    for k, (x, y) in enumerate(located):
-        u, v = unit_corners[k]
+    slopes = []
+    for (x, y), (u, v) in zip(_corners(homography, unit_corners), unit_corners, strict=True):
         d = h[2] @ [x, y, 1.0]
         by_pixel = (h[:2, :2] - np.outer([u, v], h[2, :2])) / d
         by_h = np.array([[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]) / d
-        slope[2 * k : 2 * k + 2] = -np.linalg.solve(by_pixel, by_h)
-    return located, slope
+        slopes.append(-np.linalg.solve(by_pixel, by_h))
+    return np.concatenate(slopes)

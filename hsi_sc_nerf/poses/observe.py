@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, UInt8
 from rich.progress import track
+from scipy.optimize import minimize_scalar
 
 from hsi_sc_nerf.poses.adjust import reproject
 from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker
@@ -17,6 +18,7 @@ from hsi_sc_nerf.poses.markers import Detections, detect_markers
 # The camera's blur that is tried, standard deviation in pixels, and on how many markers.
 _BLURS_PX = (0.0, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7)
 _MARKERS_TO_TELL_THE_BLUR = 10
+_BLUR_TOLERANCE_PX = 0.02
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
@@ -48,14 +50,21 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
     # Spread over the larger half: neighbours in size are often the same marker in neighbouring frames.
     seen = seen[: max(_MARKERS_TO_TELL_THE_BLUR, len(seen) // 2)]
     seen = seen[:: max(1, len(seen) // _MARKERS_TO_TELL_THE_BLUR)][:_MARKERS_TO_TELL_THE_BLUR]
-    best, least = 0.0, np.inf
-    for blur_px in _BLURS_PX:
+    if not seen:
+        return 0.0
+
+    def left(blur_px: float) -> float:
         fits = [fit_marker(images[i].astype(float), dictionary, m, c, blur_px) for i, m, c in seen]
-        left = float(np.mean([1.0 if f is None else f.unexplained for f in fits])) if fits else np.inf
-        if left > least:
-            break
-        best, least = blur_px, left
-    return best
+        return float(np.mean([1.0 if f is None else f.unexplained for f in fits]))
+
+    tried = [left(_BLURS_PX[0])]
+    while len(tried) < len(_BLURS_PX) and (len(tried) < 3 or tried[-1] <= tried[-2]):
+        tried.append(left(_BLURS_PX[len(tried)]))
+    k = int(np.argmin(tried))
+    if not 0 < k < len(tried) - 1:
+        return _BLURS_PX[k]
+    bracket = (_BLURS_PX[k - 1], _BLURS_PX[k + 1])
+    return float(minimize_scalar(left, bounds=bracket, method="bounded", options={"xatol": _BLUR_TOLERANCE_PX}).x)
 
 
 def observe_expected(

@@ -18,7 +18,8 @@ _ARROW_SHARE = 0.15
 def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
     """Draw cameras and markers in space and from above, and the reprojection error by frame, into a picture file."""
     path = Path(path)
-    figure = Figure(figsize=(15, 5), layout="constrained")
+    figure = Figure(figsize=(15, 5))
+    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12, top=0.9, wspace=0.2)
     FigureCanvasAgg(figure)
     eyes = poses.camera_to_world[poses.used, :3, 3]
     arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_SHARE * np.linalg.norm(eyes[0])
