@@ -18,34 +18,108 @@ from torch.nn import functional as F
 _HASH_PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 
-class _WeightedGather(torch.autograd.Function):
-    """``out[i] = sum_j weights[i, j] * table[indices[i, j]]``, with a gradient for table and weights."""
+def interpolate_hash_grid(
+    positions: Float[Tensor, "n 3"],
+    table: Float[Tensor, "rows features"],
+    scalings: Float[Tensor, "levels"],
+    table_size: int,
+) -> Float[Tensor, "n levels_x_features"]:
+    """Trilinear interpolation of a stack of hashed grids, differentiable once in positions and table.
+
+    Args:
+        positions: points in [0, 1]^3.
+        table: the levels' feature tables, one after the other; ``table_size`` rows each, a power of two.
+        scalings: cells along an edge of the unit cube, a level.
+        table_size: rows of one level.
+    """
+    return _Interpolate.apply(positions, table, scalings.to(positions), table_size)
+
+
+class _Interpolate(torch.autograd.Function):
+    """The interpolation with its gradients written out; what is saved is what the backward pass reads."""
 
     @staticmethod
-    def forward(ctx, table, indices, weights):  # noqa: D102
-        ctx.save_for_backward(table, indices, weights)
-        return F.embedding_bag(indices, table, per_sample_weights=weights, mode="sum")
+    def forward(ctx, positions, table, scalings, table_size):
+        scaled = positions[:, None, :] * scalings[:, None]  # (n, levels, 3)
+        lower = torch.floor(scaled)
+        fraction = (scaled - lower).reshape(-1, 3)
+        indices = _corner_rows(lower.to(torch.int32), table_size)
+        weights = _corner_weights(fraction)
+        ctx.save_for_backward(table, scalings, indices, fraction)
+        features = F.embedding_bag(indices, table, per_sample_weights=weights, mode="sum")
+        return features.view(positions.shape[0], -1)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad):  # noqa: D102
-        table, indices, weights = ctx.saved_tensors
-        grad_table = grad_weights = None
+    def backward(ctx, grad):
+        table, scalings, indices, fraction = ctx.saved_tensors
+        grad = grad.reshape(-1, table.shape[1])
+        grad_positions = grad_table = None
         if ctx.needs_input_grad[0]:
-            grad_table = _scatter_to_table(grad, indices, weights, table.shape[0])
-        if ctx.needs_input_grad[2]:
-            corners = F.embedding(indices, table)
-            grad_weights = torch.einsum("if,ijf->ij", grad, corners)
-        return grad_table, None, grad_weights
+            along = torch.einsum("if,icf->ic", grad, F.embedding(indices, table))
+            slopes = _slopes(along, fraction).view(-1, scalings.shape[0], 3)
+            grad_positions = torch.einsum("nla,l->na", slopes, scalings)
+        if ctx.needs_input_grad[1]:
+            grad_table = _scatter_to_table(grad, indices, _corner_weights(fraction), table.shape[0])
+        return grad_positions, grad_table, None, None
+
+
+# The eight corners of a cell are numbered 4 x + 2 y + z, with x, y, z in {0, 1}.
+
+
+def _corner_rows(lower_cell: Int[Tensor, "n levels 3"], table_size: int) -> Int[Tensor, "n_x_levels 8"]:
+    """Row in the table of each corner of the cells (Müller et al. 2022, Eq. 4)."""
+    primes = torch.tensor(_HASH_PRIMES, dtype=torch.int32, device=lower_cell.device)
+    near = lower_cell * primes
+    x, y, z = torch.stack([near, near + primes]).unbind(dim=-1)  # (2, n, levels) each
+    offsets = torch.arange(lower_cell.shape[1], dtype=torch.int32, device=lower_cell.device) * table_size
+    xy = [x[i] ^ y[j] for i in (0, 1) for j in (0, 1)]
+    corners = torch.stack([pair ^ z[k] for pair in xy for k in (0, 1)], dim=-1)
+    return corners.bitwise_and_(table_size - 1).add_(offsets[:, None]).view(-1, 8)
+
+
+def _corner_weights(fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 8"]:
+    """Trilinear weight of each corner."""
+    x, y, z = fraction.unbind(dim=-1)
+    xy_far, xz, yz = x * y, x * z, y * z
+    xyz = xy_far * z
+    return torch.stack(
+        [
+            1 - x - y - z + xy_far + xz + yz - xyz,
+            z - xz - yz + xyz,
+            y - xy_far - yz + xyz,
+            yz - xyz,
+            x - xy_far - xz + xyz,
+            xz - xyz,
+            xy_far - xyz,
+            xyz,
+        ],
+        dim=-1,
+    )
+
+
+def _slopes(values: Float[Tensor, "n 8"], fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Gradient of the trilinear interpolation of corner values with respect to the fraction."""
+    x, y, z = fraction.unbind(dim=-1)
+    near_z, step_z = values[:, 0::2], values[:, 1::2] - values[:, 0::2]  # (n, 4): corners 2 x + y
+    at_z = near_z + step_z * z[:, None]
+    step_y = at_z[:, 1::2] - at_z[:, 0::2]  # (n, 2): corners x
+    at_yz = at_z[:, 0::2] + step_y * y[:, None]
+    step_z_at_y = step_z[:, 0::2] + (step_z[:, 1::2] - step_z[:, 0::2]) * y[:, None]
+    return torch.stack(
+        [
+            at_yz[:, 1] - at_yz[:, 0],
+            step_y[:, 0] + (step_y[:, 1] - step_y[:, 0]) * x,
+            step_z_at_y[:, 0] + (step_z_at_y[:, 1] - step_z_at_y[:, 0]) * x,
+        ],
+        dim=-1,
+    )
 
 
 def _scatter_to_table(
-    grad: Float[Tensor, "n features"],
-    indices: Int[Tensor, "n corners"],
-    weights: Float[Tensor, "n corners"],
-    rows: int,
+    grad: Float[Tensor, "n features"], indices: Int[Tensor, "n 8"], weights: Float[Tensor, "n 8"], rows: int
 ) -> Float[Tensor, "rows features"]:
-    """The gradient of the weighted gather with respect to its table."""
+    """Gradient of the weighted sums with respect to the table."""
     flat = indices.reshape(-1)
     if grad.device.type == "cpu":
         # bincount is several times faster than index_add_ there, and sums in float64.
@@ -56,41 +130,6 @@ def _scatter_to_table(
         return torch.stack(columns, dim=1).to(grad.dtype)
     contributions = (weights[..., None] * grad[:, None, :]).reshape(-1, grad.shape[1])
     return torch.zeros(rows, grad.shape[1], device=grad.device, dtype=grad.dtype).index_add_(0, flat, contributions)
-
-
-def interpolate_hash_grid(
-    positions: Float[Tensor, "n 3"],
-    table: Float[Tensor, "rows features"],
-    scalings: Float[Tensor, "levels"],
-    table_size: int,
-) -> Float[Tensor, "n levels_x_features"]:
-    """Trilinear interpolation of a stack of hashed grids.
-
-    Args:
-        positions: points in [0, 1]^3.
-        table: the levels' feature tables, one after the other; ``table_size`` rows each, a power of two.
-        scalings: cells along an edge of the unit cube, a level.
-        table_size: rows of one level.
-    """
-    levels = scalings.shape[0]
-    scaled = positions[:, None, :] * scalings.to(positions)[:, None]  # (n, levels, 3)
-    lower = torch.floor(scaled)
-    fraction = scaled - lower
-    lower_cell = lower.detach().to(torch.int32)
-
-    primes = torch.tensor(_HASH_PRIMES, dtype=torch.int32, device=positions.device)
-    hashed = torch.stack([lower_cell * primes, (lower_cell + 1) * primes], dim=-1)  # (n, levels, 3, 2)
-    x, y, z = hashed.unbind(dim=2)
-    corners = x[..., :, None, None] ^ y[..., None, :, None] ^ z[..., None, None, :]  # (n, levels, 2, 2, 2)
-    offsets = torch.arange(levels, dtype=torch.int32, device=positions.device) * table_size
-    indices = (corners & (table_size - 1)) + offsets[:, None, None, None]
-
-    ends = torch.stack([1.0 - fraction, fraction], dim=-1)  # (n, levels, 3, 2)
-    wx, wy, wz = ends.unbind(dim=2)
-    weights = wx[..., :, None, None] * wy[..., None, :, None] * wz[..., None, None, :]
-
-    features = _WeightedGather.apply(table, indices.reshape(-1, 8), weights.reshape(-1, 8))
-    return features.reshape(positions.shape[0], levels * table.shape[1])
 
 
 class FusedHashEncoding(HashEncoding):

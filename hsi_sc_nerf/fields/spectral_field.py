@@ -82,8 +82,17 @@ class SpectralField(NerfactoField):
 
 
 class SpectralProposalField(HashMLPDensityField):
-    """Nerfacto's proposal density with the fused hash grid."""
+    """Nerfacto's proposal density with the fused hash grid.
+
+    Positions are detached: proposals say where to look, and the poses are refined by what the spectral field sees.
+    """
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
         fuse_hash_encodings(self)
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], None]:
+        """Density at the samples."""
+        positions, inside = _positions_in_box(ray_samples, self.aabb)
+        before_activation = self.mlp_base(positions.detach().view(-1, 3)).view(*ray_samples.frustums.shape, -1)
+        return self.average_init_density * trunc_exp(before_activation.to(positions)) * inside, None

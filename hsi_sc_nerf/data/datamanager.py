@@ -1,0 +1,84 @@
+"""nerfstudio data manager: training rays with their spectra, read from the cubes on disk pixel by pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.model_components.ray_generators import RayGenerator
+
+from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE
+from hsi_sc_nerf.data.pixels import PixelSampler
+
+
+@dataclass
+class SpectralDataManagerConfig(VanillaDataManagerConfig):
+    """Configuration of the data manager."""
+
+    _target: type = field(default_factory=lambda: SpectralDataManager)
+    dataparser: SpectralDataParserConfig = field(default_factory=SpectralDataParserConfig)
+    train_num_rays_per_batch: int = 2048
+    """Rays of a training step."""
+    eval_num_rays_per_batch: int = 2048
+    """Rays of an evaluation step during training."""
+    seed: int = 0
+    """Seed of the random pixels."""
+
+
+class SpectralDataManager(VanillaDataManager[SpectralDataset]):
+    """Random pixels of memory-mapped cubes; nothing is cached but the masks.
+
+    Attributes:
+        foreground_share: share of the training rays that hit the foreground; ``None`` for whole frames. The
+            trainer sets it by stage.
+    """
+
+    config: SpectralDataManagerConfig
+    train_pixel_sampler: PixelSampler  # type: ignore[assignment]
+    eval_pixel_sampler: PixelSampler  # type: ignore[assignment]
+    foreground_share: float | None = None
+
+    def _pixels(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
+        return PixelSampler(
+            cubes=[frame.cube() for frame in dataset.frames],
+            masks=np.stack([frame.mask() for frame in dataset.frames]),
+            scale=REFLECTANCE_SCALE,
+            num_rays_per_batch=num_rays,
+            seed=self.config.seed,
+        )
+
+    def setup_train(self) -> None:
+        """Map the training cubes."""
+        self.train_pixel_sampler = self._pixels(self.train_dataset, self.config.train_num_rays_per_batch)
+        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+
+    def setup_eval(self) -> None:
+        """Map the held-out cubes."""
+        self.eval_pixel_sampler = self._pixels(self.eval_dataset, self.config.eval_num_rays_per_batch)
+        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
+            input_dataset=self.eval_dataset, device=self.device
+        )
+        self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict]:
+        """The training batch of ``step``: always the same for the same step, stage and seed."""
+        self.train_count += 1
+        return self._rays(self.train_pixel_sampler, self.train_ray_generator, step, self.foreground_share)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict]:
+        """Random pixels of held-out views."""
+        self.eval_count += 1
+        return self._rays(self.eval_pixel_sampler, self.eval_ray_generator, step, None)
+
+    def _rays(
+        self, pixels: PixelSampler, generator: RayGenerator, step: int, foreground_share: float | None
+    ) -> tuple[RayBundle, dict]:
+        batch = {key: torch.from_numpy(value) for key, value in pixels.sample(step, foreground_share).items()}
+        return generator(batch["indices"]), batch

@@ -1,0 +1,138 @@
+"""nerfstudio data parser: a packed dataset, or a raw session that is processed first, once.
+
+nerfstudio imports this module while its own data managers are still being imported: it must not import them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.packed import PackedDataset, is_packed, open_packed
+from hsi_sc_nerf.data.process import ProcessConfig, process_session
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
+from hsi_sc_nerf.data.session import is_session
+from hsi_sc_nerf.errors import InputError
+
+
+@dataclass
+class SpectralDataParserConfig(DataParserConfig):
+    """Hyperspectral turntable data."""
+
+    _target: type = field(default_factory=lambda: SpectralDataParser)
+    data: Path = Path()
+    """A dataset made by `hsi-sc-nerf process`, or a capture session, which is processed into a folder beside it."""
+    train_split_fraction: float = paper.TRAIN_SPLIT_FRACTION
+    """Share of the frames to train on; the others, evenly spread, are held out for evaluation."""
+    process: ProcessConfig = field(default_factory=ProcessConfig)
+    """How to process a session."""
+
+
+def processed_dir(session_dir: Path) -> Path:
+    """Where a session given as ``--data`` is processed to."""
+    return session_dir.with_name(session_dir.name + "-processed")
+
+
+@dataclass
+class SpectralDataParser(DataParser):
+    """Turns a packed dataset into nerfstudio's cameras, boxes and file lists."""
+
+    config: SpectralDataParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        try:
+            return self._outputs(self._open(), split)
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+
+    def _open(self) -> PackedDataset:
+        data = self.config.data
+        if not is_packed(data) and is_session(data):
+            return open_packed(process_session(data, processed_dir(data.resolve()), self.config.process))
+        return open_packed(data)
+
+    def _outputs(self, dataset: PackedDataset, split: str) -> DataparserOutputs:
+        num_frames = len(dataset.frames)
+        train, held_out = split_frames(num_frames, self.config.train_split_fraction)
+        chosen = train if split == "train" else held_out
+        centre, scale = scene_scaling(dataset.scene_box_m)
+        poses = dataset.camera_to_worlds
+        poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
+
+        lens = dataset.intrinsics
+        k1, k2, p1, p2 = dataset.distortion
+        cameras = Cameras(
+            camera_to_worlds=torch.from_numpy(poses[chosen, :3]).float(),
+            fx=lens.fl_x,
+            fy=lens.fl_y,
+            cx=lens.cx,
+            cy=lens.cy,
+            width=lens.w,
+            height=lens.h,
+            distortion_params=torch.tensor([k1, k2, 0.0, 0.0, p1, p2]).float() if dataset.distortion.any() else None,
+            camera_type=CameraType.PERSPECTIVE,
+            metadata={
+                "frame_index": torch.from_numpy(chosen)[:, None].float(),
+                "camera_rotation": torch.from_numpy(poses[chosen, :3, :3].reshape(-1, 9)).float(),
+            },
+        )
+        transform = torch.eye(4)[:3]
+        transform[:, 3] = -torch.from_numpy(centre)
+        return DataparserOutputs(
+            image_filenames=[dataset.frames[i].image_path for i in chosen],
+            mask_filenames=[dataset.frames[i].mask_path for i in chosen],
+            cameras=cameras,
+            scene_box=SceneBox(aabb=torch.from_numpy((dataset.scene_box_m - centre) * scale).float()),
+            dataparser_transform=transform,
+            dataparser_scale=scale,
+            metadata={
+                "frames": [dataset.frames[i] for i in chosen],
+                "wavelengths_nm": dataset.wavelengths_nm,
+                "rgb_bands": nearest_bands(dataset.wavelengths_nm, dataset.pseudo_rgb_nm).tolist(),
+                "background_reflectance": dataset.background_reflectance,
+                "object_box": torch.from_numpy((dataset.object_box_m - centre) * scale).float(),
+                # What the pose refinement needs to know of the turntable.
+                "turntable": {
+                    "camera_to_world": poses[0],
+                    "frame_indices": train,
+                    "num_frames": num_frames,
+                    "axis_origin": -centre * scale,
+                },
+            },
+        )
+
+
+def split_frames(num_frames: int, train_fraction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of training and held-out frames, the latter spread evenly (nerfstudio's "fraction" split).
+
+    Raises:
+        InputError: no frame would be left on one of the two sides.
+    """
+    train, held_out = get_train_eval_split_fraction([Path(str(i)) for i in range(num_frames)], train_fraction)
+    if len(train) == 0 or len(held_out) == 0:
+        raise InputError(
+            f"--train-split-fraction {train_fraction} leaves {len(train)} of {num_frames} frames to train on and "
+            f"{len(held_out)} to evaluate; choose a fraction that leaves at least one of each."
+        )
+    return train, held_out
+
+
+def scene_scaling(scene_box_m: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (metres) and scale that bring the scene box into [-1, 1]^3, as nerfstudio's models expect."""
+    low, high = scene_box_m
+    return (low + high) / 2.0, float(2.0 / (high - low).max())
+
+
+hsi_sc_nerf_dataparser = DataParserSpecification(
+    config=SpectralDataParserConfig(),
+    description="Hyperspectral turntable session: raw ENVI cubes, or the dataset that `hsi-sc-nerf process` made.",
+)

@@ -1,0 +1,33 @@
+"""Clean point clouds with Open3D."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Float, Int
+
+OUTLIER_NEIGHBOURS = 20
+"""Neighbours whose mean distance marks an outlier (released settings of the paper)."""
+
+
+def _cloud(points: Float[np.ndarray, "n 3"]) -> o3d.geometry.PointCloud:
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
+
+
+def statistical_inliers(points: Float[np.ndarray, "n 3"], std_ratio: float) -> Int[np.ndarray, "inliers"]:
+    """Indices of the points whose mean distance to their neighbours is usual for the cloud.
+
+    Args:
+        points: positions, any unit.
+        std_ratio: standard deviations above the cloud's mean from which a point is an outlier.
+    """
+    _, inliers = _cloud(points).remove_statistical_outlier(nb_neighbors=OUTLIER_NEIGHBOURS, std_ratio=std_ratio)
+    return np.asarray(inliers, dtype=np.int64)
+
+
+def estimate_normals(points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Normals from neighbouring points, turned to the side of the vectors in ``facing``."""
+    cloud = _cloud(points)
+    cloud.estimate_normals()
+    normals = np.asarray(cloud.normals)
+    return np.where((normals * facing).sum(axis=1, keepdims=True) < 0, -normals, normals)

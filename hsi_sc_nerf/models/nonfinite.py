@@ -1,0 +1,84 @@
+"""Skip training steps that turn non-finite, and stop a run that keeps doing so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
+from torch.amp.grad_scaler import GradScaler
+
+
+class TrainingDivergedError(RuntimeError):
+    """Too many steps in a row were not finite."""
+
+
+def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
+    """Names of the tensors that hold an infinity or a NaN."""
+    if not values:
+        return []
+    # The sum of a tensor is finite only if all its elements are; one transfer from the device for all.
+    sums = torch.stack([value.detach().float().sum() for value in values.values()])
+    return [name for name, finite in zip(values, torch.isfinite(sums).tolist(), strict=True) if not finite]
+
+
+class GuardedOptimizers(Optimizers):
+    """nerfstudio's optimisers, except that a step with a non-finite gradient changes nothing.
+
+    Attributes:
+        skipped_groups: parameter groups whose gradient was not finite in the last step; empty after a good one.
+    """
+
+    skipped_groups: tuple[str, ...] = ()
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """Step the optimisers of ``param_groups``, or none of them."""
+        if grad_scaler.is_enabled():
+            # Scaled gradients overflow now and then by design; the scaler skips those steps itself.
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            return
+        gradients = {
+            f"{group}/{i}": parameter.grad
+            for group in param_groups
+            for i, parameter in enumerate(self.parameters[group])
+            if parameter.grad is not None
+        }
+        self.skipped_groups = tuple(dict.fromkeys(name.split("/")[0] for name in non_finite_names(gradients)))
+        if not self.skipped_groups:
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+
+class NonFiniteGuard:
+    """Counts skipped steps in a row.
+
+    Args:
+        limit: this many in a row end the run.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.in_a_row = 0
+
+    def record(self, step: int, losses: Iterable[str], groups: Iterable[str]) -> str | None:
+        """Take note of a step; returns a sentence to print where it was skipped.
+
+        Args:
+            step: the step.
+            losses: names of the loss terms that were not finite.
+            groups: names of the parameter groups whose gradient was not finite.
+
+        Raises:
+            TrainingDivergedError: this was the last of ``limit`` skipped steps in a row.
+        """
+        culprits = [f"loss {name}" for name in losses] or [f"gradient of {name}" for name in groups]
+        if not culprits:
+            self.in_a_row = 0
+            return None
+        self.in_a_row += 1
+        sentence = f"step {step} skipped: {', '.join(culprits)} not finite"
+        if self.in_a_row >= self.limit:
+            raise TrainingDivergedError(
+                f"{sentence}, the {self.in_a_row}th in a row; lower the learning rate, or look for damaged frames"
+            )
+        return sentence

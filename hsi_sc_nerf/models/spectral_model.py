@@ -1,0 +1,230 @@
+"""The model: nerfacto with a spectrum a ray, bounded by the turntable's box, before the chamber's own spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer, RGBRenderer
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.model_components.shaders import NormalsShader
+from nerfstudio.models.base_model import Model
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.utils import colormaps
+from torch import Tensor
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+from hsi_sc_nerf.models.losses import angular_loss, hsi_loss
+from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
+from hsi_sc_nerf.models.turntable_refinement import TurntableRefinementConfig
+from hsi_sc_nerf.numerics import safe_log10
+
+ANGLE_PICTURE_MAX_RAD = 0.2
+"""Spectral angle that the error picture draws at full scale."""
+
+
+@dataclass
+class SpectralModelConfig(NerfactoModelConfig):
+    """Configuration of the spectral model. Where a default differs from nerfacto's, a turntable scene is why."""
+
+    _target: type = field(default_factory=lambda: SpectralModel)
+    angular_loss_mult: float = paper.ANGULAR_LOSS_WEIGHT
+    """Weight of the spectral angle's cosine loss."""
+    hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
+    """Weight of the squared error over pixels and bands."""
+    interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
+    """Weight of the proposal loss."""
+    distortion_loss_mult: float = paper.DISTORTION_LOSS_WEIGHT
+    """Weight of the distortion loss."""
+    orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
+    """Weight of the orientation loss on computed normals."""
+    pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
+    """Weight of the predicted-normal loss."""
+    predict_normals: bool = True
+    """Predict normals, as the paper does. It roughly doubles the time of a step."""
+    near_plane: float = 0.01
+    """Rays start no nearer to the camera than this (scene units)."""
+    disable_scene_contraction: bool = True
+    """The scene is the box that holds everything that turns: nothing lies outside it to contract."""
+    proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
+    """Rays are sampled between where they enter and leave the box."""
+    num_proposal_samples_per_ray: tuple[int, ...] = (64, 32)
+    """Samples a ray for each proposal network: a box of 0.2 m needs far fewer than an unbounded scene."""
+    num_nerf_samples_per_ray: int = 32
+    """Samples a ray for the spectral field."""
+    max_res: int = 512
+    """Finest grid of the spectral field; 512 cells over a 0.2 m box are 0.4 mm each."""
+    log2_hashmap_size: int = 17
+    """Size of the field's hash table a level."""
+    average_init_density: float = 0.1
+    """The box starts nearly empty."""
+    use_appearance_embedding: bool = False
+    """Reflectance is calibrated and the lamps stand still: views need no appearance of their own."""
+    implementation: Literal["tcnn", "torch"] = "torch"
+    """"torch" trains and loads everywhere, with or without a GPU."""
+    eval_num_rays_per_chunk: int = 4096
+    """Rays rendered at a time."""
+    camera_optimizer: TurntableRefinementConfig = field(default_factory=TurntableRefinementConfig)
+    """Refinement of the camera pose and the turntable's angles."""
+
+
+class ChamberRenderer(RGBRenderer):
+    """Composite spectra along rays; what the object lets through shows the chamber's spectrum.
+
+    Args:
+        background: reflectance of the chamber behind the scene box, one number a band.
+    """
+
+    background: Tensor
+
+    def __init__(self, background: Float[Tensor, "bands"]) -> None:
+        super().__init__(background_color="black")
+        self.register_buffer("background", background)
+
+    def forward(self, rgb: Tensor, weights: Tensor, **kwargs) -> Float[Tensor, "*rays bands"]:
+        """Weighted sum of the samples' spectra plus the background's share."""
+        spectrum = torch.sum(weights * rgb, dim=-2)
+        return spectrum + self.background * (1.0 - torch.sum(weights, dim=-2))
+
+
+class SpectralModel(NerfactoModel):
+    """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
+
+    Outputs of a ray: ``spectral`` (bands) beside nerfacto's own, with ``rgb`` a pseudo-RGB of three bands.
+    """
+
+    config: SpectralModelConfig
+
+    def populate_modules(self) -> None:
+        """Build the modules.
+
+        Nerfacto's own method is not called: it builds LPIPS, which downloads AlexNet and means nothing for spectra.
+        """
+        Model.populate_modules(self)
+        config, metadata = self.config, self.kwargs["metadata"]
+        self.wavelengths_nm: np.ndarray = metadata["wavelengths_nm"]
+        self.rgb_bands: list[int] = metadata["rgb_bands"]
+        self.field = SpectralField(
+            self.scene_box.aabb,
+            num_bands=len(self.wavelengths_nm),
+            hidden_dim=config.hidden_dim,
+            num_levels=config.num_levels,
+            max_res=config.max_res,
+            base_res=config.base_res,
+            features_per_level=config.features_per_level,
+            log2_hashmap_size=config.log2_hashmap_size,
+            hidden_dim_color=config.hidden_dim_color,
+            num_images=self.num_train_data,
+            use_pred_normals=config.predict_normals,
+            use_average_appearance_embedding=config.use_average_appearance_embedding,
+            appearance_embedding_dim=config.appearance_embed_dim if config.use_appearance_embedding else 0,
+            average_init_density=config.average_init_density,
+            implementation=config.implementation,
+        )
+        self._build_proposals()
+        self.camera_optimizer = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
+        )
+        self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)
+
+        self.renderer_rgb = ChamberRenderer(torch.as_tensor(metadata["background_reflectance"]).float())
+        self.renderer_accumulation = AccumulationRenderer()
+        self.renderer_depth = DepthRenderer(method="median")
+        self.renderer_expected_depth = DepthRenderer(method="expected")
+        self.renderer_normals = NormalsRenderer()
+        self.normals_shader = NormalsShader()
+        self.step = 0
+
+    def _build_proposals(self) -> None:
+        """Proposal networks and the sampler that uses them, as in nerfacto."""
+        config = self.config
+        arguments = config.proposal_net_args_list
+        networks = [
+            SpectralProposalField(
+                self.scene_box.aabb,
+                **arguments[min(i, len(arguments) - 1)],
+                average_init_density=config.average_init_density,
+                implementation=config.implementation,
+            )
+            for i in range(1 if config.use_same_proposal_network else config.num_proposal_iterations)
+        ]
+        self.proposal_networks = torch.nn.ModuleList(networks)
+        rounds = config.num_proposal_iterations
+        self.density_fns = [networks[min(i, len(networks) - 1)].density_fn for i in range(rounds)]
+
+        def update_schedule(step: int) -> float:
+            rise = step / max(1, config.proposal_warmup) * config.proposal_update_every
+            return float(np.clip(rise, 1, config.proposal_update_every))
+
+        uniform = config.proposal_initial_sampler == "uniform"
+        self.proposal_sampler = ProposalNetworkSampler(
+            num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
+            num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
+            num_proposal_network_iterations=rounds,
+            single_jitter=config.use_single_jitter,
+            update_sched=update_schedule,
+            initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
+        )
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """Nerfacto's outputs with the spectrum; held-out views are corrected like training views."""
+        if not self.training:
+            self.camera_optimizer.apply_to_raybundle(ray_bundle)
+        outputs = super().get_outputs(ray_bundle)
+        outputs["spectral"] = outputs["rgb"]
+        outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
+        return outputs
+
+    def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
+        """PSNR of the batch over all bands, distortion, size of the pose corrections."""
+        with torch.no_grad():
+            squared_error = (outputs["spectral"] - batch["spectral"].to(self.device)).square().mean()
+            metrics = {"psnr": -10.0 * safe_log10(squared_error)}
+        if self.training:
+            metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
+        """The paper's composite loss (section "Loss Function"); a term of weight zero is not computed."""
+        config, target = self.config, batch["spectral"].to(self.device)
+        losses = {}
+        if config.hsi_loss_mult > 0:
+            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target)
+        if config.angular_loss_mult > 0:
+            losses["angular_loss"] = config.angular_loss_mult * angular_loss(outputs["spectral"], target)
+        if not self.training:
+            return losses
+        assert metrics_dict is not None
+        losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
+            outputs["weights_list"], outputs["ray_samples_list"]
+        )
+        losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
+        if config.predict_normals:
+            losses["orientation_loss"] = config.orientation_loss_mult * outputs["rendered_orientation_loss"].mean()
+            losses["pred_normal_loss"] = config.pred_normal_loss_mult * outputs["rendered_pred_normal_loss"].mean()
+        self.camera_optimizer.get_loss_dict(losses)
+        return losses
+
+    def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""
+        truth, rendered = batch["spectral"].to(self.device), outputs["spectral"].to(self.device)
+        mask = batch["mask"].to(self.device)[..., 0].bool()
+        metrics = spectral_metrics(rendered, truth, mask)
+        metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth).items()}
+
+        angle = spectral_angle_map(rendered, truth)[..., None] / ANGLE_PICTURE_MAX_RAD
+        images = {
+            "img": torch.cat([truth[..., self.rgb_bands], rendered[..., self.rgb_bands]], dim=1).clamp(0.0, 1.0),
+            "spectral_angle": colormaps.apply_colormap(angle.clamp(0.0, 1.0)),
+            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
+            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
+        }
+        return metrics, images

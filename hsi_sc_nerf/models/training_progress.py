@@ -1,0 +1,48 @@
+"""The progress bar of a training run."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from hsi_sc_nerf.models.stages import Stage
+
+
+class TrainingProgress:
+    """Stage, steps, PSNR of the batches and time left; use it as a context."""
+
+    def __init__(self, total_steps: int, first_step: int) -> None:
+        self._progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[quality]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=CONSOLE,
+        )
+        self._task = self._progress.add_task("training", total=total_steps, completed=first_step, quality="")
+        self._smoothed_psnr: float | None = None
+
+    def __enter__(self) -> TrainingProgress:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, step: int, stage: Stage, psnr: float) -> None:
+        """Show that ``step`` of ``stage`` is done."""
+        before = self._smoothed_psnr
+        self._smoothed_psnr = psnr if before is None else 0.95 * before + 0.05 * psnr
+        self._progress.update(
+            self._task,
+            completed=step + 1,
+            description=f"training, {stage.config.name} stage",
+            quality=f"PSNR {self._smoothed_psnr:.1f} dB",
+        )
