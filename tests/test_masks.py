@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from capture_factory import (
+    INTRINSICS,
+    SPHERE_CENTRE_M,
+    SPHERE_RADIUS_M,
+    frame_reflectance,
+    sphere_mask,
+    true_pose,
+)
+
+from hsi_sc_nerf.data.masks import (
+    MaskConfig,
+    above_lid,
+    choose_threshold,
+    foreground_mask,
+    foreground_score,
+    otsu_threshold,
+)
+from hsi_sc_nerf.data.packed import Container
+from hsi_sc_nerf.data.report import mask_picture
+from hsi_sc_nerf.data.scene_box import focus_point, object_box, scene_box
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project
+
+NO_DISTORTION = np.zeros(4)
+CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+
+
+def test_score_is_the_spread_over_bins():
+    spectrum = np.array([0.1, 0.1, 0.1, 0.7, 0.7, 0.7], np.float32)
+    cube = np.broadcast_to(spectrum, (4, 4, 6)).copy()
+    np.testing.assert_allclose(foreground_score(cube, spectral_bins=2), 0.3, atol=1e-6)
+    np.testing.assert_allclose(foreground_score(cube, spectral_bins=24), cube.std(-1), atol=1e-6)
+    assert foreground_score(np.full((4, 4, 6), 0.4, np.float32)).max() < 1e-6
+
+
+def test_score_is_linear_in_the_share_of_a_pixel():
+    plant = np.linspace(0.1, 0.6, 12)
+    shares = np.array([0.0, 0.25, 0.5, 1.0])
+    cube = (shares[:, None] * plant + (1 - shares[:, None]) * 0.8)[None].astype(np.float32)
+    score = foreground_score(cube, smoothing_px=0.0)[0]
+    np.testing.assert_allclose(score, shares * score[-1], atol=1e-6)
+
+
+def test_otsu_separates_two_classes_and_says_how_far_they_are_apart():
+    rng = np.random.default_rng(2)
+    scores = [np.abs(rng.normal(0.02, 0.01, (50, 50))) for _ in range(3)]
+    scores[1][:10, :20] = rng.normal(0.3, 0.03, (10, 20))
+    threshold, contrast = otsu_threshold(scores)
+    assert 0.1 < threshold < 0.2
+    assert contrast == pytest.approx(0.28, abs=0.01)
+
+
+def test_otsu_agrees_with_opencv():
+    rng = np.random.default_rng(3)
+    gray = np.clip(np.concatenate([rng.normal(60, 20, 4000), rng.normal(180, 25, 2000)]), 1, 255).astype(np.uint8)
+    gray[0] = 255
+    expected, _ = cv2.threshold(gray.reshape(60, 100), 0, 255, cv2.THRESH_OTSU)
+    threshold, _ = otsu_threshold([gray.reshape(60, 100).astype(float)])
+    assert abs(threshold - expected) < 2.0  # OpenCV's bins are 1 wide and its threshold is the lower bin
+
+
+def test_no_contrast():
+    rng = np.random.default_rng(4)
+    with pytest.raises(InputError, match="no object can be told from the background"):
+        choose_threshold([np.abs(rng.normal(0.0, 0.01, (30, 30)))], MaskConfig())
+    with pytest.raises(InputError, match="no object"):
+        choose_threshold([np.zeros((30, 30))], MaskConfig())
+    assert choose_threshold([np.zeros((30, 30))], MaskConfig(threshold=0.2)) == 0.2
+
+
+def test_mask_is_one_whole_region_with_its_stem():
+    score = np.zeros((60, 60))
+    score[20:50, 15:45] = 0.3
+    score[30:33, 25:28] = 0.0  # a label on the fruit
+    score[5:20, 30] = 0.12  # a woody stem, weaker than the threshold
+    score[20:50, 45] = 0.12  # the fruit's rim, part background
+    score[2:6, 2:6] = 0.3  # something else
+    mask = foreground_mask(score, 0.2)
+    expected = np.zeros((60, 60), bool)
+    expected[20:50, 15:45] = True
+    expected[5:20, 30] = True
+    np.testing.assert_array_equal(mask, expected)
+    assert not foreground_mask(score, 0.2, weak_share=1.0)[:20].any()
+    allowed = np.ones((60, 60), bool)
+    allowed[40:] = False
+    assert not foreground_mask(score, 0.2, allowed=allowed)[40:].any()
+    assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 77.0])
+def test_mask_of_a_sphere(angle_deg):
+    score = foreground_score(frame_reflectance(angle_deg).astype(np.float32))
+    truth = sphere_mask(true_pose(angle_deg))
+    mask = foreground_mask(score, choose_threshold([score], MaskConfig()))
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.97
+
+
+@pytest.mark.parametrize("height", [0.25, 0.05])
+def test_above_lid_agrees_with_marching_along_the_rays(height):
+    pose = look_at([0.35, 0.1, height], [0.0, 0.0, 0.08])
+    intrinsics = PinholeIntrinsics(24, 24, 35.0, 35.0, 12.0, 12.0)
+    x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(24) + 0.5)
+    origin, directions = pixel_rays(intrinsics, pose, np.stack([x, y], axis=-1))
+    expected, blocked = np.zeros((2, 24, 24), bool)
+    radius = CONTAINER.diameter_m / 2
+    for t in np.arange(0.0, 0.8, 0.0005):
+        points = origin + t * directions
+        distance = np.hypot(points[..., 0], points[..., 1])
+        above, inside = points[..., 2] > CONTAINER.height_m, points[..., 2] > 0.0
+        expected |= (distance < 1.2 * radius) & above & ~blocked
+        blocked |= (distance < radius) & inside & ~above
+    result = above_lid(intrinsics, NO_DISTORTION, pose, CONTAINER, overhang=1.2)
+    assert 0.1 < expected.mean() < 0.9
+    assert (result != expected).sum() <= 3
+
+
+def test_above_lid_undoes_lens_distortion():
+    pose = true_pose(0.0)
+    distortion = np.array([2.0, 0.0, 0.03, 0.0])
+    straight = above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER)
+    bent = above_lid(INTRINSICS, distortion, pose, CONTAINER)
+    y, x = np.mgrid[0 : INTRINSICS.h, 0 : INTRINSICS.w]
+    rays = np.stack(
+        [(x + 0.5 - INTRINSICS.cx) / INTRINSICS.fl_x, (y + 0.5 - INTRINSICS.cy) / INTRINSICS.fl_y, np.ones(x.shape)],
+        -1,
+    )
+    moved = cv2.projectPoints(rays.reshape(-1, 3), np.zeros(3), np.zeros(3), INTRINSICS.matrix(), distortion)[0]
+    column, row = np.clip(moved.reshape(*x.shape, 2).astype(int), 0, INTRINSICS.w - 1).transpose(2, 0, 1)
+    central = np.hypot(x - INTRINSICS.cx, y - INTRINSICS.cy) < 20
+    disagree = (bent[row, column] != straight)[central].mean()
+    assert disagree < 0.02
+    assert (bent != straight)[central].mean() > 2 * disagree
+
+
+def turn(count: int) -> np.ndarray:
+    return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
+
+
+def test_focus_point_is_where_the_cameras_look():
+    np.testing.assert_allclose(focus_point(turn(8)), [0.0, 0.0, 0.1], atol=1e-9)
+
+
+def test_object_box_of_a_sphere():
+    poses = turn(24)
+    intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
+    outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
+    assert outside.min() > -0.001
+    # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
+    assert outside[:, :2].max() < 0.005
+    np.testing.assert_allclose(
+        object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
+    )
+    assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
+
+
+def test_one_wrong_mask_does_not_cut_the_object():
+    poses = turn(24)
+    masks = np.stack([sphere_mask(pose) for pose in poses])
+    box = object_box(masks, poses, INTRINSICS)
+    masks[5] = False
+    assert np.abs(object_box(masks, poses, INTRINSICS) - box).max() < 0.01
+
+
+def test_box_keeps_a_part_thinner_than_a_voxel():
+    poses = turn(12)
+    stem = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.1, 0.17, 200)])
+    intrinsics = PinholeIntrinsics(160, 160, 300.0, 300.0, 80.0, 80.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    for mask, pose in zip(masks, poses, strict=True):
+        x, y = project(stem, pose, intrinsics)[0].astype(int).T
+        mask[y, x] = True
+    assert 0.17 <= object_box(masks, poses, intrinsics, margin_m=0.0)[1, 2] < 0.18
+
+
+def test_masks_that_do_not_fit_the_poses():
+    poses = turn(6)
+    masks = np.zeros((6, 48, 48), bool)
+    with pytest.raises(InputError, match="do not fit each other"):
+        object_box(masks, poses, INTRINSICS)
+
+
+def test_scene_box_holds_all_that_turns():
+    corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    np.testing.assert_allclose(
+        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-0.055, -0.055, -0.01], [0.13, 0.055, 0.21]]
+    )
+    np.testing.assert_allclose(scene_box(obj, corners, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.12, 0.02, 0.2]])
+
+
+def test_mask_picture_draws_each_outline(tmp_path):
+    images = [np.full((30, 40, 3), 90, np.uint8)] * 4
+    masks = [np.zeros((30, 40), bool) for _ in images]
+    masks[3][10:20, 10:20] = True
+    path = tmp_path / "masks.png"
+    mask_picture(path, images, masks, list("abcd"), columns=3, tile_px=80)
+    sheet = cv2.imread(str(path))[..., ::-1].astype(int)
+    assert sheet.shape == (120, 240, 3)
+    magenta = (sheet == [255, 0, 200]).all(-1)
+    assert magenta[60:, :80].sum() > 40
+    assert not magenta[:60].any()

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spectral.io import envi as spy
+
+from hsi_sc_nerf.data.atomic import write_png
+from hsi_sc_nerf.data.frames import border_spectrum
+from hsi_sc_nerf.data.packed import (
+    REFLECTANCE_SCALE,
+    Container,
+    PackedDataset,
+    PackedFrame,
+    is_packed,
+    open_packed,
+    write_packed_cube,
+    write_transforms,
+)
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at
+
+WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
+
+
+@pytest.fixture
+def dataset(tmp_path) -> PackedDataset:
+    rng = np.random.default_rng(0)
+    frames = []
+    for name in ("a", "b"):
+        write_packed_cube(tmp_path / "cubes" / f"{name}.hdr", rng.random((4, 5, 3)), WAVELENGTHS_NM)
+        write_png(tmp_path / "images" / f"{name}.png", rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
+        write_png(tmp_path / "masks" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * 255)
+        frames.append(
+            PackedFrame(
+                capture=name,
+                image_path=tmp_path / "images" / f"{name}.png",
+                mask_path=tmp_path / "masks" / f"{name}.png",
+                cube_path=tmp_path / "cubes" / f"{name}.hdr",
+                angle_deg=12.5,
+                reprojection_error_px=0.25,
+                camera_to_world=look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.1]),
+            )
+        )
+    return PackedDataset(
+        root=tmp_path,
+        intrinsics=PinholeIntrinsics(5, 4, 10.0, 11.0, 2.5, 2.0),
+        distortion=np.array([0.1, 0.2, 0.3, 0.4]),
+        wavelengths_nm=WAVELENGTHS_NM,
+        pseudo_rgb_nm=WAVELENGTHS_NM[::-1],
+        object_name="pear",
+        scene_box_m=np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]),
+        object_box_m=np.array([[-0.05, -0.05, 0.07], [0.05, 0.05, 0.2]]),
+        background_reflectance=np.array([0.9, 0.91, 0.92]),
+        container=Container(0.09, 0.07),
+        frames=tuple(frames),
+        fingerprint="f00",
+    )
+
+
+def edit(root: Path, change) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    change(content)
+    (root / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("container", [Container(0.09, 0.07), None])
+def test_round_trip(dataset, container):
+    write_transforms(replace(dataset, container=container))
+    for path in (dataset.root, dataset.root / "transforms.json"):
+        opened = open_packed(path)
+        assert (opened.intrinsics, opened.container) == (dataset.intrinsics, container)
+        assert (opened.object_name, opened.fingerprint, opened.root) == ("pear", "f00", dataset.root)
+        for name in ("distortion", "wavelengths_nm", "pseudo_rgb_nm", "scene_box_m", "object_box_m"):
+            np.testing.assert_array_equal(getattr(opened, name), getattr(dataset, name))
+        np.testing.assert_array_equal(opened.background_reflectance, dataset.background_reflectance)
+        np.testing.assert_array_equal(opened.camera_to_worlds, dataset.camera_to_worlds)
+        assert [(f.capture, f.angle_deg, f.reprojection_error_px) for f in opened.frames] == [
+            ("a", 12.5, 0.25),
+            ("b", 12.5, 0.25),
+        ]
+
+
+def test_nerfstudio_keys(dataset):
+    content = json.loads(write_transforms(dataset).read_text())
+    assert content["camera_model"] == "OPENCV"
+    assert [content[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [5, 4, 10.0, 11.0, 2.5, 2.0]
+    assert [content[k] for k in ("k1", "k2", "p1", "p2")] == [0.1, 0.2, 0.3, 0.4]
+    assert content["frames"][1]["file_path"] == "images/b.png"
+    assert content["frames"][1]["mask_path"] == "masks/b.png"
+    assert content["frames"][1]["cube_path"] == "cubes/b.hdr"
+
+
+def test_pixels(dataset):
+    frame = open_packed(write_transforms(dataset)).frames[0]
+    assert frame.cube().dtype == np.uint16
+    assert isinstance(frame.cube(), np.memmap)
+    np.testing.assert_array_equal(frame.mask(), np.eye(4, 5, dtype=bool))
+    reread = np.random.default_rng(0).random((4, 5, 3))
+    assert np.abs(frame.cube() / REFLECTANCE_SCALE - reread).max() <= 0.5 / REFLECTANCE_SCALE + 1e-12
+
+
+def test_pseudo_rgb_keeps_its_channels(tmp_path, dataset):
+    image = np.zeros((4, 5, 3), np.uint8)
+    image[..., 0], image[..., 2] = 200, 30
+    write_png(dataset.frames[0].image_path, image)
+    np.testing.assert_array_equal(dataset.frames[0].pseudo_rgb(), image)
+
+
+def test_cubes_open_in_spy_as_reflectance(dataset):
+    header = dataset.frames[0].cube_path
+    cube = spy.open(str(header))
+    assert cube.metadata["interleave"] == "bip"
+    assert header.with_suffix(".bip").is_file()
+    assert float(cube.metadata["reflectance scale factor"]) == REFLECTANCE_SCALE
+    expected = np.random.default_rng(0).random((4, 5, 3))
+    np.testing.assert_allclose(np.asarray(cube.load()), expected, atol=1e-5)
+
+
+def test_reflectance_outside_the_range_is_clipped(tmp_path):
+    write_packed_cube(tmp_path / "c.hdr", np.array([[[-0.5, 0.5, 7.0]]]), WAVELENGTHS_NM)
+    assert np.fromfile(tmp_path / "c.bip", "<u2").tolist() == [0, 32768, 65535]
+
+
+def test_is_packed(tmp_path, dataset):
+    assert not is_packed(tmp_path)
+    write_transforms(dataset)
+    assert is_packed(tmp_path)
+    edit(tmp_path, lambda content: content.pop("wavelengths_nm"))
+    assert not is_packed(tmp_path)
+    (tmp_path / "transforms.json").write_text("[")
+    assert not is_packed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("fl_x"), "lacks the key 'fl_x'"),
+        (lambda c: c.pop("object_box_m"), "lacks the key 'object_box_m'"),
+        (lambda c: c["frames"][0].pop("cube_path"), "lacks the key 'cube_path'"),
+        (lambda c: c.update(scene_box_m=[1, 2]), "cannot be read"),
+        (lambda c: c.update(background_reflectance=[1, 2]), "cannot be read"),
+        (lambda c: c.update(frames=[]), "lists no frames"),
+        (lambda c: c["frames"][0].update(angle_deg=None), "cannot be read"),
+    ],
+)
+def test_transforms_that_cannot_be_used(dataset, change, message):
+    write_transforms(dataset)
+    edit(dataset.root, change)
+    with pytest.raises(InputError, match=rf"transforms\.json: {message}"):
+        open_packed(dataset.root)
+
+
+def test_missing_files(tmp_path, dataset):
+    with pytest.raises(InputError, match="no packed dataset here"):
+        open_packed(tmp_path)
+    write_transforms(dataset)
+    (tmp_path / "masks" / "b.png").unlink()
+    with pytest.raises(InputError, match=r"b\.png: is missing"):
+        open_packed(tmp_path)
+
+
+def test_border_spectrum_is_the_background(tmp_path):
+    reflectance = np.full((64, 64, 3), 0.5)
+    reflectance[:2] = reflectance[-2:] = reflectance[:, :2] = reflectance[:, -2:] = [0.7, 0.8, 0.9]
+    foreground = np.zeros((64, 64), bool)
+    foreground[:40, 10:50] = True
+    reflectance[foreground] = 0.1
+    write_packed_cube(tmp_path / "c.hdr", reflectance, WAVELENGTHS_NM)
+    np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), [0.7, 0.8, 0.9], atol=1e-4)
+    assert np.isnan(border_spectrum(tmp_path / "c.hdr", np.ones((64, 64), bool))).all()
