@@ -195,7 +195,7 @@ def draw_cloud(
     inch_per_mm = 3.2 / float(size.max())
     widths = [size[side[1][0]] for side in sides]
     heights = [size[side[2][0]] for side in sides]
-    # One side shows about half of the points; a little over twice their spacing leaves no gaps.
+    # One side shows about half of the points; a little over twice their spacing leaves hardly a gap.
     dot_mm = 2.2 * math.sqrt(2.0 * size[0] * size[2] / max(len(points), 1))
     figure = _figure(sum(widths) * inch_per_mm + 0.75 * len(sides), max(heights) * inch_per_mm + 0.85)
     for axes, side in zip(figure.subplots(1, len(sides), width_ratios=widths, squeeze=False)[0], sides, strict=True):
