@@ -110,8 +110,8 @@ class StagedTrainer(Trainer):
             os.replace(self._checkpoint_path(step), final_dir / self._checkpoint_path(step).name)
         except (OSError, RuntimeError) as error:
             raise SystemExit(
-                f"hsi-sc-nerf: the checkpoint of step {step} could not be written to {final_dir} ({error}); free some "
-                "space and resume with --load-dir from the checkpoint before it"
+                f"hsi-sc-nerf: the checkpoint of step {step} could not be written to {final_dir} ({error}); free "
+                "some space and resume with --load-dir from the checkpoint before it"
             ) from error
         finally:
             shutil.rmtree(self.checkpoint_dir, ignore_errors=True)
