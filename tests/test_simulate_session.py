@@ -149,7 +149,7 @@ def test_white_things_in_a_white_chamber_cannot_be_seen():
 
 def test_rendering_in_pieces_changes_nothing(monkeypatch):
     scene = override(load_scene("maize"), size_px=32)
-    renderer = assemble.build_renderer(scene)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     arguments = assemble.intrinsics(scene.camera), assemble.camera_poses(scene)[3], 2
     whole = renderer.render(*arguments)
     monkeypatch.setattr("hsi_sc_nerf.simulate.render.RAYS_AT_ONCE", 700)
@@ -186,7 +186,7 @@ def detect(image, enlarge):
 @pytest.mark.parametrize("name", ["pear", "maize"])
 def test_enough_markers_are_found_in_small_images(name):
     scene = load_scene(name)
-    renderer = assemble.build_renderer(scene)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     found = [len(detect(green_image(scene, renderer, p), 4)) for p in assemble.camera_poses(scene)[:12:2]]
     assert min(found) >= 3
     assert np.mean(found) >= 5
@@ -194,7 +194,7 @@ def test_enough_markers_are_found_in_small_images(name):
 
 def test_marker_corners_are_seen_where_truth_projects_them():
     scene = override(load_scene("pear"), size_px=256)
-    renderer = assemble.build_renderer(scene)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     layout = marker_layout(scene.markers, scene.container, scene.turntable)
     errors = []
     for pose in assemble.camera_poses(scene)[[0, 4, 13]]:

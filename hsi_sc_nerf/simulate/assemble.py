@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.simulate import shapes, target, texture
+from hsi_sc_nerf.simulate.mesh import Mesh
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import Camera, Scene, Turntable
 
@@ -68,10 +69,10 @@ def support_parts(scene: Scene) -> list[Part]:
     return parts
 
 
-def build_renderer(scene: Scene) -> Renderer:
-    """The renderer of the whole scene."""
-    return Renderer([object_part(scene), *support_parts(scene)])
+def build_renderer(scene: Scene, thing: Part) -> Renderer:
+    """The renderer of the whole scene around its object (from `object_part`)."""
+    return Renderer([thing, *support_parts(scene)])
 
 
-def _plain(mesh: target.Mesh, material: str) -> Part:
+def _plain(mesh: Mesh, material: str) -> Part:
     return Part(mesh, (material,), np.ones((len(mesh.vertices), 1)))

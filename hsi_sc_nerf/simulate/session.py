@@ -16,7 +16,6 @@ from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble, truth
 from hsi_sc_nerf.simulate.materials import endmembers
-from hsi_sc_nerf.simulate.render import Renderer
 from hsi_sc_nerf.simulate.scene import Scene
 from hsi_sc_nerf.simulate.sensor import band_centres_nm, expose, white_signal
 from hsi_sc_nerf.simulate.target import marker_layout
@@ -83,10 +82,16 @@ def _check_free(session_dir: Path) -> None:
 
 
 def _move_into_place(building: Path, session_dir: Path) -> None:
+    if not session_dir.exists():
+        os.rename(building, session_dir)
+        return
     earlier = building.with_name(building.name + "-earlier")
-    if session_dir.exists():
-        os.rename(session_dir, earlier)
-    os.rename(building, session_dir)
+    os.rename(session_dir, earlier)
+    try:
+        os.rename(building, session_dir)
+    except OSError:
+        os.rename(earlier, session_dir)
+        raise
     shutil.rmtree(earlier, ignore_errors=True)
 
 
@@ -97,7 +102,7 @@ def _write(scene: Scene, session_dir: Path, progress: bool) -> None:
     poses = assemble.camera_poses(scene)
     captures = [f"{scene.name}_{i:03d}" for i in range(len(poses))]
     thing = assemble.object_part(scene)
-    renderer = Renderer([thing, *assemble.support_parts(scene)])
+    renderer = assemble.build_renderer(scene, thing)
     spectra = endmembers(renderer.materials, wavelengths_nm)
 
     truth.write_truth(
