@@ -80,6 +80,7 @@ def test_mask_is_one_whole_region_with_its_stem():
     score[5:20, 30] = 0.12  # a woody stem, weaker than the threshold
     score[20:50, 45] = 0.12  # the fruit's rim, part background
     score[2:6, 2:6] = 0.3  # something else
+    score[30, 46:49] = 0.12  # noise
     mask = foreground_mask(score, 0.2)
     expected = np.zeros((60, 60), bool)
     expected[20:50, 15:45] = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -21,7 +22,7 @@ class ProcessCommand:
     """Folder of the capture session."""
     output_dir: Path
     """Folder to write the dataset to."""
-    config: tyro.conf.OmitArgPrefixes[ProcessConfig] = field(default_factory=ProcessConfig)
+    config: Annotated[ProcessConfig, tyro.conf.arg(name="")] = field(default_factory=ProcessConfig)
     """Settings; the defaults are the paper's where it prints them."""
 
     def main(self) -> None:

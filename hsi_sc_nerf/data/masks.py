@@ -143,7 +143,7 @@ def foreground_mask(
     body = fill_holes(largest_component(closed))
     weak = (score > weak_share * threshold) & allowed
     rim = dilate(body, closing_px)
-    sticking_out = touching(weak & ~rim, dilate(rim, 3))
+    sticking_out = touching(weak & ~rim, dilate(rim, 3), min_area_px=closing_px + 1)
     return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
 
 

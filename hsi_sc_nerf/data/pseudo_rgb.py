@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike
 from hsi_sc_nerf import paper
 
 
-def nearest_bands(
-    wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: ArrayLike
-) -> Int[np.ndarray, "targets"]:
+def nearest_bands(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: ArrayLike) -> Int[np.ndarray, "targets"]:
     """Index of the band whose centre is nearest to each target."""
     return np.abs(wavelengths_nm[None, :] - np.asarray(targets_nm, float)[:, None]).argmin(axis=1)
 

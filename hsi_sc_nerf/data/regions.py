@@ -26,11 +26,12 @@ def dilate(mask: Bool[np.ndarray, "lines samples"], size_px: int) -> Bool[np.nda
 
 
 def touching(
-    mask: Bool[np.ndarray, "lines samples"], other: Bool[np.ndarray, "lines samples"]
+    mask: Bool[np.ndarray, "lines samples"], other: Bool[np.ndarray, "lines samples"], min_area_px: int = 1
 ) -> Bool[np.ndarray, "lines samples"]:
-    """The 8-connected components of the mask that share a pixel with ``other``."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    return mask & np.isin(labels, np.unique(labels[mask & other]))
+    """The mask's 8-connected components of at least ``min_area_px`` pixels that share a pixel with ``other``."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    large = np.flatnonzero(statistics[:, cv2.CC_STAT_AREA] >= min_area_px)
+    return mask & np.isin(labels, np.intersect1d(labels[mask & other], large))
 
 
 def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
