@@ -72,8 +72,6 @@ class MarkerScene:
         images = []
         for i, pose in enumerate(self.camera_to_world):
             image = self._render(pose, i in self.blanked)
-            if self.blur_px:
-                image = cv2.GaussianBlur(image, (0, 0), self.blur_px)
             image = image + rng.normal(0, 1, image.shape) * self.noise
             images.append(np.clip(np.round(image * 255), 0, 255).astype(np.uint8))
         return images
@@ -96,6 +94,8 @@ class MarkerScene:
                 cosine = centre[:2] @ to_camera[:2] / np.linalg.norm(centre[:2]) / np.linalg.norm(to_camera)
                 if cosine > 0.05:
                     self._paste(canvas, marker, pose, over, 0.55 + 0.35 * cosine)
+        if self.blur_px:
+            canvas = cv2.GaussianBlur(canvas, (0, 0), self.blur_px * over)
         return cv2.resize(canvas, (self.size_px, self.size_px), interpolation=cv2.INTER_AREA)
 
     def _fill(self, canvas, points, pose, over, value):

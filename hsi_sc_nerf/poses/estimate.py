@@ -149,30 +149,25 @@ def _usable(seen: Observations) -> tuple[Observations, list[str]]:
     return usable.select(linked_rows(usable.frame, usable.marker)), warnings
 
 
-def _adjust_without_outliers(turntable, observations, centre, side_m):
+def _adjust_without_outliers(
+    turntable: Turntable, observations: Observations, centre: tuple[float, float], side_m: float
+) -> tuple[Turntable, Observations]:
     """Adjust, throw out what does not fit, adjust again."""
-    for last in (False, True):
-        turntable = _restrict(turntable, observations)
-        weights = whitening(observations.covariance_px2)
-        turntable = adjust(turntable, observations, centre, side_m, weights, _LOSS_SIGMAS)
-        if last:
-            return turntable, observations
-        error = np.sqrt(
-            ((reproject(turntable, observations, centre, side_m) - observations.corners_px) ** 2).sum(-1).mean(-1)
+    weights = whitening(observations.covariance_px2)
+    turntable = adjust(turntable, observations, centre, side_m, weights, _LOSS_SIGMAS)
+    residual = reproject(turntable, observations, centre, side_m) - observations.corners_px
+    error = np.sqrt((residual**2).sum(-1).mean(-1))
+    good = error < max(_OUTLIER_PX, _OUTLIER_MEDIANS * float(np.median(error)))
+    if good.all():
+        return turntable, observations
+    kept, _ = _usable(observations.select(good))
+    if len(np.unique(kept.frame)) < FEWEST_FRAMES:
+        raise InputError(
+            "the markers do not move as on one turntable; check that camera and markers were not touched during "
+            "the session and that all markers have the same side"
         )
-        good = error < max(_OUTLIER_PX, _OUTLIER_MEDIANS * float(np.median(error)))
-        observations = observations.select(good)
-        seen_twice = np.bincount(observations.marker)[observations.marker] >= 2
-        observations = observations.select(seen_twice)
-        observations = observations.select(linked_rows(observations.frame, observations.marker))
-        if len(np.unique(observations.frame)) < FEWEST_FRAMES:
-            raise InputError(
-                "the markers do not move as on one turntable; check that camera and markers were not touched during "
-                "the session and that all markers have the same side"
-            )
-        if good.all():
-            return turntable, observations
-    raise AssertionError("unreachable")
+    turntable = _restrict(turntable, kept)
+    return adjust(turntable, kept, centre, side_m, whitening(kept.covariance_px2), _LOSS_SIGMAS), kept
 
 
 def _restrict(turntable: Turntable, observations: Observations) -> Turntable:
@@ -193,8 +188,20 @@ def _restrict(turntable: Turntable, observations: Observations) -> Turntable:
 
 
 def _result(
-    turntable, observations, centre, side_m, size, names, dropped, dictionary, blur_px, warnings, step, direction
-):
+    turntable: Turntable,
+    observations: Observations,
+    centre: tuple[float, float],
+    side_m: float,
+    size: tuple[int, int],
+    names: Sequence[str],
+    dropped: dict[str, str],
+    dictionary: str,
+    blur_px: float,
+    warnings: Sequence[str],
+    step: float | None,
+    direction: Literal["ccw", "cw"] | None,
+) -> TurntablePoses:
+    """The adjusted machine in the object frame, frame by frame."""
     n = len(names)
     residual = reproject(turntable, observations, centre, side_m) - observations.corners_px
     squared = (residual**2).sum(-1).mean(-1)

@@ -20,10 +20,12 @@ from hsi_sc_nerf.poses.markers import marker_pattern
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
 _TEXELS = 8
-_ITERATIONS = 15
-_CONVERGED_PX = 1e-3
+_ITERATIONS = 12
+_CONVERGED_PX = 3e-3
 # A fit explains the pixels when what it leaves is below this share of their variance.
 _LARGEST_UNEXPLAINED = 0.15
+# A start that leaves more than this is no start: another thing is in front of the marker.
+_HOPELESS_UNEXPLAINED = 0.8
 # Errors of the pattern's model itself (print, lens, shading) that the pixels' residual does not show.
 _MODEL_ERROR_PX = 0.02
 _HUBER_SIGMAS = 2.5
@@ -88,6 +90,8 @@ def fit_marker(
             return None
         weighted = root[:, 0] * values
         residual = weighted - basis @ (basis.T @ weighted)
+        if residual @ residual > _HOPELESS_UNEXPLAINED * np.sum((weighted - weighted.mean()) ** 2):
+            return None
         white_over_black = shading @ np.linalg.solve(triangle, basis.T @ weighted)[3:]
         jacobian = root * white_over_black[:, None] * slope
         jacobian = jacobian - basis @ (basis.T @ jacobian)
@@ -114,6 +118,12 @@ def fit_marker(
     to_corners = _corner_slopes(homography, unit_corners) * extent
     covariance = variance * to_corners @ np.linalg.solve(information, to_corners.T)
     return FittedMarker(corners, covariance + _MODEL_ERROR_PX**2 * np.eye(8), unexplained)
+
+
+def quad_area(corners: Float[np.ndarray, "4 2"]) -> float:
+    """Area of a quadrilateral, from its diagonals."""
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    return 0.5 * abs(float(a[0] * b[1] - a[1] * b[0]))
 
 
 def _window(corners_px, cells, shape):
@@ -148,8 +158,7 @@ def _homography(corners, cells):
 def _footprint(corners_px, cells, blur_px):
     """Sample positions over one pixel (with blur around it), and their weights."""
     side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
-    area = 0.5 * abs(np.cross(corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]))
-    narrowest_cell = area / side.max() / cells
+    narrowest_cell = quad_area(corners_px) / side.max() / cells
     # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
     spacing = max(1.0 / np.clip(np.ceil(4.0 / narrowest_cell), 2, 6), 0.4 * blur_px)
     reach = 0.5 + 2.5 * blur_px
@@ -165,30 +174,31 @@ def _footprint(corners_px, cells, blur_px):
 
 @lru_cache(maxsize=64)
 def _texture(dictionary, marker):
-    """The pattern with a white margin and its slopes along u and v (a cell), and the margin in texels."""
+    """The pattern with a white margin of three cells, and its slopes along u and v (a cell), as three channels."""
     pattern = np.pad(marker_pattern(dictionary, marker), 3, constant_values=1).astype(np.float32)
     texture = np.kron(pattern, np.ones((_TEXELS, _TEXELS), np.float32))
-    slope_u, slope_v = (cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (_TEXELS / 2) for dx in (1, 0))
-    return texture, slope_u, slope_v
+    slopes = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (_TEXELS / 2) for dx in (1, 0)]
+    return cv2.merge([texture, *slopes])
 
 
 def _render(local, offsets, weights, homography, dictionary, marker):
     """The pattern seen by each pixel, in [0, 1], and its derivatives by the homography."""
-    texture, slope_u, slope_v = _texture(dictionary, marker)
     x, y = (local[:, None, axis] + offsets[None, :, axis] for axis in (0, 1))
     h = homography
     inverse_d = 1.0 / (h[6] * x + h[7] * y + 1.0)
     u = (h[0] * x + h[1] * y + h[2]) * inverse_d
     v = (h[3] * x + h[4] * y + h[5]) * inverse_d
-    at = [((axis + 3) * _TEXELS - 0.5).astype(np.float32) for axis in (u, v)]
-    seen, seen_u, seen_v = (
-        cv2.remap(t, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for t in (texture, slope_u, slope_v)
-    )
-    du, dv = seen_u * inverse_d * weights, seen_v * inverse_d * weights
+    u_at, v_at = (((axis + 3) * _TEXELS - 0.5).astype(np.float32) for axis in (u, v))
+    seen = cv2.remap(_texture(dictionary, marker), u_at, v_at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    scaled = inverse_d * weights
+    du, dv = seen[..., 1] * scaled, seen[..., 2] * scaled
     dd = -(du * u + dv * v)
-    slope = np.stack([(a * b).sum(-1) for a in (du, dv, dd) for b in (x, y, 1.0)][:8], -1)
-    return seen @ weights, slope
+    slope = np.empty((len(local), 9))
+    for k, derivative in enumerate((du, dv, dd)):
+        slope[:, 3 * k] = np.einsum("ns,ns->n", derivative, x)
+        slope[:, 3 * k + 1] = np.einsum("ns,ns->n", derivative, y)
+        slope[:, 3 * k + 2] = derivative.sum(-1)
+    return np.einsum("ns,s->n", seen[..., 0], weights), slope[:, :8]
 
 
 def _corners(homography, unit_corners):

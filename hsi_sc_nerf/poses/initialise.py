@@ -2,7 +2,7 @@
 
 Centres of markers run on circles about one axis. A wrong focal length stretches these circles along the viewing
 direction, so the focal length is the one that leaves them round; and centres hardly suffer from the two-fold
-ambiguity of a small square's pose, which the layout then resolves: in the object's frame a marker stands still.
+ambiguity of a small square's pose, which the layout then resolves: one pose on the object must suit all frames.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
@@ -78,8 +79,15 @@ def initialise(observations: Observations, centre_px: tuple[float, float], width
     """First guess from linked observations (``linked_rows``) of markers that each are in two or more frames."""
     fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
     focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
-    trials = [_Circles(observations, f, centre_px, side_m) for f in focals]
-    return min(trials, key=lambda t: t.error_px).turntable()
+    errors = [_Circles(observations, f, centre_px, side_m).error_px for f in focals]
+    best = int(np.argmin(errors))
+    finer = minimize_scalar(
+        lambda log_focal: _Circles(observations, np.exp(log_focal), centre_px, side_m).error_px,
+        bounds=np.log([focals[min(best + 1, _FOV_STEPS - 1)], focals[max(best - 1, 0)]]),
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
+    return _Circles(observations, float(np.exp(finer.x)), centre_px, side_m).turntable()
 
 
 class _Circles:
@@ -89,6 +97,8 @@ class _Circles:
         self.frames, self.f = np.unique(observations.frame, return_inverse=True)
         self.markers, self.m = np.unique(observations.marker, return_inverse=True)
         self.focal_px = focal_px
+        self.corners_px = observations.corners_px - centre_px
+        self.square = square_corners(side_m)
         self.rotations, self.centres = _marker_poses(observations.corners_px, focal_px, centre_px, side_m)
         self._fit()
         ratio = focal_px * side_m / self.centres[:, 2]
@@ -131,15 +141,21 @@ class _Circles:
         camera_rotation = np.stack([x, np.cross(z, x), z], -1)
         camera = np.array([distance, 0.0, 0.0])
         angles = self.angles - self.angles[0]
-        back = np.stack([rotation_about_z(-np.rad2deg(a))[:3, :3] for a in angles])
+        turn = np.stack([rotation_about_z(np.rad2deg(a))[:3, :3] for a in angles])[self.f]
         in_room = self.centres @ camera_rotation + camera
-        centres = np.einsum("nij,nj->ni", back[self.f], in_room)
-        rotations = np.einsum("nij,kj,nckl->ncil", back[self.f], camera_rotation.T, self.rotations)
+        centres = np.einsum("nji,nj->ni", turn, in_room)
+        rotations = np.einsum("nji,kj,nckl->ncil", turn, camera_rotation.T, self.rotations)
         poses = np.tile(np.eye(4), (len(self.markers), 1, 1))
         for k in range(len(self.markers)):
             rows = self.m == k
-            poses[k, :3, :3] = _steadiest(rotations[rows])
             poses[k, :3, 3] = np.median(centres[rows], axis=0)
+            candidates = rotations[rows].reshape(-1, 3, 3)
+            points = np.einsum("cij,kj->cki", candidates, self.square) + poses[k, :3, 3]
+            in_camera = (np.einsum("nij,ckj->cnki", turn[rows], points) - camera) @ camera_rotation.T
+            error = self.focal_px * in_camera[..., :2] / in_camera[..., 2:] - self.corners_px[rows]
+            # Of all frames' two candidates the one that suits all frames best.
+            size = np.linalg.norm(error, axis=-1).mean(-1)
+            poses[k, :3, :3] = candidates[np.argmin(np.median(size, axis=-1))]
         start = Turntable(self.focal_px, camera_rotation, float(distance), self.frames, angles, self.markers, poses)
         up = poses[:, 2, 2]
         flat = np.abs(up) > _HORIZONTAL_COSINE
@@ -167,6 +183,9 @@ def _marker_poses(corners_px, focal_px, centre_px, side_m):
     rotations, centres = [], []
     for corners in corners_px:
         _, turns, shifts, _ = cv2.solvePnPGeneric(square, corners, k, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+        if not (np.isfinite(turns).all() and np.isfinite(shifts).all()):
+            # IPPE divides by zero for a square seen exactly from the front.
+            _, turns, shifts, _ = cv2.solvePnPGeneric(square, corners, k, None, flags=cv2.SOLVEPNP_ITERATIVE)
         rotations.append(Rotation.from_rotvec(np.array([turns[0].ravel(), turns[-1].ravel()])).as_matrix())
         centres.append(shifts[0].ravel())
     return np.array(rotations), np.array(centres)
@@ -192,12 +211,3 @@ def _mean_direction(index, numbers, size):
     total = np.bincount(index, numbers.real, size) + 1j * np.bincount(index, numbers.imag, size)
     length = np.abs(total)
     return np.where(length > 1e-12, total / np.maximum(length, 1e-12), 0.0)
-
-
-def _steadiest(rotations):
-    """Of all frames' two candidates the one that the other frames' candidates agree with best."""
-    n = len(rotations)
-    flat = rotations.reshape(2 * n, 9)
-    distance = np.linalg.norm(flat[:, None] - flat[None], axis=-1).reshape(2 * n, n, 2).min(-1)
-    best = np.argmin(np.minimum(distance, 0.5).sum(-1))
-    return flat[best].reshape(3, 3)

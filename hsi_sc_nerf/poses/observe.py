@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
 from hsi_sc_nerf.poses.adjust import reproject
-from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker
+from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.frame import layout
 from hsi_sc_nerf.poses.initialise import Observations, Turntable
 from hsi_sc_nerf.poses.markers import Detections, detect_markers
@@ -46,7 +46,7 @@ def observe(
 def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detections: Sequence[Detections]) -> float:
     """Standard deviation of the blur, in pixels, with which the largest markers' patterns fit their pixels best."""
     seen = [(i, m, c) for i, found in enumerate(detections) for m, c in sorted(found.items())]
-    seen.sort(key=lambda s: -_area(s[2]))
+    seen.sort(key=lambda s: -quad_area(s[2]))
     # Spread over the larger half: neighbours in size are often the same marker in neighbouring frames.
     seen = seen[: max(_MARKERS_TO_TELL_THE_BLUR, len(seen) // 2)]
     seen = seen[:: max(1, len(seen) // _MARKERS_TO_TELL_THE_BLUR)][:_MARKERS_TO_TELL_THE_BLUR]
@@ -117,8 +117,3 @@ def _observations(rows: list[tuple[int, int, FittedMarker]]) -> Observations:
         np.array([f.corners_px for _, _, f in rows]).reshape(-1, 4, 2),
         np.array([f.covariance_px2 for _, _, f in rows]).reshape(-1, 8, 8),
     )
-
-
-def _area(corners: Float[np.ndarray, "4 2"]) -> float:
-    a, b = corners[2] - corners[0], corners[3] - corners[1]
-    return 0.5 * abs(float(a[0] * b[1] - a[1] * b[0]))
