@@ -9,7 +9,7 @@ import pytest
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.adjust import _Problem, adjust, whitening
+from hsi_sc_nerf.poses.adjust import _Problem, adjust, reproject, whitening
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
 from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m, on_disc
 from hsi_sc_nerf.poses.geometry import project, rotation_angle_deg
@@ -73,6 +73,14 @@ def test_exact_corners_give_exact_poses(options):
     assert position < 1e-1
     turned = np.rad2deg(np.unwrap(turntable.angles_rad))
     np.testing.assert_allclose(turned, scene.angles_deg, atol=1e-2)
+
+
+def test_first_guess_is_all_but_exact_on_exact_corners():
+    scene = MarkerScene(frames=18, turn_deg=200.0)
+    observations = exact_observations(scene)
+    start = initialise(observations, (64.0, 64.0), scene.size_px, SIDE_M)
+    error = reproject(start, observations, (64.0, 64.0), SIDE_M) - observations.corners_px
+    assert np.abs(error).max() < 0.05
 
 
 def test_noisy_corners_give_close_poses():

@@ -144,7 +144,7 @@ class _Circles:
         turn = np.stack([rotation_about_z(np.rad2deg(a))[:3, :3] for a in angles])[self.f]
         in_room = self.centres @ camera_rotation + camera
         centres = np.einsum("nji,nj->ni", turn, in_room)
-        rotations = np.einsum("nji,kj,nckl->ncil", turn, camera_rotation.T, self.rotations)
+        rotations = np.einsum("nji,kj,nckl->ncil", turn, camera_rotation, self.rotations)
         poses = np.tile(np.eye(4), (len(self.markers), 1, 1))
         for k in range(len(self.markers)):
             rows = self.m == k
