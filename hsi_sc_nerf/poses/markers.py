@@ -35,6 +35,8 @@ _FAMILIES: dict[str, tuple[str, ...]] = {
     "DICT_APRILTAG_16h5": ("DICT_APRILTAG_16h5",),
 }
 _FRAMES_TO_TELL_THE_DICTIONARY = 8
+# With so many of its markers in a frame, no other family needs to be tried.
+_CLEAR_MARKERS_PER_FRAME = 2
 
 
 def dictionary_by_name(name: str) -> cv2.aruco.Dictionary:
@@ -97,6 +99,8 @@ def find_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
             best_score = score
             largest = max(steady)
             best = next(p for p in parts if largest < dictionary_by_name(p).bytesList.shape[0])
+        if score >= _CLEAR_MARKERS_PER_FRAME * len(take):
+            break
     return best
 
 
