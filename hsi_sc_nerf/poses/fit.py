@@ -85,14 +85,18 @@ def fit_marker(
         rendered, slope = _render(local, offsets, weights, homography, dictionary, marker)
         design = np.concatenate([shading, shading * rendered[:, None]], -1)
         root = np.sqrt(robust)[:, None]
-        basis, triangle = np.linalg.qr(root * design)
-        if np.abs(np.diag(triangle)).min() < 1e-9:
+        # Cholesky's factor of the 6 x 6 Gram matrix: as good as QR for these columns, and many times faster.
+        gram = (root * design).T @ (root * design)
+        try:
+            back = np.linalg.inv(np.linalg.cholesky(gram)).T
+        except np.linalg.LinAlgError:
             return None
+        basis = root * design @ back
         weighted = root[:, 0] * values
         residual = weighted - basis @ (basis.T @ weighted)
         if residual @ residual > _HOPELESS_UNEXPLAINED * np.sum((weighted - weighted.mean()) ** 2):
             return None
-        white_over_black = shading @ np.linalg.solve(triangle, basis.T @ weighted)[3:]
+        white_over_black = shading @ (back @ (basis.T @ weighted))[3:]
         jacobian = root * white_over_black[:, None] * slope
         jacobian = jacobian - basis @ (basis.T @ jacobian)
         information = jacobian.T @ jacobian
