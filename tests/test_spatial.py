@@ -9,6 +9,7 @@ import pytest
 from hsi_sc_nerf.evaluation.spatial import (
     SpatialScore,
     distance_to_surface,
+    f_score_with_spread,
     precision_recall_f_score,
     sample_surface,
 )
@@ -105,3 +106,17 @@ def test_distance_to_the_surface_not_to_its_vertices() -> None:
 def test_scores_need_no_open3d() -> None:
     program = "import sys, hsi_sc_nerf.evaluation.spatial as s; sys.exit('open3d' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_spread_shrinks_with_the_number_of_points():
+    rng = np.random.default_rng(1)
+    spreads = []
+    for count in (500, 50_000):
+        reference = np.zeros((count, 3))
+        reconstructed = np.where(rng.random((count, 1)) < 0.5, 0.0, 1.0) * np.ones(3)
+        score, spread = f_score_with_spread(reconstructed, reference, 0.002)
+        assert score == precision_recall_f_score(reconstructed, reference, 0.002)
+        # F = 2 P / (1 + P) with P = 1/2 of Bernoulli hits: dF = 2 / (1 + P)^2 dP.
+        assert spread == pytest.approx(100 * 2 / 1.5**2 * 0.5 / np.sqrt(count), rel=0.25)
+        spreads.append(spread)
+    assert spreads[1] < spreads[0] / 5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,9 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
         ) from error
     finally:
         for source in temporary:
-            source.unlink(missing_ok=True)
+            # What cannot be deleted was not written either; the error above says why.
+            with suppress(OSError):
+                source.unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.paper import F_SCORE_THRESHOLD_M
@@ -32,12 +32,46 @@ def precision_recall_f_score(
     Distances to points overstate distances to the surface by up to the spacing: sample the reference densely.
     An empty cloud scores 0.
     """
+    return _score(*_hits(reconstructed_m, reference_m, threshold_m))
+
+
+def f_score_with_spread(
+    reconstructed_m: Float[np.ndarray, "n 3"],
+    reference_m: Float[np.ndarray, "m 3"],
+    threshold_m: float = F_SCORE_THRESHOLD_M,
+    resamples: int = 100,
+    seed: int = 0,
+) -> tuple[SpatialScore, float]:
+    """`precision_recall_f_score`, and the standard deviation of the F-score (percent) over bootstrap resamples.
+
+    The points of both clouds are drawn again with replacement (Efron 1979): the spread says how much of the score
+    is the luck of which points were sampled, not how well the surface is known.
+    """
+    precise, recalled = _hits(reconstructed_m, reference_m, threshold_m)
+    rng = np.random.default_rng(seed)
+    scores = [
+        _score(rng.choice(precise, len(precise)), rng.choice(recalled, len(recalled))).f_score
+        for _ in range(resamples)
+        if len(precise) and len(recalled)
+    ]
+    return _score(precise, recalled), float(np.std(scores)) if scores else 0.0
+
+
+def _hits(
+    reconstructed_m: Float[np.ndarray, "n 3"], reference_m: Float[np.ndarray, "m 3"], threshold_m: float
+) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "m"]]:
+    """Which points of each cloud have a point of the other within the threshold; none, if one is empty."""
     if not len(reconstructed_m) or not len(reference_m):
-        return SpatialScore(0.0, 0.0, 0.0)
-    precision, recall = (
-        100.0 * float(np.mean(cKDTree(there).query(here, workers=-1)[0] <= threshold_m))
+        return np.zeros(len(reconstructed_m), bool), np.zeros(len(reference_m), bool)
+    precise, recalled = (
+        cKDTree(there).query(here, workers=-1)[0] <= threshold_m
         for here, there in ((reconstructed_m, reference_m), (reference_m, reconstructed_m))
     )
+    return precise, recalled
+
+
+def _score(precise: Bool[np.ndarray, "n"], recalled: Bool[np.ndarray, "m"]) -> SpatialScore:
+    precision, recall = (100.0 * float(np.mean(hits)) if len(hits) else 0.0 for hits in (precise, recalled))
     total = precision + recall
     return SpatialScore(precision, recall, 2 * precision * recall / total if total else 0.0)
 

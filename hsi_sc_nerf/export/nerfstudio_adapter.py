@@ -53,12 +53,11 @@ class _ExporterBeingImported(types.ModuleType):
 
     def __getattribute__(self, name: str) -> Any:
         if name in ("entrypoint", "ExportPointCloud"):
-            self.__class__ = types.ModuleType
-            if hasattr(self, "entrypoint"):
+            complete = "entrypoint" in vars(self)
+            if complete:
+                self.__class__ = types.ModuleType
                 _wrap_main(self)
-            else:
-                self.__class__ = _ExporterBeingImported
-        return super().__getattribute__(name)
+        return types.ModuleType.__getattribute__(self, name)
 
 
 class _ExporterFinder(importlib.abc.MetaPathFinder):

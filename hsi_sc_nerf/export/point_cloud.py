@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hsi_sc_nerf.errors import InputError
@@ -75,7 +75,7 @@ def sample_surface_points(
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        console=CONSOLE,
+        console=Console(stderr=True),
     ) as progress:
         task = progress.add_task("", total=num_points)
         while found < num_points:

@@ -11,7 +11,9 @@ from jaxtyping import Float
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.activations import trunc_exp
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.mlp import MLP
+from nerfstudio.fields.base_field import get_normalized_directions
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
@@ -70,6 +72,35 @@ class SpectralField(NerfactoField):
         self._density_before_activation = before_activation
         density = self.average_init_density * trunc_exp(before_activation.to(positions)) * inside
         return density, features
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
+    ) -> dict[FieldHeadNames, Tensor]:
+        """Spectra (and predicted normals) at samples along rays.
+
+        The viewing direction is encoded once a ray: nerfacto does it at every sample, which shows without a GPU.
+        """
+        assert density_embedding is not None
+        outputs: dict[FieldHeadNames, Tensor] = {}
+        if self.use_pred_normals:
+            positions = self.position_encoding(ray_samples.frustums.get_positions())
+            hidden = self.mlp_pred_normals(torch.cat([positions, density_embedding], dim=-1))
+            outputs[FieldHeadNames.PRED_NORMALS] = self.field_head_pred_normals(hidden)
+        directions = get_normalized_directions(ray_samples.frustums.directions[..., 0, :])
+        encoded = self.direction_encoding(directions)[..., None, :].expand(*density_embedding.shape[:-1], -1)
+        inputs = [encoded, density_embedding]
+        if self.embedding_appearance is not None:
+            inputs.append(self._appearance(ray_samples).expand(*density_embedding.shape[:-1], -1))
+        outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1))
+        return outputs
+
+    def _appearance(self, ray_samples: RaySamples) -> Float[Tensor, "#rays #samples embedding"]:
+        """The view's appearance in training; outside it the average or zeros, as nerfacto's option says."""
+        assert self.embedding_appearance is not None and ray_samples.camera_indices is not None
+        if self.training:
+            return self.embedding_appearance(ray_samples.camera_indices[..., 0])
+        average = self.embedding_appearance.mean(dim=0)
+        return average if self.use_average_appearance_embedding else torch.zeros_like(average)
 
     def density_gradient(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Gradient of the log density at points in scene units; its negative points out of the surface."""

@@ -59,6 +59,13 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Samples a ray for each proposal network: a box of 0.2 m needs far fewer than an unbounded scene."""
     num_nerf_samples_per_ray: int = 32
     """Samples a ray for the spectral field."""
+    proposal_net_args_list: list[dict] = field(
+        default_factory=lambda: [
+            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
+            for max_res in (64, 128)
+        ]
+    )
+    """The proposal networks: a scene of 0.2 m fits into smaller tables than nerfacto's."""
     max_res: int = 512
     """Finest grid of the spectral field; 512 cells over a 0.2 m box are 0.4 mm each."""
     log2_hashmap_size: int = 17

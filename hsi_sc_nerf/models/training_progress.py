@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import TracebackType
 
-from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hsi_sc_nerf.models.stages import Stage
@@ -22,7 +22,7 @@ class TrainingProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            console=CONSOLE,
+            console=Console(stderr=True),
         )
         self._task = self._progress.add_task("training", total=total_steps, completed=first_step, quality="")
         self._smoothed_psnr: float | None = None

@@ -44,6 +44,11 @@ class Truth:
         """The object alone, PLY, object frame, metres."""
         return self.session_dir / "truth" / "mesh.ply"
 
+    def mesh(self) -> Mesh:
+        """The object alone, object frame, metres."""
+        read = o3d.io.read_triangle_mesh(str(self.mesh_path))
+        return Mesh(np.asarray(read.vertices), np.asarray(read.triangles))
+
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
         """Share of each material in each pixel, summing to 1."""
         return self._pixels(capture, "material_weights").astype(np.float32)

@@ -1,0 +1,120 @@
+"""What the demo shows at its end: scores against the known truth, pictures, a table, a summary for machines."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf import __version__, paper
+from hsi_sc_nerf.cli.steps import StepCost
+from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, PackedDataset, open_packed
+from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
+from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.poses.geometry import project
+from hsi_sc_nerf.simulate.truth import load_truth
+
+SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")
+REFERENCE_POINTS = 100_000
+MARKED_POINTS = 4
+# The paper's hardest object, the apple: what the demo has to reach.
+PAPER_APPLE = {"sam": 0.0642, "rmse": 0.0438, "ssim": 0.742, "psnr": 24.49, "f_score": None}
+
+
+def score(out: Path) -> dict[str, float]:
+    """The held-out metrics of ``ns-eval`` and the F-score of the cloud against the true mesh, without alignment."""
+    results = json.loads((out / "eval.json").read_text(encoding="utf-8"))["results"]
+    metrics = {f"{key}{end}": results[f"{key}{end}"] for key in SPECTRAL_METRICS for end in ("", "_std")}
+    mesh = load_truth(out / "session").mesh()
+    reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
+    cloud = read_spectral_ply(out / "point_cloud.ply")
+    spatial, spread = f_score_with_spread(cloud.points, reference, paper.F_SCORE_THRESHOLD_M)
+    metrics |= {"f_score": spatial.f_score, "f_score_std": spread}
+    return metrics | {"precision": spatial.precision, "recall": spatial.recall}
+
+
+def write_summary(out: Path, metrics: dict[str, float], costs: Sequence[StepCost]) -> None:
+    """``summary.json``: metrics, steps, versions and machine."""
+    write_json(
+        out / "summary.json",
+        {
+            "metrics": metrics,
+            "steps": [asdict(cost) for cost in costs],
+            "seconds": sum(cost.seconds for cost in costs),
+            "f_score_threshold_m": paper.F_SCORE_THRESHOLD_M,
+            "version": __version__,
+            "machine": {"system": platform.platform(), "python": platform.python_version(), "cores": os.cpu_count()},
+        },
+    )
+
+
+def show_table(console: Console, out: Path, metrics: dict[str, float], costs: Sequence[StepCost]) -> None:
+    """Print what was reached and what it cost."""
+    quality = Table(title="Held-out views, masked to the object; cloud against the true mesh")
+    for title in ("metric", "mean ± SD", "paper's apple"):
+        quality.add_column(title)
+    units = {"sam": "SAM, rad", "rmse": "RMSE", "ssim": "SSIM", "psnr": "PSNR, dB", "f_score": "F-score at 2 mm, %"}
+    for key, title in units.items():
+        digits = 1 if key in ("psnr", "f_score") else 4
+        printed = PAPER_APPLE[key]
+        reached = f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}"
+        quality.add_row(title, reached, "-" if printed is None else f"{printed:.{digits}f}")
+    cost_table = Table(title="Cost")
+    for title in ("step", "seconds", "peak memory, MiB"):
+        cost_table.add_column(title, justify="left" if title == "step" else "right")
+    for cost in costs:
+        cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
+    cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")
+    console.print(quality, cost_table)
+    console.print(f"Pictures, cloud and summary.json are in {out}.")
+
+
+def draw_pictures(out: Path) -> None:
+    """Draw ``views.png``, ``spectra.png`` and ``cloud.png``, and put ``poses.png`` beside them."""
+    dataset = open_packed(out / "data")
+    cloud = read_spectral_ply(out / "point_cloud.ply")
+    renders = sorted((out / "renders").glob("*_img_*.png"))
+    halves = [np.split(cv2.imread(str(path))[..., ::-1], 2, axis=1) for path in renders]
+    names = [f"held-out view {i + 1}" for i in range(len(halves))]
+    draw_views(out / "views.png", [h[0] for h in halves], [h[1] for h in halves], names)
+    draw_cloud(out / "cloud.png", cloud.points, cloud.colours)
+    _draw_marked_spectra(out / "spectra.png", dataset, cloud.points, cloud.spectra)
+    (out / "poses.png").write_bytes((out / "data" / "report" / "poses.png").read_bytes())
+
+
+def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray, spectra: np.ndarray) -> None:
+    """Spectra of the cloud at a few places of the first frame, beside what that frame measured there."""
+    frame = dataset.frames[0]
+    pixels = _spread_pixels(frame.mask(), MARKED_POINTS)
+    image_points, depth = project(points, frame.camera_to_world, dataset.intrinsics)
+    # Of the points behind a pixel the nearest to the camera is the one that it shows.
+    tree = cKDTree(image_points)
+    nearest = [min(tree.query_ball_point(p, 0.7) or [tree.query(p)[1]], key=lambda i: depth[i]) for p in pixels]
+    columns, lines = np.floor(pixels).astype(int).T
+    measured = frame.cube()[lines, columns] / REFLECTANCE_SCALE
+    labels = [chr(ord("A") + i) for i in range(len(pixels))]
+    draw_spectra(path, dataset.wavelengths_nm, measured, spectra[nearest], labels, frame.pseudo_rgb(), pixels)
+
+
+def _spread_pixels(mask: np.ndarray, count: int) -> np.ndarray:
+    """Centres (x, y) of ``count`` pixels well inside the mask, spread from its top to its bottom."""
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    lines, columns = np.nonzero(inside if inside.any() else mask)
+    wanted = np.quantile(lines, (np.arange(count) + 0.5) / count).round().astype(int)
+    chosen = []
+    for i, line in enumerate(wanted):
+        row = np.sort(columns[lines == lines[np.abs(lines - line).argmin()]])
+        # Alternate between the sides of the object, where its spectra differ.
+        chosen.append((row[int((0.25 if i % 2 else 0.75) * (len(row) - 1))] + 0.5, line + 0.5))
+    return np.array(chosen)

@@ -1,0 +1,35 @@
+"""The command line `hsi-sc-nerf`."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf.cli.demo import DemoCommand
+from hsi_sc_nerf.cli.process import ProcessCommand
+from hsi_sc_nerf.cli.simulate import SimulateCommand
+from hsi_sc_nerf.errors import InputError
+
+Commands = (
+    Annotated[DemoCommand, tyro.conf.subcommand("demo")]
+    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
+)
+
+
+def main() -> None:
+    """Run the command that the user asked for; bad input ends in one sentence and status 2."""
+    command = tyro.cli(Commands, description="Hyperspectral 3D reconstruction of turntable captures.")  # type: ignore[call-overload]
+    try:
+        command.main()
+    except InputError as error:
+        Console(stderr=True).print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
