@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
@@ -85,7 +86,7 @@ def draw_pictures(out: Path) -> None:
     dataset = open_packed(out / "data")
     cloud = read_spectral_ply(out / "point_cloud.ply")
     renders = sorted((out / "renders").glob("*_img_*.png"))
-    halves = [np.split(cv2.imread(str(path))[..., ::-1], 2, axis=1) for path in renders]
+    halves = [np.split(np.asarray(Image.open(path).convert("RGB")), 2, axis=1) for path in renders]
     names = [f"held-out view {i + 1}" for i in range(len(halves))]
     draw_views(out / "views.png", [h[0] for h in halves], [h[1] for h in halves], names)
     draw_cloud(out / "cloud.png", cloud.points, cloud.colours)

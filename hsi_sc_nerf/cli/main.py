@@ -1,4 +1,4 @@
-"""The command line `hsi-sc-nerf`."""
+"""Hyperspectral 3D reconstruction of turntable captures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Commands = (
 
 def main() -> None:
     """Run the command that the user asked for; bad input ends in one sentence and status 2."""
-    command = tyro.cli(Commands, description="Hyperspectral 3D reconstruction of turntable captures.")  # type: ignore[call-overload]
+    command: DemoCommand | SimulateCommand | ProcessCommand = tyro.cli(Commands, description=__doc__)
     try:
         command.main()
     except InputError as error:

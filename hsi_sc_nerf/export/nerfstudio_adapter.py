@@ -55,7 +55,7 @@ class _ExporterBeingImported(types.ModuleType):
         if name in ("entrypoint", "ExportPointCloud"):
             complete = "entrypoint" in vars(self)
             if complete:
-                self.__class__ = types.ModuleType
+                self.__class__ = types.ModuleType  # type: ignore[assignment]
                 _wrap_main(self)
         return types.ModuleType.__getattribute__(self, name)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -12,10 +13,12 @@ from nerfstudio.scripts.exporter import ExportPointCloud
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.clean import estimate_normals, statistical_inliers
 from hsi_sc_nerf.export.ply import write_spectral_ply
 from hsi_sc_nerf.export.point_cloud import SurfacePoints, sample_surface_points
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 
 def export_spectral_point_cloud(options: ExportPointCloud) -> None:
@@ -25,11 +28,12 @@ def export_spectral_point_cloud(options: ExportPointCloud) -> None:
         SystemExit: with one sentence, where the model holds no object or the file cannot be written.
     """
     _, pipeline, _, _ = eval_setup(options.load_config)
-    manager = pipeline.datamanager
+    manager = cast(SpectralDataManager, pipeline.datamanager)
+    model = cast(SpectralModel, pipeline.model)
     scene = manager.train_dataparser_outputs
     try:
         cloud = sample_surface_points(
-            pipeline.model,
+            model,
             manager.train_dataset.cameras,
             manager.train_pixel_sampler.masks,
             options.num_points,
@@ -41,7 +45,7 @@ def export_spectral_point_cloud(options: ExportPointCloud) -> None:
         points_m = np.asarray(cloud.points / scene.dataparser_scale + centre, np.float32)
         path = Path(options.output_dir) / "point_cloud.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
-        wavelengths_nm = pipeline.model.wavelengths_nm
+        wavelengths_nm = model.wavelengths_nm
         write_spectral_ply(path, points_m, cloud.normals, cloud.colours, cloud.spectra, wavelengths_nm)
     except InputError as error:
         raise SystemExit(f"hsi-sc-nerf: {error}") from error

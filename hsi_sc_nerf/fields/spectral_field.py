@@ -66,10 +66,10 @@ class SpectralField(NerfactoField):
         positions, inside = _positions_in_box(ray_samples, self.aabb)
         if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
             positions.requires_grad_()
-        self._sample_locations = positions
+        self._sample_locations = positions  # type: ignore[assignment]
         hidden = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
         before_activation, features = torch.split(hidden, [1, self.geo_feat_dim], dim=-1)
-        self._density_before_activation = before_activation
+        self._density_before_activation = before_activation  # type: ignore[assignment]
         density = self.average_init_density * trunc_exp(before_activation.to(positions)) * inside
         return density, features
 
@@ -96,7 +96,8 @@ class SpectralField(NerfactoField):
 
     def _appearance(self, ray_samples: RaySamples) -> Float[Tensor, "#rays #samples embedding"]:
         """The view's appearance in training; outside it the average or zeros, as nerfacto's option says."""
-        assert self.embedding_appearance is not None and ray_samples.camera_indices is not None
+        assert self.embedding_appearance is not None
+        assert ray_samples.camera_indices is not None
         if self.training:
             return self.embedding_appearance(ray_samples.camera_indices[..., 0])
         average = self.embedding_appearance.mean(dim=0)
@@ -122,7 +123,7 @@ class SpectralProposalField(HashMLPDensityField):
         super().__init__(*args, **kwargs)
         fuse_hash_encodings(self)
 
-    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], None]:
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], None]:  # type: ignore[override]
         """Density at the samples."""
         positions, inside = _positions_in_box(ray_samples, self.aabb)
         before_activation = self.mlp_base(positions.detach().view(-1, 3)).view(*ray_samples.frustums.shape, -1)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
-from torch.amp.grad_scaler import GradScaler
+from torch.cuda.amp.grad_scaler import GradScaler
 
 
 class TrainingDivergedError(RuntimeError):

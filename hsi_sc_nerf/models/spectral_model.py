@@ -23,7 +23,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.losses import angular_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
-from hsi_sc_nerf.models.turntable_refinement import TurntableRefinementConfig
+from hsi_sc_nerf.models.turntable_refinement import TurntableRefinement, TurntableRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10
 
 ANGLE_PICTURE_MAX_RAD = 0.2
@@ -95,7 +95,9 @@ class ChamberRenderer(RGBRenderer):
         super().__init__(background_color="black")
         self.register_buffer("background", background)
 
-    def forward(self, rgb: Tensor, weights: Tensor, **kwargs) -> Float[Tensor, "*rays bands"]:
+    def forward(  # type: ignore[override]
+        self, rgb: Float[Tensor, "*rays samples bands"], weights: Float[Tensor, "*rays samples 1"]
+    ) -> Float[Tensor, "*rays bands"]:
         """Weighted sum of the samples' spectra plus the background's share."""
         spectrum = torch.sum(weights * rgb, dim=-2)
         return spectrum + self.background * (1.0 - torch.sum(weights, dim=-2))
@@ -108,6 +110,9 @@ class SpectralModel(NerfactoModel):
     """
 
     config: SpectralModelConfig
+    field: SpectralField
+    camera_optimizer: TurntableRefinement
+    renderer_rgb: ChamberRenderer
 
     def populate_modules(self) -> None:
         """Build the modules.
@@ -139,7 +144,9 @@ class SpectralModel(NerfactoModel):
         self.camera_optimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
-        self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)
+        self.collider = AABBBoxCollider(  # type: ignore[assignment]
+            self.scene_box, near_plane=config.near_plane
+        )
 
         self.renderer_rgb = ChamberRenderer(torch.as_tensor(metadata["background_reflectance"]).float())
         self.renderer_accumulation = AccumulationRenderer()
@@ -180,7 +187,7 @@ class SpectralModel(NerfactoModel):
             initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
         )
 
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+    def get_outputs(self, ray_bundle: RayBundle) -> dict:  # type: ignore[override]
         """Nerfacto's outputs with the spectrum; held-out views are corrected like training views."""
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)

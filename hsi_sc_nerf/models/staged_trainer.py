@@ -7,12 +7,14 @@ import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import Stage, StageConfig, full_frame_stage, masked_stage, plan_stages
 from hsi_sc_nerf.models.training_progress import TrainingProgress
 
@@ -93,8 +95,8 @@ class StagedTrainer(Trainer):
             kept = self.base_dir / f"stage-{self._stage.config.name}"
             kept.mkdir(exist_ok=True)
             shutil.copy2(self._checkpoint_path(step - 1), kept)
-        self.pipeline.datamanager.foreground_share = stage.config.foreground_share
-        self.pipeline.model.camera_optimizer.frozen = not stage.config.optimize_poses
+        cast(SpectralDataManager, self.pipeline.datamanager).foreground_share = stage.config.foreground_share
+        cast(SpectralModel, self.pipeline.model).camera_optimizer.frozen = not stage.config.optimize_poses
         self._stage = stage
 
     def _checkpoint_path(self, step: int) -> Path:
