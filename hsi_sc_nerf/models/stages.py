@@ -29,7 +29,7 @@ class StageConfig:
     """Refine the camera poses during this stage; otherwise what was learned so far is kept, frozen."""
     lr_start: float = 1.0
     """Factor on every learning rate at the start of the stage."""
-    lr_end: float = 0.1
+    lr_end: float = 0.5
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
     warmup_iterations: int = 0
     """Steps over which the learning rate rises linearly from nothing at the start of the stage."""
@@ -48,7 +48,7 @@ def masked_stage() -> StageConfig:
         foreground_share=0.75,
         optimize_poses=False,
         lr_start=0.5,
-        lr_end=0.01,
+        lr_end=0.02,
     )
 
 

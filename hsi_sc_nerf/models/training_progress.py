@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import TracebackType
 
 from rich.console import Console
@@ -38,11 +39,12 @@ class TrainingProgress:
 
     def update(self, step: int, stage: Stage, psnr: float) -> None:
         """Show that ``step`` of ``stage`` is done."""
-        before = self._smoothed_psnr
-        self._smoothed_psnr = psnr if before is None else 0.95 * before + 0.05 * psnr
+        if math.isfinite(psnr):  # a skipped step has none
+            before = self._smoothed_psnr
+            self._smoothed_psnr = psnr if before is None else 0.95 * before + 0.05 * psnr
         self._progress.update(
             self._task,
             completed=step + 1,
             description=f"training, {stage.config.name} stage",
-            quality=f"PSNR {self._smoothed_psnr:.1f} dB",
+            quality="" if self._smoothed_psnr is None else f"PSNR {self._smoothed_psnr:.1f} dB",
         )

@@ -1,0 +1,26 @@
+import math
+
+import pytest
+import torch
+
+from hsi_sc_nerf.export.surface import opacity_crossing_depth
+
+
+@pytest.mark.parametrize("level", [0.1, 0.25, 0.5, 0.9])
+@pytest.mark.parametrize("density", [0.7, 30.0, 5000.0])
+def test_constant_density_crosses_where_beer_and_lambert_say(level, density):
+    edges = torch.linspace(1.0, 9.0, 33, dtype=torch.float64)[None]
+    depth = opacity_crossing_depth(edges, torch.full((1, 32), density, dtype=torch.float64), level)
+    assert depth.item() == pytest.approx(min(9.0, 1.0 - math.log(1 - level) / density), abs=1e-9)
+
+
+def test_a_hard_surface_is_found_at_its_front():
+    edges = torch.linspace(0.0, 1.0, 11)[None]
+    densities = torch.zeros(1, 10)
+    densities[0, 6:] = 1e6
+    assert opacity_crossing_depth(edges, densities, 0.25).item() == pytest.approx(0.6, abs=1e-4)
+
+
+def test_an_empty_ray_ends_at_its_last_edge():
+    edges = torch.linspace(0.0, 1.0, 11)[None].expand(3, -1)
+    assert opacity_crossing_depth(edges, torch.zeros(3, 10), 0.25).tolist() == [1.0] * 3
