@@ -191,10 +191,16 @@ def test_masks_that_do_not_fit_the_poses():
 def test_scene_box_holds_all_that_turns():
     corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
     obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    disc = 1.1 * np.hypot(0.12, 0.02)
+    reach = disc + 0.01
     np.testing.assert_allclose(
-        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-0.055, -0.055, -0.01], [0.13, 0.055, 0.21]]
+        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
     )
-    np.testing.assert_allclose(scene_box(obj, corners, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.12, 0.02, 0.2]])
+    np.testing.assert_allclose(
+        scene_box(obj, {}, CONTAINER, margin_m=0.0), [[-0.045, -0.045, 0.0], [0.045, 0.045, 0.2]]
+    )
+    wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
 
 
 def test_mask_picture_draws_each_outline(tmp_path):

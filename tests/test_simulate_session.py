@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 import tyro
 
-from hsi_sc_nerf.cli.simulate import simulate
+from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
@@ -231,9 +231,8 @@ def test_clockwise_turns_the_other_way(small_session):
 
 
 def test_command_line(tmp_path, capsys):
-    tyro.cli(
-        simulate, args=["pear", str(tmp_path / "s"), "--frames", "2", "--size", "24", "--bands", "5", "--seed", "3"]
-    )
+    words = ["pear", str(tmp_path / "s"), "--frames", "2", "--size", "24", "--bands", "5", "--seed", "3"]
+    tyro.cli(SimulateCommand, args=words).main()
     truth = load_truth(tmp_path / "s")
     assert len(truth.captures) == 2
     assert truth.reflectance("pear_001").shape == (24, 24, 5)

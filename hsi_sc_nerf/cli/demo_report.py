@@ -29,6 +29,7 @@ from hsi_sc_nerf.simulate.truth import load_truth
 SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")
 REFERENCE_POINTS = 100_000
 MARKED_POINTS = 4
+FRONT_LAYER_M = 0.005
 # The paper's hardest object, the apple: what the demo has to reach.
 PAPER_APPLE = {"sam": 0.0642, "rmse": 0.0438, "ssim": 0.742, "psnr": 24.49, "f_score": None}
 
@@ -99,13 +100,17 @@ def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray,
     frame = dataset.frames[0]
     pixels = _spread_pixels(frame.mask(), MARKED_POINTS)
     image_points, depth = project(points, frame.camera_to_world, dataset.intrinsics)
-    # Of the points behind a pixel the nearest to the camera is the one that it shows.
     tree = cKDTree(image_points)
-    nearest = [min(tree.query_ball_point(p, 0.7) or [tree.query(p)[1]], key=lambda i: depth[i]) for p in pixels]
+    seen = []
+    for pixel in pixels:
+        behind = np.array(tree.query_ball_point(pixel, 0.5) or [tree.query(pixel)[1]])
+        # The pixel shows the layer of points that is nearest to the camera, not the object's far side.
+        front = behind[depth[behind] < depth[behind].min() + FRONT_LAYER_M]
+        seen.append(spectra[front].mean(axis=0))
     columns, lines = np.floor(pixels).astype(int).T
     measured = frame.cube()[lines, columns] / REFLECTANCE_SCALE
     labels = [chr(ord("A") + i) for i in range(len(pixels))]
-    draw_spectra(path, dataset.wavelengths_nm, measured, spectra[nearest], labels, frame.pseudo_rgb(), pixels)
+    draw_spectra(path, dataset.wavelengths_nm, measured, np.array(seen), labels, frame.pseudo_rgb(), pixels)
 
 
 def _spread_pixels(mask: np.ndarray, count: int) -> np.ndarray:

@@ -14,6 +14,9 @@ from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
 
+DISC_OVERHANG = 1.1
+"""How far the turntable's disc reaches beyond its outermost marker corner, as a factor on the radius."""
+
 
 def focus_point(camera_to_worlds: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, "3"]:
     """The point nearest (least squares) to the optical axes of all frames."""
@@ -98,10 +101,18 @@ def scene_box(
     container: Container | None,
     margin_m: float = 0.005,
 ) -> Float[np.ndarray, "2 3"]:
-    """Minimum and maximum of all that turns: object, markers and container, widened by ``margin_m``."""
-    points = [object_box_m, *marker_corners_m.values()]
-    if container is not None:
-        radius = container.diameter_m / 2.0
-        points.append(np.array([[-radius, -radius, 0.0], [radius, radius, container.height_m]]))
-    everything = np.concatenate(points)
-    return np.stack([everything.min(axis=0) - margin_m, everything.max(axis=0) + margin_m])
+    """Minimum and maximum of all that turns: object, container, markers and the disc that they lie on.
+
+    The disc is round, so the box is square about the axis; it is widened by ``margin_m``. The disc is taken to reach
+    ``DISC_OVERHANG`` times as far as the outermost marker corner.
+    """
+    corners = np.concatenate([np.zeros((1, 3)), *marker_corners_m.values()])
+    radii = [
+        DISC_OVERHANG * np.hypot(corners[:, 0], corners[:, 1]).max(),
+        np.abs(object_box_m[:, :2]).max(),
+        0.0 if container is None else container.diameter_m / 2.0,
+    ]
+    lowest = min(corners[:, 2].min(), object_box_m[0, 2])
+    highest = max(corners[:, 2].max(), object_box_m[1, 2], 0.0 if container is None else container.height_m)
+    reach = max(radii) + margin_m
+    return np.array([[-reach, -reach, lowest - margin_m], [reach, reach, highest + margin_m]])

@@ -119,18 +119,18 @@ def draw_spectra(
     path: Path,
     wavelengths_nm: Float[np.ndarray, "bands"],
     truth: Float[np.ndarray, "k bands"],
-    rendered: Float[np.ndarray, "k bands"],
+    reconstructed: Float[np.ndarray, "k bands"],
     labels: Sequence[str],
     image: Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"],
     pixels: Float[np.ndarray, "k 2"],
 ) -> None:
-    """Measured and rendered spectra of marked points, their differences, and the picture that shows the points.
+    """Measured and reconstructed spectra of marked points, their differences, and the picture that shows the points.
 
     Args:
         path: The PNG file.
         wavelengths_nm: Band centres.
         truth: Measured reflectance of each point (solid).
-        rendered: Rendered reflectance of each point (dashed).
+        reconstructed: Reflectance of each point in the reconstruction (dashed).
         labels: A name for each point.
         image: Pseudo-RGB, float in [0, 1] or 8 bit.
         pixels: (x, y) of each point in the image, from its upper left corner.
@@ -148,15 +148,15 @@ def draw_spectra(
         picture.plot(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="white", markeredgewidth=3.5)
         picture.plot(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=2)
         spectra.plot(nm, truth[index][order], color=colour, linewidth=1.4, label=label)
-        spectra.plot(nm, rendered[index][order], color=colour, linewidth=1.4, linestyle=_DASHED)
-        difference.plot(nm, (rendered[index] - truth[index])[order], color=colour, linewidth=1.0)
+        spectra.plot(nm, reconstructed[index][order], color=colour, linewidth=1.4, linestyle=_DASHED)
+        difference.plot(nm, (reconstructed[index] - truth[index])[order], color=colour, linewidth=1.0)
     points = spectra.legend(loc="upper left", handlelength=1.2)
     spectra.add_artist(points)
     lines = [Line2D([], [], color="0.3"), Line2D([], [], color="0.3", linestyle=_DASHED)]
-    spectra.legend(lines, ["measured", "rendered"], loc="lower right", handlelength=2.2)
+    spectra.legend(lines, ["measured", "reconstructed"], loc="lower right", handlelength=2.2)
     spectra.set(ylabel="reflectance", ylim=(0, None))
     difference.axhline(0, color="0.4", linewidth=0.8)
-    difference.set(xlabel="wavelength (nm)", ylabel="rendered\n− measured", xlim=(nm[0], nm[-1]))
+    difference.set(xlabel="wavelength (nm)", ylabel="reconstructed\n− measured", xlim=(nm[0], nm[-1]))
     right.align_ylabels()
     _save(figure, path)
 
