@@ -92,13 +92,32 @@ def test_mask_keeps_the_percentile_and_its_largest_part():
 @given(st.integers(1, 60), st.floats(-5.0, 5.0), st.floats(-100.0, 100.0), st.sampled_from([1, 3, 5, 9]))
 def test_smoothing_leaves_lines_alone_in_every_band(bands, slope, offset, window):
     line = offset + slope * np.arange(bands)
-    np.testing.assert_allclose(smooth_spectrum(line, window), line, atol=1e-10)
+    np.testing.assert_allclose(smooth_spectrum(line, 3.0 * np.arange(bands), window, 1e3), line, atol=1e-10)
 
 
 def test_smoothing_averages_inside():
     spectrum = np.array([0.0, 0, 0, 5, 0, 0, 0])
-    np.testing.assert_allclose(smooth_spectrum(spectrum, 5), [0, 0, 1, 1, 1, 0, 0])
-    np.testing.assert_array_equal(smooth_spectrum(spectrum, 1), spectrum)
+    bands_nm = 700.0 - 3.0 * np.arange(7)
+    np.testing.assert_allclose(smooth_spectrum(spectrum, bands_nm, 5, 12.0), [0, 0, 1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(smooth_spectrum(spectrum, bands_nm, 1, 12.0), spectrum)
+
+
+def test_smoothing_never_spans_more_than_it_may():
+    spectrum = np.array([0.0, 0, 0, 6, 0, 0, 0])
+    narrow = 3.0 * np.arange(7)
+    np.testing.assert_allclose(smooth_spectrum(spectrum, narrow, 5, 11.9), [0, 0, 2, 2, 2, 0, 0])
+    # Broad bands are left alone, and so is each band of a camera whose bands lie apart on one side only.
+    np.testing.assert_array_equal(smooth_spectrum(spectrum, 10 * narrow, 5, 15.0), spectrum)
+    uneven = np.array([0.0, 3, 6, 9, 40, 71, 102])
+    np.testing.assert_allclose(smooth_spectrum(spectrum, uneven, 5, 15.0), [0, 0, 2, 6, 0, 0, 0])
+
+
+def test_a_camera_with_few_broad_bands_keeps_its_lamps_spectrum(tmp_path):
+    """Five bands of seven would smooth the lamp away, and with it the reflectance."""
+    white = white_reference(capture(tmp_path, "white", tarp_scene(0.0)), CONFIG)
+    np.testing.assert_array_equal(white.spectrum, white.measured)
+    smoothed = white_reference(capture(tmp_path, "white", tarp_scene(0.0)), CalibrationConfig(smoothing_max_nm=1e3))
+    np.testing.assert_allclose(smoothed.spectrum, smooth_spectrum(white.measured, WAVELENGTHS_NM, 5, 1e3))
 
 
 def test_dark_counts_by_sample_or_by_band():
@@ -135,7 +154,6 @@ def test_white_reference_of_a_folded_tarp(tmp_path):
     assert white.mask[:, 7:].all()
     # The speck, which closing takes in, weighs half a pixel among the mask's.
     np.testing.assert_allclose(white.measured, LAMP, rtol=2e-3)
-    np.testing.assert_allclose(white.spectrum, smooth_spectrum(white.measured, 5))
 
 
 def test_given_roi(tmp_path):

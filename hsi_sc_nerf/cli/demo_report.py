@@ -21,6 +21,7 @@ from hsi_sc_nerf.cli.steps import StepCost
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, PackedDataset, open_packed
 from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
+from hsi_sc_nerf.evaluation.processing import ProcessingScore, score_processing
 from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.poses.geometry import project
@@ -46,12 +47,20 @@ def score(out: Path) -> dict[str, float]:
     return metrics | {"precision": spatial.precision, "recall": spatial.recall}
 
 
-def write_summary(out: Path, metrics: dict[str, float], costs: Sequence[StepCost]) -> None:
-    """``summary.json``: metrics, steps, versions and machine."""
+def score_dataset(out: Path) -> ProcessingScore:
+    """How well processing recovered poses, camera, reflectance and masks."""
+    return score_processing(open_packed(out / "data"), load_truth(out / "session"))
+
+
+def write_summary(
+    out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
+) -> None:
+    """``summary.json``: metrics, errors of the processing, steps, versions and machine."""
     write_json(
         out / "summary.json",
         {
             "metrics": metrics,
+            "processing": asdict(processing),
             "steps": [asdict(cost) for cost in costs],
             "seconds": sum(cost.seconds for cost in costs),
             "f_score_threshold_m": paper.F_SCORE_THRESHOLD_M,
@@ -61,7 +70,9 @@ def write_summary(out: Path, metrics: dict[str, float], costs: Sequence[StepCost
     )
 
 
-def show_table(console: Console, out: Path, metrics: dict[str, float], costs: Sequence[StepCost]) -> None:
+def show_table(
+    console: Console, out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
+) -> None:
     """Print what was reached and what it cost."""
     quality = Table(title="Held-out views, masked to the object; cloud against the true mesh")
     for title in ("metric", "mean ± SD", "paper's apple"):
@@ -72,13 +83,24 @@ def show_table(console: Console, out: Path, metrics: dict[str, float], costs: Se
         printed = PAPER_APPLE[key]
         reached = f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}"
         quality.add_row(title, reached, "-" if printed is None else f"{printed:.{digits}f}")
+    steps_table = Table(title="Processing against the known truth")
+    for title in ("error", "reached", "target"):
+        steps_table.add_column(title)
+    for title, reached, target in (
+        ("rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"),
+        ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
+        ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
+        ("reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"),
+        ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
+    ):
+        steps_table.add_row(title, reached, target)
     cost_table = Table(title="Cost")
     for title in ("step", "seconds", "peak memory, MiB"):
         cost_table.add_column(title, justify="left" if title == "step" else "right")
     for cost in costs:
         cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
     cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")
-    console.print(quality, cost_table)
+    console.print(quality, steps_table, cost_table)
     console.print(f"Pictures, cloud and summary.json are in {out}.")
 
 

@@ -32,6 +32,9 @@ class CalibrationConfig:
     """The ellipse's diameter is the tarp's shorter side divided by this, where that is larger."""
     smoothing_bands: int = paper.WHITE_SMOOTHING_BANDS
     """Width of the moving average along the white spectrum, bands; 1 leaves the spectrum as measured."""
+    smoothing_max_nm: float = 15.0
+    """The moving average spans no more than this, nm: five bands of a camera with few, broad bands would smooth the
+    lamp's own spectrum away. The paper's five bands span 12 nm."""
     bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
     """Reflectance is clipped to these."""
     roi_brightness: float = 0.5
@@ -93,16 +96,21 @@ def white_mask(deviation: Float[np.ndarray, "y x"], *, percentile: float, kernel
     return largest_component(ellipse_close_open(kept, close_px=kernel_px, open_px=kernel_px))
 
 
-def smooth_spectrum(spectrum: Float[np.ndarray, "bands"], window: int) -> Float[np.ndarray, "bands"]:
+def smooth_spectrum(
+    spectrum: Float[np.ndarray, "bands"], wavelengths_nm: Float[np.ndarray, "bands"], window: int, max_nm: float
+) -> Float[np.ndarray, "bands"]:
     """Step 5: moving average over ``window`` bands (odd), whose window shrinks symmetrically towards the ends.
 
-    A symmetrical window leaves constant and linear spectra as they are in every band; the outermost bands are
-    not smoothed.
+    It also shrinks where it would span more than ``max_nm`` between the centres of its outermost bands. A symmetrical
+    window leaves constant and linear spectra as they are in every band; the outermost bands are not smoothed.
     """
-    half = window // 2
-    last = len(spectrum) - 1
-    reach = np.minimum(half, np.minimum(np.arange(last + 1), last - np.arange(last + 1)))
-    return np.array([spectrum[i - r : i + r + 1].mean() for i, r in enumerate(reach)])
+    smoothed = np.empty(len(spectrum))
+    for i in range(len(spectrum)):
+        reach = min(window // 2, i, len(spectrum) - 1 - i)
+        while reach and abs(wavelengths_nm[i + reach] - wavelengths_nm[i - reach]) > max_nm:
+            reach -= 1
+        smoothed[i] = spectrum[i - reach : i + reach + 1].mean()
+    return smoothed
 
 
 def dark_counts(
@@ -177,7 +185,8 @@ def white_reference(capture: Capture, config: CalibrationConfig) -> WhiteReferen
             f"{capture.cube.wavelengths_nm[unlit[0]]:.2f} nm ({len(unlit)} such bands); take the tarp again with "
             "more light or leave these bands out of the export."
         )
-    return WhiteReference(roi, deviation, mask, measured, smooth_spectrum(measured, config.smoothing_bands))
+    smoothed = smooth_spectrum(measured, capture.cube.wavelengths_nm, config.smoothing_bands, config.smoothing_max_nm)
+    return WhiteReference(roi, deviation, mask, measured, smoothed)
 
 
 def calibrate(
