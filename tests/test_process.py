@@ -224,6 +224,20 @@ def test_marker_size_is_needed(tmp_path):
     assert not (tmp_path / "data").exists()
 
 
+def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
+    seen = []
+
+    def poses(images, names, **options):
+        seen.append(options["marker_side_m"])
+        raise InputError("enough")
+
+    for info in (None, {"marker_side_m": 0.02}):
+        session = write_session(tmp_path / f"session_{info is None}", info=info)
+        with pytest.raises(InputError, match="enough"):
+            run(session, tmp_path / f"data_{info is None}", config=ProcessConfig(marker_side_m=0.04), poses=poses)
+    assert seen == [0.04, 0.04]
+
+
 def test_bad_tarp_writes_nothing(session, tmp_path):
     write_capture(session, "white_reference", np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16))
     with pytest.raises(InputError, match="no usable region"):

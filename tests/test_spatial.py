@@ -112,8 +112,8 @@ def test_spread_shrinks_with_the_number_of_points():
     rng = np.random.default_rng(1)
     spreads = []
     for count in (500, 50_000):
-        reference = np.zeros((count, 3))
-        reconstructed = np.where(rng.random((count, 1)) < 0.5, 0.0, 1.0) * np.ones(3)
+        reference = np.linspace([0.0, 0.0, 0.0], [0.001, 0.0, 0.0], count)
+        reconstructed = reference + np.where(rng.random((count, 1)) < 0.5, 0.0, [0.0, 1.0, 0.0])
         score, spread = f_score_with_spread(reconstructed, reference, 0.002)
         assert score == precision_recall_f_score(reconstructed, reference, 0.002)
         # F = 2 P / (1 + P) with P = 1/2 of Bernoulli hits: dF = 2 / (1 + P)^2 dP.

@@ -52,6 +52,8 @@ class ProcessConfig:
     """Foreground masks."""
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
     """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
+    marker_side_m: float | None = None
+    """Side of a marker's black square, metres; session.json's where it is not given here."""
     marker_range_nm: tuple[float, float] = (450.0, 700.0)
     """Markers are looked for in the mean image of these bands, nm (many inks are transparent beyond 700 nm)."""
     object_margin_m: float = 0.003
@@ -87,10 +89,11 @@ def process_session(
     if _is_done(output_dir, stamp):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
-    if session.info.marker_side_m is None:
+    marker_side_m = config.marker_side_m or session.info.marker_side_m
+    if marker_side_m is None:
         raise InputError(
             f"{session.path / SESSION_INFO_NAME}: does not give marker_side_m, the side of a marker's black square "
-            "in metres, without which nothing has a size; add it."
+            "in metres, without which nothing has a size; add it or give --marker-side-m."
         )
     _clear_transforms(output_dir)
 
@@ -106,7 +109,7 @@ def process_session(
         [note.gray for note in notes],
         names,
         dictionary=session.info.marker_dictionary,
-        marker_side_m=session.info.marker_side_m,
+        marker_side_m=marker_side_m,
         nominal_step_deg=session.info.nominal_step_deg,
         direction=session.info.direction,
         progress=progress,
