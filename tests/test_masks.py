@@ -24,7 +24,7 @@ from hsi_sc_nerf.data.packed import Container
 from hsi_sc_nerf.data.report import mask_picture
 from hsi_sc_nerf.data.scene_box import focus_point, object_box, scene_box
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
 
 NO_DISTORTION = np.zeros(4)
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
@@ -160,6 +160,17 @@ def test_object_box_of_a_sphere():
         object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
     )
     assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
+    """Beyond the common field of view a voxel is in a few frames only, and in front of their masks by chance."""
+    start = look_at([0.42, 0.0, 0.23], [0.0, 0.0, 0.06])
+    poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
+    intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
 
 
 def test_one_wrong_mask_does_not_cut_the_object():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hsi_sc_nerf.cli.demo_report import draw_pictures, score, score_dataset, show_table, write_summary
 from hsi_sc_nerf.cli.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
 from hsi_sc_nerf.errors import InputError
 
@@ -52,6 +51,9 @@ class DemoCommand:
         Raises:
             InputError: a step failed, or the folder cannot be used.
         """
+        # Open3D takes seconds to import; the other commands and --help do without it.
+        from hsi_sc_nerf.cli.demo_report import draw_pictures, score, score_dataset, show_table, write_summary
+
         console = Console()
         out = self.output_dir
         logs = out / "logs"

@@ -9,7 +9,6 @@ import tyro
 from rich.console import Console
 
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.session import simulate_session
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,9 @@ class SimulateCommand:
         Raises:
             InputError: the scene cannot be used or the session cannot be written.
         """
+        # Open3D takes seconds to import; the other commands and --help do without it.
+        from hsi_sc_nerf.simulate.session import simulate_session
+
         scene = override(
             load_scene(self.scene), frames=self.frames, size_px=self.size, bands=self.bands, seed=self.seed
         )

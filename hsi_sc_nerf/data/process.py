@@ -105,15 +105,18 @@ def process_session(
 
     names = [capture.name for capture in session.frames]
     notes = _process_frames(session, output_dir, white, config, progress)
-    poses = estimate_poses(
-        [note.gray for note in notes],
-        names,
-        dictionary=session.info.marker_dictionary,
-        marker_side_m=marker_side_m,
-        nominal_step_deg=session.info.nominal_step_deg,
-        direction=session.info.direction,
-        progress=progress,
-    )
+    try:
+        poses = estimate_poses(
+            [note.gray for note in notes],
+            names,
+            dictionary=session.info.marker_dictionary,
+            marker_side_m=marker_side_m,
+            nominal_step_deg=session.info.nominal_step_deg,
+            direction=session.info.direction,
+            progress=progress,
+        )
+    except InputError as error:
+        raise InputError(f"{session.path}: {error}") from error
     write_json(output_dir / "poses.json", poses.report())
     draw_poses(poses, output_dir / "report" / "poses.png")
     frames = _posed_frames(output_dir, names, poses)

@@ -77,7 +77,7 @@ def mask_picture(
         for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
             cv2.putText(tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
         tiles.append(tile)
-    blank = np.zeros_like(tiles[0])
+    blank = np.full_like(tiles[0], 255)
     rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
     rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))

@@ -33,21 +33,22 @@ def carve(
     intrinsics: PinholeIntrinsics,
     min_agreement: float = 0.95,
 ) -> Float[np.ndarray, "kept 3"]:
-    """The points that some frame sees and that lie outside the mask in few frames.
+    """The points that two thirds of the frames see and that lie outside the mask in few frames.
 
-    Few are at most ``1 - min_agreement`` of all frames: a wrong mask or pose may cut a piece off the object.
+    Few are at most ``1 - min_agreement`` of all frames: a wrong mask or pose may cut a piece off the object. What
+    few frames see, far behind the object or beside the camera, has too few masks to be carved by.
     """
     allowed = int((1.0 - min_agreement) * len(masks) + 1e-9)
     missed = np.zeros(len(points), dtype=int)
-    seen = np.zeros(len(points), dtype=bool)
+    seen = np.zeros(len(points), dtype=int)
     for mask, pose in zip(masks, camera_to_worlds, strict=True):
         pixels, depth = project(points, pose, intrinsics)
         in_image = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < (intrinsics.w, intrinsics.h)).all(axis=1)
         x, y = pixels[in_image].astype(int).T
         missed[in_image] += ~mask[y, x]
         keep = missed <= allowed
-        points, missed, seen = points[keep], missed[keep], (seen | in_image)[keep]
-    return points[seen]
+        points, missed, seen = points[keep], missed[keep], (seen + in_image)[keep]
+    return points[3 * seen >= 2 * len(masks)]
 
 
 def object_box(
