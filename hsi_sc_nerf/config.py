@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataManagerConfig
 from hsi_sc_nerf.export.nerfstudio_adapter import extend_export_point_cloud
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
+from hsi_sc_nerf.models.pipeline import SpectralPipelineConfig
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 
@@ -32,7 +32,7 @@ hsi_sc_nerf = MethodSpecification(
         steps_per_eval_batch=500,
         steps_per_eval_image=5000,
         steps_per_eval_all_images=20_000,
-        pipeline=VanillaPipelineConfig(datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()),
+        pipeline=SpectralPipelineConfig(datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()),
         optimizers={"fields": _adam(1e-2), "proposal_networks": _adam(1e-2), "camera_opt": _adam(1e-4)},
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         # The progress bar of the stages takes the place of nerfstudio's table of lines.
