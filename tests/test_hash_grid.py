@@ -35,6 +35,17 @@ def test_gradients_equal_nerfstudio(device):
     torch.testing.assert_close(gradients[1][1], gradients[0][1], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_points_have_no_features(device):
+    _, fused = _pair(device)
+    x = torch.zeros(0, 3, device=device, requires_grad=True)
+    features = fused.pytorch_fwd(x)
+    assert features.shape == (0, 10)
+    features.sum().backward()
+    assert x.grad.shape == (0, 3)
+    assert fused.hash_table.grad.abs().max() == 0
+
+
 def test_fuse_replaces_torch_encodings_only():
     module = torch.nn.Sequential(_pair("cpu")[0], torch.nn.Linear(10, 2))
     fuse_hash_encodings(module)

@@ -47,7 +47,7 @@ class _Interpolate(torch.autograd.Function):
         weights = _corner_weights(fraction)
         ctx.save_for_backward(table, scalings, indices, fraction)
         features = F.embedding_bag(indices, table, per_sample_weights=weights, mode="sum")
-        return features.view(positions.shape[0], -1)
+        return features.view(positions.shape[0], scalings.shape[0] * table.shape[1])
 
     @staticmethod
     @once_differentiable
@@ -138,7 +138,7 @@ class FusedHashEncoding(HashEncoding):
     def pytorch_fwd(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs features"]:
         """Encode points in [0, 1]^3."""
         flat = interpolate_hash_grid(in_tensor.reshape(-1, 3), self.hash_table, self.scalings, self.hash_table_size)
-        return flat.reshape(*in_tensor.shape[:-1], -1)
+        return flat.reshape(*in_tensor.shape[:-1], flat.shape[1])
 
 
 def fuse_hash_encodings(module: nn.Module) -> None:
