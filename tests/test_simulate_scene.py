@@ -19,7 +19,7 @@ markers: {side_m: 0.036}
 @pytest.mark.parametrize("name", SHIPPED_SCENES)
 def test_shipped_scenes_have_the_papers_target(name):
     scene = load_scene(name)
-    assert scene.name == scene.object.shape == name
+    assert scene.name == name
     assert (scene.turntable.frames, scene.camera.size_px, scene.sensor.bands) == (36, 128, 204)
     assert (scene.container.diameter_m, scene.container.height_m) == (0.09, 0.07)
     assert (scene.markers.on_container, scene.markers.on_disc) == (6, 8)
@@ -76,7 +76,7 @@ def test_bad_scene_files_get_one_sentence(text, sentence):
 
 
 def test_a_scene_that_does_not_exist_is_named():
-    with pytest.raises(InputError, match=r"pineapple: neither a shipped scene \(pear, apple, maize\)"):
+    with pytest.raises(InputError, match="pineapple: neither a shipped scene .*pear, apple, maize"):
         load_scene("pineapple")
 
 

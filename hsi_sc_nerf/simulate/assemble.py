@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, turntable_camera_to_world
-from hsi_sc_nerf.simulate import shapes, target, texture
+from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
 from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.simulate.objects import Cylinder, MaizeEar, Object, OwnMesh, Sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import Camera, Scene, Turntable
 
@@ -39,16 +42,29 @@ def camera_poses(scene: Scene) -> Float[np.ndarray, "n 4 4"]:
 
 
 def object_part(scene: Scene) -> Part:
-    """The object, standing on the container's lid."""
-    rng = np.random.default_rng(scene.seed)
-    thing = scene.object
-    shape = {"pear": shapes.pear, "apple": shapes.apple, "maize": shapes.maize}[thing.shape](thing.height_m, rng)
-    if thing.shape == "maize":
-        materials, weights = texture.MAIZE_MATERIALS, texture.maize_weights(shape, thing, rng)
-    else:
-        materials, weights = texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng)
-    on_lid = shape.mesh.moved(np.array([0.0, 0.0, scene.container.height_m]))
-    return Part(on_lid, materials, weights, is_object=True)
+    """The object, standing on the container's lid.
+
+    Raises:
+        InputError: the object is a mesh whose files cannot be used.
+    """
+    part = _object_on_zero(scene.object, np.random.default_rng(scene.seed))
+    return replace(part, mesh=part.mesh.moved(np.array([0.0, 0.0, scene.container.height_m])), is_object=True)
+
+
+def _object_on_zero(thing: Object, rng: np.random.Generator) -> Part:
+    """The object, standing on z = 0."""
+    if isinstance(thing, Sphere):
+        return _plain(shapes.sphere(thing.height_m), thing.material)
+    if isinstance(thing, Cylinder):
+        return _plain(shapes.cylinder(thing.diameter_m, thing.height_m), thing.material)
+    if isinstance(thing, OwnMesh):
+        mesh, weights = own_mesh.load(thing)
+        return Part(mesh, thing.materials, weights)
+    if isinstance(thing, MaizeEar):
+        shape = shapes.maize(thing.height_m, rng)
+        return Part(shape.mesh, texture.MAIZE_MATERIALS, texture.maize_weights(shape, thing, rng))
+    shape = {"pear": shapes.pear, "apple": shapes.apple}[thing.shape](thing.height_m, rng)
+    return Part(shape.mesh, texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng))
 
 
 def support_parts(scene: Scene) -> list[Part]:

@@ -8,11 +8,14 @@ overtone of water after Peñuelas et al. (1993).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+
+from hsi_sc_nerf.simulate.reading import between
 
 Spectrum = Float[np.ndarray, "bands"]
 
@@ -21,28 +24,41 @@ Spectrum = Float[np.ndarray, "bands"]
 class PlantTissue:
     """Pigment amounts of a plant surface, as absorbance at each pigment's strongest peak."""
 
-    plateau: float
+    plateau: float = between(0.0, 1.0)
     """Reflectance of the near-infrared plateau, about 800-900 nm."""
-    chlorophyll: float = 0.0
-    carotenoid: float = 0.0
-    anthocyanin: float = 0.0
-    brown: float = 0.0
+    chlorophyll: float = between(0.0, 5.0, default=0.0)
+    carotenoid: float = between(0.0, 5.0, default=0.0)
+    anthocyanin: float = between(0.0, 5.0, default=0.0)
+    brown: float = between(0.0, 5.0, default=0.0)
     """Oxidised phenols: absorbance at 400 nm of an exponential tail towards the red."""
-    water: float = 0.0
+    water: float = between(0.0, 5.0, default=0.0)
 
 
 @dataclass(frozen=True)
 class Plain:
     """A non-plant material: nearly flat, with a gentle rise from blue to near-infrared."""
 
-    level: float
+    level: float = between(0.0, 1.0)
     """Reflectance at 700 nm."""
-    slope_per_um: float = 0.0
-    blue_loss: float = 0.0
+    slope_per_um: float = between(-3.0, 3.0, default=0.0)
+    """Relative change of reflectance over 1000 nm."""
+    blue_loss: float = between(0.0, 1.0, default=0.0)
     """Share lost at 400 nm (binders and whiteners absorb there), gone by 450 nm."""
 
 
-MATERIALS: dict[str, PlantTissue | Plain] = {
+@dataclass(frozen=True)
+class Measured:
+    """A measured spectrum, straight between its points."""
+
+    wavelengths_nm: tuple[float, ...]
+    """Increasing."""
+    reflectance: tuple[float, ...]
+    """In [0, 1]."""
+
+
+Material: TypeAlias = PlantTissue | Plain | Measured
+
+MATERIALS: dict[str, Material] = {
     "pear_skin": PlantTissue(0.66, chlorophyll=0.62, carotenoid=0.62, brown=0.10, water=0.075),
     "pear_blush": PlantTissue(0.64, chlorophyll=0.30, carotenoid=0.52, anthocyanin=0.55, brown=0.12, water=0.075),
     "apple_skin": PlantTissue(0.68, chlorophyll=0.34, carotenoid=0.55, brown=0.06, water=0.080),
@@ -64,20 +80,30 @@ MATERIALS: dict[str, PlantTissue | Plain] = {
     # Calibration is relative to the tarp, so an ideal tarp makes calibrated reflectance the true one.
     "white_tarp": Plain(1.0),
     "tarp_surround": Plain(0.12, slope_per_um=0.05),
+    # Exactly flat, for proofs: what is white absorbs nothing, what is grey half.
+    "matte_white": Plain(1.0),
+    "matte_grey": Plain(0.5),
 }
 
 
-def endmembers(names: Sequence[str], wavelengths_nm: Spectrum) -> Float[np.ndarray, "materials bands"]:
+def endmembers(
+    names: Sequence[str], wavelengths_nm: Spectrum, own: Mapping[str, Material] | None = None
+) -> Float[np.ndarray, "materials bands"]:
     """Reflectance of the named materials at the given wavelengths, each in [0, 1].
 
+    ``own`` are the scene's own materials; they come before built-in ones of the same name.
+
     Raises:
-        KeyError: a name is not in `MATERIALS`.
+        KeyError: a name is neither in ``own`` nor in `MATERIALS`.
     """
-    return np.stack([reflectance(MATERIALS[name], np.asarray(wavelengths_nm, float)) for name in names])
+    known = {**MATERIALS, **(own or {})}
+    return np.stack([reflectance(known[name], np.asarray(wavelengths_nm, float)) for name in names])
 
 
-def reflectance(material: PlantTissue | Plain, wavelengths_nm: Spectrum) -> Spectrum:
+def reflectance(material: Material, wavelengths_nm: Spectrum) -> Spectrum:
     """Reflectance of one material, in [0, 1]."""
+    if isinstance(material, Measured):
+        return np.interp(wavelengths_nm, material.wavelengths_nm, material.reflectance)
     if isinstance(material, Plain):
         tilt = 1.0 + material.slope_per_um * (wavelengths_nm - 700.0) / 1000.0
         violet = 1.0 - material.blue_loss / (1.0 + np.exp((wavelengths_nm - 415.0) / 7.0))

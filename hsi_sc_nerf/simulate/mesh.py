@@ -94,3 +94,70 @@ def quads(corners: Float[np.ndarray, "q 4 3"]) -> Mesh:
     first = 4 * np.arange(len(corners))[:, None]
     triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
     return Mesh(np.asarray(corners, float).reshape(-1, 3), triangles)
+
+
+def snapped(vertices: Float[np.ndarray, "v 3"], tolerance_m: float) -> Float[np.ndarray, "v 3"]:
+    """Vertices that fall into the same cell of a grid of ``tolerance_m`` are put in exactly the same place."""
+    _, first, cell = np.unique(np.rint(vertices / tolerance_m), axis=0, return_index=True, return_inverse=True)
+    return vertices[first[cell.ravel()]]
+
+
+def welded(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], columns: Float[np.ndarray, "v c"]
+) -> tuple[Mesh, Float[np.ndarray, "w c"]]:
+    """The mesh with vertices of equal position made one, their columns averaged; empty triangles are left out."""
+    # Adding 0 makes -0 and 0 the same.
+    places, place = np.unique(vertices + 0.0, axis=0, return_inverse=True)
+    place = place.ravel()
+    count = np.bincount(place, minlength=len(places))
+    mean = np.stack([np.bincount(place, column, minlength=len(places)) for column in columns.T], axis=-1)
+    a, b, c = place[triangles].T
+    return Mesh(places, np.stack([a, b, c], axis=-1)[(a != b) & (b != c) & (c != a)]), mean / count[:, None]
+
+
+def subdivided(
+    vertices: Float[np.ndarray, "v 3+c"], triangles: Int[np.ndarray, "t 3"], longest_m: float
+) -> tuple[Float[np.ndarray, "w 3+c"], Int[np.ndarray, "s 3"]]:
+    """The same surface with no edge longer than ``longest_m``.
+
+    Long edges are halved until none is left; whether an edge is halved depends on its ends' positions alone, so
+    that neighbours agree and a closed mesh stays closed, repeated vertices along a seam included. Columns after
+    the first three (UVs) are interpolated as the positions are.
+    """
+    while True:
+        start, end = triangles, np.roll(triangles, -1, axis=1)
+        is_long = np.linalg.norm(vertices[start, :3] - vertices[end, :3], axis=-1) > longest_m
+        if not is_long.any():
+            return vertices, triangles
+        n = len(vertices)
+        edges = np.minimum(start, end).astype(np.int64) * n + np.maximum(start, end)
+        halved, which = np.unique(edges[is_long], return_inverse=True)
+        middle = np.full(triangles.shape, -1)
+        middle[is_long] = n + which
+        vertices = np.concatenate([vertices, (vertices[halved // n] + vertices[halved % n]) / 2.0])
+        triangles = np.concatenate([_cut(triangles, middle, long_edges, vertices) for long_edges in range(4)])
+
+
+def _cut(
+    triangles: Int[np.ndarray, "t 3"], middle: Int[np.ndarray, "t 3"], long_edges: int, vertices: np.ndarray
+) -> Int[np.ndarray, "s 3"]:
+    """Cut those triangles that have so many long edges; ``middle`` of an edge from each corner to the next, or -1."""
+    chosen = (middle >= 0).sum(axis=1) == long_edges
+    corners, middle = triangles[chosen], middle[chosen]
+    # Turned so that the long edges come first.
+    turn = {1: middle.argmax(axis=1), 2: middle.argmin(axis=1) + 1}.get(long_edges, np.zeros(len(corners), int))
+    order = (turn[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(corners, order, axis=1).T
+    ab, bc, ca = np.take_along_axis(middle, order, axis=1).T
+    if long_edges == 0:
+        return corners
+    if long_edges == 1:
+        pieces = [(a, ab, c), (ab, b, c)]
+    elif long_edges == 2:
+        # The four-sided rest is cut along its shorter diagonal.
+        across, back = (np.linalg.norm(vertices[p, :3] - vertices[q, :3], axis=-1) for p, q in ((a, bc), (ab, c)))
+        from_a = across < back
+        pieces = [(ab, b, bc), (a, ab, np.where(from_a, bc, c)), (np.where(from_a, a, ab), bc, c)]
+    else:
+        pieces = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([np.stack(piece, axis=-1) for piece in pieces])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 from dataclasses import field
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hsi_sc_nerf.errors import InputError
@@ -24,7 +26,7 @@ def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
         if key not in fields:
             raise InputError(f"{source}: {prefix}{key} is not a known key; known here are {', '.join(fields)}.")
     for key, f in fields.items():
-        if key not in values and f.default is dataclasses.MISSING:
+        if key not in values and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise InputError(f"{source}: {prefix}{key} is missing; add it.")
     hints = get_type_hints(cls)
     return cls(**{key: _read_value(hints[key], value, source, prefix + key) for key, value in values.items()})
@@ -32,6 +34,10 @@ def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
 
 def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
     """Check one value against its declared type; whole numbers pass for floats, YAML lists become tuples."""
+    if get_origin(expected) is dict:
+        return value
+    if get_origin(expected) is types.UnionType:
+        expected = _chosen(expected, value, source, key)
     if dataclasses.is_dataclass(expected):
         return read_dataclass(expected, value, source, key + ".")
     if get_origin(expected) is Literal:
@@ -41,21 +47,46 @@ def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
     if get_origin(expected) is tuple:
         if not isinstance(value, list):
             raise InputError(f"{source}: {key} is {value!r}, but must be a list.")
-        return tuple(value)
-    kind, accepted = {float: ("a number", (int, float)), int: ("a whole number", (int,)), str: ("a text", (str,))}[
-        expected
-    ]
+        (item,) = {*get_args(expected)} - {Ellipsis}
+        return tuple(
+            value if item is Any else (_read_value(item, v, source, f"{key}[{i}]") for i, v in enumerate(value))
+        )
+    kind, accepted = {
+        float: ("a number", (int, float)),
+        int: ("a whole number", (int,)),
+        str: ("a text", (str,)),
+        Path: ("a path", (str,)),
+    }[expected]
     if isinstance(value, bool) or not isinstance(value, accepted):
         raise InputError(f"{source}: {key} is {value!r}, but must be {kind}.")
     return expected(value)
 
 
+def _chosen(union: Any, value: Any, source: str, key: str) -> Any:
+    """The member of a union that a value is for: of an optional type the type, of dataclasses the one whose first
+    field, the kind, allows what the value gives there."""
+    kinds = [kind for kind in get_args(union) if kind is not types.NoneType]
+    if len(kinds) == 1:
+        return kinds[0]
+    (name,) = {dataclasses.fields(kind)[0].name for kind in kinds}
+    allowed = {choice: kind for kind in kinds for choice in get_args(get_type_hints(kind)[name])}
+    if not isinstance(value, dict) or name not in value:
+        return kinds[0]
+    _read_value(Literal[tuple(allowed)], value[name], source, f"{key}.{name}")
+    return allowed[value[name]]
+
+
 def check_ranges(values: Any, source: str, prefix: str) -> None:
+    """Check the fields made by `between`, down into dataclasses; ``prefix`` is the path down to here.
+
+    Raises:
+        InputError: a value lies outside its range.
+    """
     for f in dataclasses.fields(values):
         value = getattr(values, f.name)
         if dataclasses.is_dataclass(value):
             check_ranges(value, source, f"{prefix}{f.name}.")
-        elif "range" in f.metadata:
+        elif "range" in f.metadata and value is not None:
             low, high = f.metadata["range"]
             # Written so that NaN fails as well.
             if not low <= value <= high:

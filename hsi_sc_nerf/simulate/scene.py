@@ -1,7 +1,7 @@
 """What a scene is, and reading it from a short YAML file.
 
-A scene names the object, the camera, the turntable, the container with its markers, the sensor, and the
-physical effects beyond a matte object under even light (none exist yet).
+A scene names the object, materials of its own, the camera, the turntable, the container with its markers, the
+sensor, and the physical effects beyond a matte object under even light (none exist yet).
 """
 
 from __future__ import annotations
@@ -17,25 +17,12 @@ import yaml
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.materials import MATERIALS, Material
+from hsi_sc_nerf.simulate.objects import Cylinder, Object, OwnMesh, Sphere
+from hsi_sc_nerf.simulate.own_materials import read_materials
 from hsi_sc_nerf.simulate.reading import between, check_ranges, read_dataclass
 
-SHIPPED_SCENES = ("pear", "apple", "maize")
-
-
-@dataclass(frozen=True)
-class Object:
-    """The thing that is scanned; lengths in metres, shares in [0, 1]."""
-
-    shape: Literal["pear", "apple", "maize"]
-    height_m: float = between(0.01, 0.5)
-    blush: float = between(0.0, 1.0, default=0.0)
-    """Share of blush where it is strongest (pear, apple)."""
-    lenticel_diameter_m: float = between(0.0, 0.02, default=0.0)
-    """Diameter of the pale dots on the skin; 0 leaves them out (pear, apple)."""
-    bruise_diameter_m: float = between(0.0, 0.1, default=0.0)
-    """Diameter of the bruise; 0 leaves it out (pear, apple)."""
-    coloured_kernels: float = between(0.0, 1.0, default=0.0)
-    """Share of kernels that are purple, and again as many that are white (maize)."""
+SHIPPED_SCENES = ("pear", "apple", "maize", "sphere", "cylinder")
 
 
 @dataclass(frozen=True)
@@ -105,6 +92,8 @@ class Scene:
     camera: Camera
     turntable: Turntable
     markers: Markers
+    materials: dict[str, Material] = dataclasses.field(default_factory=dict)
+    """What the scene defines itself; a built-in material of the same name is replaced."""
     container: Container = Container()
     sensor: Sensor = Sensor()
     effects: tuple[Any, ...] = ()
@@ -120,8 +109,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
             of range; an effect that does not exist.
     """
     if str(name_or_path) in SHIPPED_SCENES:
-        text = resources.files(__package__).joinpath("scenes", f"{name_or_path}.yaml").read_text(encoding="utf-8")
+        with resources.as_file(resources.files(__package__).joinpath("scenes")) as folder:
+            text = (folder / f"{name_or_path}.yaml").read_text(encoding="utf-8")
     else:
+        folder = Path(name_or_path).parent
         try:
             text = Path(name_or_path).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
@@ -129,11 +120,13 @@ def load_scene(name_or_path: str | Path) -> Scene:
                 f"{name_or_path}: neither a shipped scene ({', '.join(SHIPPED_SCENES)}) nor a readable scene file; "
                 "give one of these names or the path of a YAML file."
             ) from error
-    return parse_scene(text, source=str(name_or_path), name=Path(name_or_path).stem)
+    return parse_scene(text, source=str(name_or_path), name=Path(name_or_path).stem, folder=folder)
 
 
-def parse_scene(text: str, *, source: str, name: str) -> Scene:
+def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> Scene:
     """Make a scene of YAML text; ``source`` names it in errors and ``name`` is used where the text has no name.
+
+    Paths in the text are relative to ``folder``.
 
     Raises:
         InputError: see `load_scene`.
@@ -145,6 +138,7 @@ def parse_scene(text: str, *, source: str, name: str) -> Scene:
         raise InputError(f"{source}: not valid YAML ({problem}); correct that line.") from error
     if isinstance(values, dict):
         values.setdefault("name", name)
+        values["materials"] = read_materials(values.get("materials", {}), source, folder)
     scene = read_dataclass(Scene, values, source, "")
     check_ranges(scene, source, "")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", scene.name):
@@ -156,7 +150,31 @@ def parse_scene(text: str, *, source: str, name: str) -> Scene:
         raise InputError(
             f"{source}: effect {scene.effects[0]!r} is unknown, for no effects exist yet; leave `effects` empty."
         )
+    _check_materials(scene, source)
+    if isinstance(scene.object, OwnMesh):
+        scene = dataclasses.replace(scene, object=scene.object.in_folder(folder))
     return scene
+
+
+def _check_materials(scene: Scene, source: str) -> None:
+    """Every material that is named exists, and every one that is defined is something's."""
+    named: tuple[str, ...] = ()
+    if isinstance(scene.object, OwnMesh):
+        named = scene.object.materials
+    elif isinstance(scene.object, Sphere | Cylinder):
+        named = (scene.object.material,)
+    for name in named:
+        if name not in MATERIALS and name not in scene.materials:
+            raise InputError(
+                f"{source}: material {name!r} is not defined; define it under `materials:` or take one of "
+                f"{', '.join(MATERIALS)}."
+            )
+    for name in scene.materials:
+        if name not in MATERIALS and name not in named:
+            raise InputError(
+                f"{source}: nothing is made of the material {name!r}; name it in the object's materials, or give it "
+                f"the name of the built-in material that it replaces ({', '.join(MATERIALS)})."
+            )
 
 
 def override(

@@ -1,8 +1,9 @@
-"""The shapes of pear, apple and maize ear: surfaces of revolution, bent and dented a little, standing on z = 0."""
+"""Shapes that stand on z = 0: sphere, cylinder; pear, apple, maize ear (surfaces of revolution, bent and dented)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -53,6 +54,24 @@ class Shape:
     """Number of the kernel that the vertex belongs to (maize)."""
     groove: Float[np.ndarray, "v"] | None = None
     """Share of the cob seen between kernels, in [0, 1] (maize)."""
+
+
+def sphere(diameter_m: float) -> Mesh:
+    """A sphere; every vertex lies on it, so that area and volume come out at most 0.02 % too small."""
+    radius_m = diameter_m / 2.0
+    rings = max(SEGMENTS // 2, _steps(np.pi * radius_m))
+    latitude = np.linspace(-np.pi / 2.0, np.pi / 2.0, rings + 1)
+    profile = np.stack([radius_m * np.cos(latitude), radius_m * (1.0 + np.sin(latitude))], axis=-1)
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, SEGMENTS)
+
+
+def cylinder(diameter_m: float, height_m: float) -> Mesh:
+    """An upright cylinder; area and volume come out less than 0.01 % too small."""
+    r = diameter_m / 2.0
+    corners = np.array([[0.0, 0.0], [r, 0.0], [r, height_m], [0.0, height_m]])
+    sides = [np.linspace(a, b, _steps(float(np.linalg.norm(b - a))) + 1) for a, b in pairwise(corners)]
+    return revolve(np.concatenate([sides[0], sides[1][1:], sides[2][1:]]), SEGMENTS)
 
 
 def pear(height_m: float, rng: np.random.Generator) -> Shape:
@@ -151,9 +170,13 @@ def _smooth(nodes: Float[np.ndarray, "n 2"], *, closed_top: bool) -> Float[np.nd
 def _resample(profile: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Points along a profile every `VERTEX_SPACING_M`, its ends kept."""
     position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
-    count = max(2, int(np.ceil(position[-1] / VERTEX_SPACING_M)) + 1)
-    wanted = np.linspace(0.0, position[-1], count)
+    wanted = np.linspace(0.0, position[-1], _steps(position[-1]) + 1)
     return np.stack([np.interp(wanted, position, profile[:, i]) for i in range(2)], axis=-1)
+
+
+def _steps(length_m: float) -> int:
+    """Into how many steps of at most `VERTEX_SPACING_M` a length is cut."""
+    return max(1, int(np.ceil(length_m / VERTEX_SPACING_M)))
 
 
 def _cylindrical(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

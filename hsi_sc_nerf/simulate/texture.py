@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.simulate.scene import Object
+from hsi_sc_nerf.simulate.objects import Fruit, MaizeEar
 from hsi_sc_nerf.simulate.shapes import Shape, smoothstep
 
 FRUIT_MATERIALS = {
@@ -16,10 +17,12 @@ FRUIT_MATERIALS = {
 MAIZE_MATERIALS = ("kernel_yellow", "kernel_white", "kernel_purple", "cob", "husk")
 
 LENTICELS_PER_CM2 = 3.0
+PADDING_PX = 8
+"""How far into the unpainted part of a weight texture its painted islands are grown."""
 STREAK_STRETCH = np.array([1.0, 1.0, 0.15])
 
 
-def fruit_weights(shape: Shape, fruit: Object, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
+def fruit_weights(shape: Shape, fruit: Fruit, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
     """Shares of skin, blush, lenticel, bruise and stem (in the order of `FRUIT_MATERIALS`)."""
     points = shape.mesh.vertices
     height = points[:, 2] / fruit.height_m
@@ -49,7 +52,7 @@ def fruit_weights(shape: Shape, fruit: Object, rng: np.random.Generator) -> Floa
     return over(weights, stem, shape.stem)
 
 
-def maize_weights(shape: Shape, ear: Object, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
+def maize_weights(shape: Shape, ear: MaizeEar, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
     """Shares of yellow, white and purple kernel, cob and husk (in the order of `MAIZE_MATERIALS`)."""
     assert shape.kernel is not None
     assert shape.groove is not None
@@ -63,6 +66,28 @@ def maize_weights(shape: Shape, ear: Object, rng: np.random.Generator) -> Float[
     of_kernel = over(of_kernel, purple, np.where(is_purple, rng.uniform(0.6, 0.95, kernels), 0.0))
     weights = over(of_kernel[shape.kernel], cob, 0.9 * shape.groove)
     return over(weights, husk, shape.stem)
+
+
+def padded_shares(image: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "h w m"]:
+    """An image whose channels are amounts of materials as shares that sum to 1 (0 where nothing is painted).
+
+    Texels up to `PADDING_PX` beside a painted one take its shares: UV islands end between texels.
+    """
+    total = image.sum(axis=-1, keepdims=True)
+    shares = np.divide(image, total, out=np.zeros_like(image), where=total > 0.0)
+    distance_px, nearest = distance_transform_edt(total[..., 0] == 0.0, return_indices=True)
+    return np.where((distance_px <= PADDING_PX)[..., None], shares[tuple(nearest)], 0.0)
+
+
+def sampled(image: Float[np.ndarray, "h w m"], uv: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v m"]:
+    """Bilinear samples at UVs (origin at the image's lower left corner); the image repeats outside [0, 1]."""
+    height, width = image.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    across, down = (x - left)[:, None], (y - top)[:, None]
+    rows, columns = (top % height, (top + 1) % height), (left % width, (left + 1) % width)
+    upper, lower = (image[row, columns[0]] * (1.0 - across) + image[row, columns[1]] * across for row in rows)
+    return upper * (1.0 - down) + lower * down
 
 
 def over(
