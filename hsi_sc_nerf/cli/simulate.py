@@ -27,6 +27,8 @@ class SimulateCommand:
     """Number of spectral bands between 397 and 1003 nm, instead of the scene's."""
     seed: int | None = None
     """Grows another fruit of the same kind, instead of the scene's."""
+    effects: tuple[str, ...] | None = None
+    """Physical effects instead of the scene's: names, or with strengths '{photon_noise: {full_well: 20000}}'."""
 
     def main(self) -> None:
         """Run the command.
@@ -36,12 +38,19 @@ class SimulateCommand:
         """
         # Open3D takes seconds to import; the other commands and --help do without it.
         from hsi_sc_nerf.simulate.session import simulate_session
+        from hsi_sc_nerf.simulate.truth import load_truth
 
         scene = override(
-            load_scene(self.scene), frames=self.frames, size_px=self.size, bands=self.bands, seed=self.seed
+            load_scene(self.scene),
+            frames=self.frames,
+            size_px=self.size,
+            bands=self.bands,
+            seed=self.seed,
+            effects=self.effects,
         )
         written = simulate_session(scene, self.session)
+        size_px, frames = scene.camera.size_px, len(load_truth(written).captures)
         Console().print(
-            f"{written}: {scene.turntable.frames} frames of {scene.camera.size_px} x {scene.camera.size_px} pixels x "
-            f"{scene.sensor.bands} bands; truth in {written / 'truth'}."
+            f"{written}: {frames} frames of {size_px} x {size_px} pixels x {scene.sensor.bands} bands; truth in "
+            f"{written / 'truth'}."
         )

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, turntable_camera_to_world
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at
 from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
+from hsi_sc_nerf.simulate.effects import of_stage
+from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
 from hsi_sc_nerf.simulate.mesh import Mesh
 from hsi_sc_nerf.simulate.objects import Cylinder, MaizeEar, Object, OwnMesh, Sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
-from hsi_sc_nerf.simulate.scene import Camera, Scene, Turntable
+from hsi_sc_nerf.simulate.scene import Camera, Scene
 
 
 def intrinsics(camera: Camera) -> PinholeIntrinsics:
@@ -29,16 +32,19 @@ def first_camera(camera: Camera) -> Float[np.ndarray, "4 4"]:
     return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
 
 
-def turntable_angles_deg(turntable: Turntable) -> Float[np.ndarray, "n"]:
-    """Angle of each frame, degrees, 0 first, positive counter-clockwise."""
-    sign = 1.0 if turntable.direction == "ccw" else -1.0
-    return sign * np.arange(turntable.frames) * 360.0 / turntable.frames
-
-
-def camera_poses(scene: Scene) -> Float[np.ndarray, "n 4 4"]:
-    """Camera-to-world of each frame, object frame."""
-    first = first_camera(scene.camera)
-    return np.stack([turntable_camera_to_world(first, angle) for angle in turntable_angles_deg(scene.turntable)])
+def frame_plan(scene: Scene) -> FramePlan:
+    """Which frames are taken, at which angles, from where: an even turn, changed by the scene's effects."""
+    frames = scene.turntable.frames
+    sign = 1.0 if scene.turntable.direction == "ccw" else -1.0
+    plan = FramePlan(
+        room_camera=first_camera(scene.camera),
+        angles_deg=sign * np.arange(frames) * 360.0 / frames,
+        elapsed=np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1),
+        nominal_step_deg=360.0 / frames,
+    )
+    for effect in of_stage(scene.effects, MotionEffect):
+        plan = effect.replan(plan, effect_rng(scene.seed, effect))
+    return plan
 
 
 def object_part(scene: Scene) -> Part:
@@ -85,9 +91,18 @@ def support_parts(scene: Scene) -> list[Part]:
     return parts
 
 
-def build_renderer(scene: Scene, thing: Part) -> Renderer:
-    """The renderer of the whole scene around its object (from `object_part`)."""
-    return Renderer([thing, *support_parts(scene)])
+def build_renderer(
+    scene: Scene,
+    thing: Part,
+    offset_m: Float[np.ndarray, "3"] | float = 0.0,
+    extra_materials: Sequence[str] = (),
+) -> Renderer:
+    """The renderer of the whole scene around its object (from `object_part`), its support shifted by ``offset_m``.
+
+    ``extra_materials`` get columns of their own, for what is seen where rays miss everything.
+    """
+    support = [replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support_parts(scene)]
+    return Renderer([thing, *support], extra_materials=extra_materials)
 
 
 def _plain(mesh: Mesh, material: str) -> Part:

@@ -33,11 +33,11 @@ class Part:
 class Renderer:
     """Casts rays at a fixed set of parts; whatever a ray misses is the chamber.
 
-    ``materials`` names the columns of the weights; the last one is the chamber.
+    ``materials`` names the columns of the weights; the last one is the chamber, before it come the extra ones.
     """
 
-    def __init__(self, parts: Sequence[Part], chamber: str = "chamber") -> None:
-        names = dict.fromkeys(name for part in parts for name in part.materials)
+    def __init__(self, parts: Sequence[Part], chamber: str = "chamber", extra_materials: Sequence[str] = ()) -> None:
+        names = dict.fromkeys([name for part in parts for name in part.materials] + list(extra_materials))
         self.materials = (*names, chamber)
         vertices, triangles, weights, is_object, offset = [], [], [], [], 0
         for part in parts:

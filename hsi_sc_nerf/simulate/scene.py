@@ -1,13 +1,14 @@
 """What a scene is, and reading it from a short YAML file.
 
 A scene names the object, materials of its own, the camera, the turntable, the container with its markers, the
-sensor, and the physical effects beyond a matte object under even light (none exist yet).
+sensor, and the physical effects beyond a matte object under even light that a perfect sensor sees.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -17,6 +18,7 @@ import yaml
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material
 from hsi_sc_nerf.simulate.objects import Cylinder, Object, OwnMesh, Sphere
 from hsi_sc_nerf.simulate.own_materials import read_materials
@@ -97,7 +99,7 @@ class Scene:
     container: Container = Container()
     sensor: Sensor = Sensor()
     effects: tuple[Any, ...] = ()
-    """Physical effects beyond a matte object under even light; none exist yet."""
+    """Physical effects beyond a matte object under even light that a perfect sensor sees (`effects.EFFECTS`)."""
     seed: int = between(0, 2**31 - 1, default=0)
 
 
@@ -140,15 +142,12 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
         values.setdefault("name", name)
         values["materials"] = read_materials(values.get("materials", {}), source, folder)
     scene = read_dataclass(Scene, values, source, "")
+    scene = dataclasses.replace(scene, effects=read_effects(scene.effects, source))
     check_ranges(scene, source, "")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", scene.name):
         raise InputError(
             f"{source}: name is {scene.name!r}, but must be of letters, digits, '_', '.' and '-', for captures are "
             "named after it."
-        )
-    if scene.effects:
-        raise InputError(
-            f"{source}: effect {scene.effects[0]!r} is unknown, for no effects exist yet; leave `effects` empty."
         )
     _check_materials(scene, source)
     if isinstance(scene.object, OwnMesh):
@@ -184,8 +183,11 @@ def override(
     size_px: int | None = None,
     bands: int | None = None,
     seed: int | None = None,
+    effects: Sequence[str] | None = None,
 ) -> Scene:
     """The scene with the given values in place of its own; ``None`` keeps the scene's.
+
+    Effects are given as in a scene file, each a text: ``photon_noise`` or ``{photon_noise: {full_well: 20000}}``.
 
     Raises:
         InputError: a value is out of range.
@@ -198,5 +200,9 @@ def override(
         scene = dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, bands=bands))
     if seed is not None:
         scene = dataclasses.replace(scene, seed=seed)
+    if effects is not None:
+        scene = dataclasses.replace(
+            scene, effects=read_effects([yaml.safe_load(text) for text in effects], "--effects")
+        )
     check_ranges(scene, scene.name, "")
     return scene

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -14,9 +16,10 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.simulate.frames import Frame, Simulation
+from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.mesh import Mesh
-from hsi_sc_nerf.simulate.scene import Scene
-from hsi_sc_nerf.simulate.target import MarkerLayout
+from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Truth:
     """Reflectance of each material."""
     area_m2: float
     volume_m3: float
+    effects: dict[str, dict[str, Any]]
+    """Strengths of each effect that was on, by its name."""
 
     @property
     def mesh_path(self) -> Path:
@@ -60,6 +65,17 @@ class Truth:
     def reflectance(self, capture: str) -> Float[np.ndarray, "lines samples bands"]:
         """Noise-free reflectance, float32, in [0, 1]."""
         return self.material_weights(capture) @ self.endmembers.astype(np.float32)
+
+    def light(self, capture: str) -> Light:
+        """The noise-free light on the sensor; `Light.radiance` makes an image of it."""
+        with np.load(pixels_path(self.session_dir, capture)) as arrays:
+            factors = [name for name in arrays.files if name.startswith("illumination_")]
+            weights = arrays["light_weights" if "light_weights" in arrays.files else "material_weights"]
+            return Light(
+                weights=weights.astype(np.float32),
+                spectra=arrays["light_spectra"] if "light_spectra" in arrays.files else self.endmembers,
+                illumination=tuple(arrays[name] for name in sorted(factors)),
+            )
 
     def _pixels(self, capture: str, key: str) -> np.ndarray:
         with np.load(pixels_path(self.session_dir, capture)) as arrays:
@@ -91,6 +107,7 @@ def load_truth(session_dir: str | Path) -> Truth:
             endmembers=table[:, 1:].T,
             area_m2=values["mesh"]["area_m2"],
             volume_m3=values["mesh"]["volume_m3"],
+            effects=values["effects"],
         )
     except FileNotFoundError as error:
         raise InputError(f"{session_dir}: has no truth ({path.name} is missing); simulate the session.") from error
@@ -98,34 +115,24 @@ def load_truth(session_dir: str | Path) -> Truth:
         raise InputError(f"{path}: cannot be read ({error!r}); simulate the session again.") from error
 
 
-def write_truth(
-    session_dir: Path,
-    scene: Scene,
-    *,
-    intrinsics: PinholeIntrinsics,
-    captures: list[str],
-    angles_deg: Float[np.ndarray, "n"],
-    camera_to_world: Float[np.ndarray, "n 4 4"],
-    marker_layout: MarkerLayout,
-    wavelengths_nm: Float[np.ndarray, "bands"],
-    materials: tuple[str, ...],
-    endmembers: Float[np.ndarray, "materials bands"],
-    mesh: Mesh,
-) -> None:
+def write_truth(session_dir: Path, simulation: Simulation) -> None:
     """Write everything but the pixels (`write_pixels` adds those, a frame at a time)."""
+    scene, mesh = simulation.scene, simulation.object_part.mesh
     folder = session_dir / "truth"
     folder.mkdir(parents=True, exist_ok=True)
+    frames = zip(
+        simulation.captures, simulation.plan.angles_deg.tolist(), simulation.camera_to_world.tolist(), strict=True
+    )
+    wavelengths_nm, materials = simulation.wavelengths_nm, simulation.materials
+    layout = marker_layout(scene.markers, scene.container, scene.turntable)
     values = {
         "object": scene.object.shape,
-        "intrinsics": dataclasses.asdict(intrinsics),
-        "frames": [
-            {"capture": capture, "angle_deg": angle, "camera_to_world": pose.tolist()}
-            for capture, angle, pose in zip(captures, angles_deg.tolist(), camera_to_world, strict=True)
-        ],
-        "marker_layout": {str(number): corners.tolist() for number, corners in marker_layout.items()},
+        "intrinsics": dataclasses.asdict(simulation.intrinsics),
+        "frames": [{"capture": name, "angle_deg": angle, "camera_to_world": c2w} for name, angle, c2w in frames],
+        "marker_layout": {str(number): (c + simulation.offset_m).tolist() for number, c in layout.items()},
         "wavelengths_nm": wavelengths_nm.tolist(),
         "materials": list(materials),
-        "effects": list(scene.effects),
+        "effects": {effect.name: dataclasses.asdict(effect) for effect in scene.effects},
         "container": dataclasses.asdict(scene.container),
         "mesh": {"area_m2": mesh.area_m2(), "volume_m3": mesh.volume_m3()},
     }
@@ -133,22 +140,30 @@ def write_truth(
     with (folder / "endmembers.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(["wavelength_nm", *materials])
-        table.writerows(np.column_stack([wavelengths_nm, endmembers.T]).tolist())
+        table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
     write_mesh(folder / "mesh.ply", mesh)
 
 
-def write_pixels(
-    session_dir: Path,
-    capture: str,
-    material_weights: Float[np.ndarray, "lines samples materials"],
-    coverage: Float[np.ndarray, "lines samples"],
-) -> None:
-    """Write what each pixel of one frame sees; exact for weights that are multiples of 1 / 2048."""
+def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
+    """Write what each pixel of one frame sees, whole or not at all.
+
+    Weights are exact, being multiples of 1 / 2048 in float16. The light is written only where it is something else
+    than the materials in the weights' shares.
+    """
     path = pixels_path(session_dir, capture)
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        path, material_weights=material_weights.astype(np.float16), object=coverage.astype(np.float16)
-    )
+    arrays: dict[str, Any] = {
+        "material_weights": frame.material_weights.astype(np.float16),
+        "object": frame.coverage.astype(np.float16),
+    }
+    if frame.light.weights is not frame.material_weights:
+        arrays["light_weights"] = frame.light.weights
+    if not np.array_equal(frame.light.spectra, frame.endmembers):
+        arrays["light_spectra"] = frame.light.spectra
+    arrays |= {f"illumination_{i}": factor for i, factor in enumerate(frame.light.illumination)}
+    writing = path.with_suffix(".writing.npz")
+    np.savez_compressed(writing, **arrays)
+    os.replace(writing, path)
 
 
 def pixels_path(session_dir: Path, capture: str) -> Path:

@@ -1,0 +1,48 @@
+"""Physical effects beyond a matte object under even light that a perfect sensor sees; each absent unless named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.effects.motion import AngleJitter
+from hsi_sc_nerf.simulate.effects.noise import PhotonNoise
+from hsi_sc_nerf.simulate.effects.stages import Effect
+from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
+
+EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in (AngleJitter, PhotonNoise)}
+"""Every effect by its name, in the order in which effects of one stage act."""
+
+Stage = TypeVar("Stage", bound=Effect)
+
+
+def of_stage(effects: Sequence[Effect], stage: type[Stage]) -> tuple[Stage, ...]:
+    """The effects that act in a stage, in order."""
+    return tuple(effect for effect in effects if isinstance(effect, stage))
+
+
+def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
+    """Effects of a scene file's list: each a name, or a name with strengths (``photon_noise: {full_well: 2e4}``).
+
+    They come back in the order in which they act.
+
+    Raises:
+        InputError: an unknown or repeated effect; an unknown, missing, mistyped or out-of-range strength.
+    """
+    found: dict[str, Effect] = {}
+    strengths: dict[str, Any]
+    for value in values:
+        if isinstance(value, str):
+            name, strengths = value, {}
+        elif isinstance(value, dict) and len(value) == 1:
+            ((name, strengths),) = value.items()
+        else:
+            raise InputError(f"{source}: effect {value!r} is neither a name nor `name: {{strength: value}}`.")
+        if name not in EFFECTS:
+            raise InputError(f"{source}: effect {name!r} is unknown; known are {', '.join(EFFECTS)}.")
+        if name in found:
+            raise InputError(f"{source}: effect {name} is named twice; name it once.")
+        found[name] = read_dataclass(EFFECTS[name], strengths or {}, source, f"effects.{name}.")
+        check_ranges(found[name], source, f"effects.{name}.")
+    return tuple(found[name] for name in EFFECTS if name in found)

@@ -1,0 +1,179 @@
+"""From a scene to the counts and the truth of each of its captures, one at a time and in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from hsi_sc_nerf.simulate import assemble, sensor
+from hsi_sc_nerf.simulate.effects import of_stage, stages
+from hsi_sc_nerf.simulate.effects.stages import effect_rng
+from hsi_sc_nerf.simulate.light import Light
+from hsi_sc_nerf.simulate.materials import endmembers
+from hsi_sc_nerf.simulate.render import Renderer, exact_weights
+from hsi_sc_nerf.simulate.scene import Scene
+
+WHITE_MATERIALS = ("white_tarp", "tarp_surround")
+TARP_MARGIN = 0.08
+"""Share of the image's side that the tarp leaves free along each edge."""
+PERFECT_DARK_LINES, DARK_LINES = 1, 64
+"""Lines of a dark cube: of a perfect sensor, whose lines are all the same, and of any other."""
+LINES_AT_ONCE = 64
+"""Lines of an image that are exposed together, which keeps large frames within little memory."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture: what the instrument writes, and what it is made of.
+
+    Attributes:
+        counts: the cube.
+        dark: its dark cube.
+        light: the noise-free light on the sensor, the image upright.
+    """
+
+    counts: UInt16[np.ndarray, "lines samples bands"]
+    dark: UInt16[np.ndarray, "dark_lines samples bands"]
+    light: Light
+
+
+@dataclass(frozen=True)
+class Frame(Capture):
+    """A capture of the object, and its truth, the image upright.
+
+    Attributes:
+        material_weights: share of each material in each pixel, summing to 1.
+        coverage: share of each pixel that the object covers.
+        endmembers: of those materials at the start of the session and the header's wavelengths.
+    """
+
+    material_weights: Float[np.ndarray, "lines samples materials"]
+    coverage: Float[np.ndarray, "lines samples"]
+    endmembers: Float[np.ndarray, "materials bands"]
+
+
+class Simulation:
+    """A scene made ready: what its captures share is computed once, here; `frame` and `white` change nothing."""
+
+    def __init__(self, scene: Scene) -> None:
+        effects = scene.effects
+        self.scene = scene
+        self.plan = assemble.frame_plan(scene)
+        self.intrinsics = assemble.intrinsics(scene.camera)
+        self.offset_m = sum((e.offset_m() for e in of_stage(effects, stages.PlacementEffect)), np.zeros(3))
+        covers = of_stage(effects, stages.ChamberEffect)
+        thing = assemble.object_part(scene)
+        self.object_part = replace(thing, mesh=thing.mesh.moved(self.offset_m))
+        self._chamber_materials = [name for cover in covers for name in cover.materials]
+        self.renderer = assemble.build_renderer(scene, self.object_part, self.offset_m, self._chamber_materials)
+        self.materials = self.renderer.materials
+        self._chamber = [
+            cover.cover(scene.camera.size_px, self.materials, effect_rng(scene.seed, cover)) for cover in covers
+        ]
+        self._optics = of_stage(effects, stages.OpticsEffect)
+        self._material = of_stage(effects, stages.MaterialEffect)
+        self._illumination = of_stage(effects, stages.IlluminationEffect)
+        self._readout = of_stage(effects, stages.ReadoutEffect)
+        self._orientation = of_stage(effects, stages.OrientationEffect)
+        self._deformation = of_stage(effects, stages.DeformationEffect)
+        self.camera_to_world = self.plan.camera_to_world
+        self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
+        self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
+        self._seen_nm = self.wavelengths_nm
+        for detector in of_stage(effects, stages.DetectorEffect):
+            self._seen_nm = detector.wavelengths_nm(self._seen_nm, scene.camera.size_px)
+        self._signal_of_white = sensor.white_signal(scene.sensor, self._seen_nm)
+        self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
+        self._seen_endmembers = self._seen_spectra(self.materials)
+
+    def frame(self, number: int) -> Frame:
+        """The capture of one frame of the plan."""
+        elapsed = float(self.plan.elapsed[number])
+        renderer = self._renderer_at(elapsed)
+        weights, coverage = renderer.render(
+            self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling
+        )
+        for cover in self._chamber:
+            # The wall's share goes to what stands before it.
+            covered = weights + weights[..., -1:] * (cover - np.eye(len(self.materials))[-1])
+            weights = exact_weights(covered.reshape(-1, len(self.materials))).reshape(weights.shape)
+        spectra = self._seen_endmembers
+        if self._material:
+            of_object = [self.materials.index(name) for name in self.object_part.materials]
+            spectra = spectra.copy()
+            for effect in self._material:
+                spectra[..., of_object, :] = effect.spectra(spectra[..., of_object, :], self._seen_nm, elapsed)
+        light = self._on_sensor(Light(weights, spectra), elapsed)
+        counts, dark = self._expose(light, number + 1)
+        return Frame(counts, dark, light, weights, coverage, self.endmembers)
+
+    def white(self) -> Capture:
+        """The capture of the white tarp, before the first frame."""
+        weights = white_capture_weights(self.scene.camera.size_px)
+        light = self._on_sensor(Light(weights, self._seen_spectra(WHITE_MATERIALS)), elapsed=0.0)
+        return Capture(*self._expose(light, 0), light)
+
+    def _seen_spectra(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
+        """Spectra as the detector sees them: a table, or one a sample where its wavelengths differ."""
+        return np.moveaxis(endmembers(names, self._seen_nm, self.scene.materials), 0, -2)
+
+    def _renderer_at(self, elapsed: float) -> Renderer:
+        if not self._deformation:
+            return self.renderer
+        vertices = self.object_part.mesh.vertices
+        for effect in self._deformation:
+            vertices = effect.deform(vertices, self.scene.container.height_m, elapsed)
+        deformed = replace(self.object_part, mesh=replace(self.object_part.mesh, vertices=vertices))
+        return assemble.build_renderer(self.scene, deformed, self.offset_m, self._chamber_materials)
+
+    def _on_sensor(self, light: Light, elapsed: float) -> Light:
+        """The light after the lens and under the lamps of its time."""
+        weights = light.weights
+        for effect in self._optics:
+            weights = effect.image(weights)
+        size_px = self.scene.camera.size_px
+        factors = tuple(e.factor(size_px, self.wavelengths_nm, elapsed) for e in self._illumination)
+        return replace(light, weights=weights, illumination=factors)
+
+    def _expose(
+        self, light: Light, exposure: int
+    ) -> tuple[UInt16[np.ndarray, "lines samples bands"], UInt16[np.ndarray, "dark_lines samples bands"]]:
+        """Counts of an image, and of the shutter."""
+        lines, samples = light.weights.shape[:2]
+        bands = len(self.wavelengths_nm)
+        counts = np.empty((lines, samples, bands), np.uint16)
+        random = [effect_rng(self.scene.seed, effect, exposure, 0) for effect in self._readout]
+        for first in range(0, lines, LINES_AT_ONCE):
+            rows = slice(first, first + LINES_AT_ONCE)
+            counts[rows] = self._digitise(light.radiance(rows, self._signal_of_white), random)
+        random = [effect_rng(self.scene.seed, effect, exposure, 1) for effect in self._readout]
+        dark_lines = DARK_LINES if self._readout else PERFECT_DARK_LINES
+        dark = self._digitise(np.zeros((dark_lines, samples, bands), np.float32), random)
+        for effect in self._orientation:
+            counts, dark = effect.orient(counts), effect.orient(dark)
+        return counts, dark
+
+    def _digitise(
+        self, signal: Float[np.ndarray, "lines samples bands"], random: list[np.random.Generator]
+    ) -> UInt16[np.ndarray, "lines samples bands"]:
+        """Counts of a signal (counts above dark), which is overwritten."""
+        counts = signal
+        counts += self.scene.sensor.dark_level
+        largest = 2**self.scene.sensor.bit_depth - 1
+        for effect, frame_rng in zip(self._readout, random, strict=True):
+            session_rng = effect_rng(self.scene.seed, effect)
+            context = stages.ReadoutContext(largest, self.scene.sensor.dark_level, frame_rng, session_rng)
+            counts = effect.read_out(counts, context)
+        np.rint(counts, out=counts)
+        return np.clip(counts, 0, largest, out=counts).astype(np.uint16)
+
+
+def white_capture_weights(size_px: int) -> Float[np.ndarray, "lines samples 2"]:
+    """Shares of tarp and of its dark surround: the tarp fills most of the image."""
+    edge = max(1, round(TARP_MARGIN * size_px))
+    tarp = np.zeros((size_px, size_px), np.float32)
+    tarp[edge:-edge, edge:-edge] = 1.0
+    return np.stack([tarp, 1.0 - tarp], axis=-1)
