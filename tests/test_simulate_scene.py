@@ -29,7 +29,7 @@ def test_shipped_scenes_have_the_papers_target(name):
 def test_nothing_that_turns_leaves_the_image(name):
     scene = override(load_scene(name), size_px=64)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
-    for pose in assemble.camera_poses(scene)[::6]:
+    for pose in assemble.frame_plan(scene).camera_to_world[::6]:
         weights, _ = renderer.render(assemble.intrinsics(scene.camera), pose, 1)
         chamber = weights[..., -1]
         for edge in (chamber[0], chamber[-1], chamber[:, 0], chamber[:, -1]):
