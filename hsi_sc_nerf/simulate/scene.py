@@ -24,7 +24,7 @@ from hsi_sc_nerf.simulate.objects import Cylinder, Object, OwnMesh, Sphere
 from hsi_sc_nerf.simulate.own_materials import read_materials
 from hsi_sc_nerf.simulate.reading import between, check_ranges, read_dataclass
 
-SHIPPED_SCENES = ("pear", "apple", "maize", "sphere", "cylinder")
+SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
 
 
 @dataclass(frozen=True)
