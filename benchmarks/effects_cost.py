@@ -1,0 +1,142 @@
+"""What each effect of the simulator costs, and the error that leaving it out would make, as a table.
+
+    uv run python benchmarks/effects_cost.py --page docs/effects.md
+
+Each effect is named alone, at its default strength, on each scene. Its cost is the time of preparing the scene and of
+making a frame, beside a frame without any effect in the same run; its error is the difference between the calibrated
+reflectances with and without it over the object's pixels: root mean square, and mean spectral angle.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from hsi_sc_nerf.data.calibration import dark_counts, normalise
+from hsi_sc_nerf.numerics import spectral_angle
+from hsi_sc_nerf.simulate.effects import EFFECTS
+from hsi_sc_nerf.simulate.frames import Capture, Simulation
+from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
+
+TABLE_STARTS, TABLE_ENDS = "<!-- table -->", "<!-- end of table -->"
+COLUMNS = [
+    "scene",
+    "effect",
+    "to prepare, s",
+    "a frame, ms",
+    "without, ms",
+    "RMS if left out",
+    "SAM if left out, rad",
+]
+
+
+@dataclass(frozen=True)
+class EffectsCost:
+    """Measure the cost and the worth of every effect."""
+
+    page: Path
+    """Markdown page whose table is replaced; the same figures go into a JSON file beside it."""
+    scenes: tuple[str, ...] = ("pear", "apple", "maize")
+    """Scenes to measure on."""
+    effects: tuple[str, ...] = tuple(EFFECTS)
+    """Effects to measure."""
+    frames: int = 6
+    """Frames in the turn."""
+    size: int = 128
+    """Width and height of the images, pixels."""
+
+    def main(self) -> None:
+        """Measure, print the table, write it into the page."""
+        rows = []
+        for name in self.scenes:
+            scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=())
+            _make(scene)  # the first run pays for what is loaded once
+            plain = _make(scene)
+            for effect in track(self.effects, f"effects on {name}"):
+                made = _make(override(scene, effects=(effect,)))
+                rows.append({"scene": name, "effect": effect, **_compare(plain, made)})
+        self.page.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        text = self.page.read_text(encoding="utf-8")
+        before, rest = text.split(TABLE_STARTS)
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *_cells(rows)))
+        after = rest.split(TABLE_ENDS)[1]
+        self.page.write_text(f"{before}{TABLE_STARTS}\n{table}\n{TABLE_ENDS}{after}", encoding="utf-8")
+        shown = Table(*COLUMNS)
+        for cells in _cells(rows):
+            shown.add_row(*cells)
+        Console(width=110).print(shown)
+
+
+@dataclass(frozen=True)
+class _Made:
+    prepare_s: float
+    frames_s: float
+    reflectance: list[Float[np.ndarray, "lines samples bands"]]
+    on_object: list[Bool[np.ndarray, "lines samples"]]
+
+
+def _make(scene: Scene) -> _Made:
+    started = time.perf_counter()
+    simulation = Simulation(scene)
+    prepared = time.perf_counter()
+    frames = [simulation.frame(i) for i in range(len(simulation.captures))]
+    made = time.perf_counter()
+    white = simulation.white()
+    centre = scene.camera.size_px // 2
+    middle = slice(centre - 4, centre + 4)
+    signal = _above_dark(white)[middle, middle].mean(axis=(0, 1))
+    # A pixel without light has no reflectance to be wrong about.
+    signal = np.where(signal > 0, signal, np.inf)
+    return _Made(
+        prepare_s=prepared - started,
+        frames_s=made - prepared,
+        reflectance=[normalise(f.counts, dark_counts(f.dark, f.counts.shape[1]), signal) for f in frames],
+        on_object=[frame.coverage > 0.5 for frame in frames],
+    )
+
+
+def _above_dark(capture: Capture) -> Float[np.ndarray, "lines samples bands"]:
+    return capture.counts.astype(float) - capture.dark.mean(axis=0)
+
+
+def _compare(plain: _Made, made: _Made) -> dict[str, float]:
+    squares, angles = [], []
+    for before, after, mask in zip(plain.reflectance, made.reflectance, plain.on_object, strict=False):
+        squares.append(np.mean((after[mask] - before[mask]) ** 2))
+        angles.append(spectral_angle(torch.from_numpy(after[mask]), torch.from_numpy(before[mask])).mean().item())
+    return {
+        "prepare_s": made.prepare_s,
+        "seconds_per_frame": made.frames_s / len(made.reflectance),
+        "plain_seconds_per_frame": plain.frames_s / len(plain.reflectance),
+        "rms_reflectance": float(np.sqrt(np.mean(squares))),
+        "sam_rad": float(np.mean(angles)),
+    }
+
+
+def _cells(rows: list[dict]) -> list[list[str]]:
+    return [
+        [
+            row["scene"],
+            row["effect"],
+            f"{row['prepare_s']:.2f}",
+            f"{1000 * row['seconds_per_frame']:.0f}",
+            f"{1000 * row['plain_seconds_per_frame']:.0f}",
+            f"{row['rms_reflectance']:.4f}",
+            f"{row['sam_rad']:.4f}",
+        ]
+        for row in rows
+    ]
+
+
+if __name__ == "__main__":
+    tyro.cli(EffectsCost).main()
