@@ -70,8 +70,10 @@ def _chosen(union: Any, value: Any, source: str, key: str) -> Any:
         return kinds[0]
     (name,) = {dataclasses.fields(kind)[0].name for kind in kinds}
     allowed = {choice: kind for kind in kinds for choice in get_args(get_type_hints(kind)[name])}
-    if not isinstance(value, dict) or name not in value:
+    if not isinstance(value, dict):
         return kinds[0]
+    if name not in value:
+        raise InputError(f"{source}: {key}.{name} is missing; add it.")
     _read_value(Literal[tuple(allowed)], value[name], source, f"{key}.{name}")
     return allowed[value[name]]
 

@@ -160,6 +160,8 @@ def _check_materials(scene: Scene, source: str) -> None:
     named: tuple[str, ...] = ()
     if isinstance(scene.object, OwnMesh):
         named = scene.object.materials
+        if len(named) == 0 or len({*named}) < len(named):
+            raise InputError(f"{source}: object.materials is {list(named)}, but must name one or more, each once.")
     elif isinstance(scene.object, Sphere | Cylinder):
         named = (scene.object.material,)
     for name in named:
