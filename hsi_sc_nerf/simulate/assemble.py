@@ -41,6 +41,7 @@ def frame_plan(scene: Scene) -> FramePlan:
         angles_deg=sign * np.arange(frames) * 360.0 / frames,
         elapsed=np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1),
         nominal_step_deg=360.0 / frames,
+        direction=scene.turntable.direction,
     )
     for effect in of_stage(scene.effects, MotionEffect):
         plan = effect.replan(plan, effect_rng(scene.seed, effect))

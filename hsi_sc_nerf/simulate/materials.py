@@ -77,6 +77,13 @@ MATERIALS: dict[str, Material] = {
     "disc": Plain(0.78, slope_per_um=0.03, blue_loss=0.10),
     # Sintered PTFE: 0.95-0.97, nearly flat.
     "chamber": Plain(0.96, slope_per_um=0.01),
+    # What a chamber's wall can be made of instead.
+    "plywood": PlantTissue(0.66, carotenoid=0.18, brown=0.55, water=0.02),
+    "blue_paint": Measured(
+        (380.0, 420.0, 460.0, 500.0, 540.0, 580.0, 640.0, 700.0, 740.0, 800.0, 1010.0),
+        (0.14, 0.30, 0.46, 0.38, 0.20, 0.09, 0.07, 0.12, 0.30, 0.42, 0.45),
+    ),
+    "black_paint": Plain(0.06, slope_per_um=0.05),
     # Calibration is relative to the tarp, so an ideal tarp makes calibrated reflectance the true one.
     "white_tarp": Plain(1.0),
     "tarp_surround": Plain(0.12, slope_per_um=0.05),
@@ -84,6 +91,11 @@ MATERIALS: dict[str, Material] = {
     "matte_white": Plain(1.0),
     "matte_grey": Plain(0.5),
 }
+
+
+def known_materials(own: Mapping[str, Material]) -> dict[str, Material]:
+    """All materials by name; a scene's ``own`` come before built-in ones of the same name."""
+    return {**MATERIALS, **own}
 
 
 def endmembers(
@@ -96,7 +108,7 @@ def endmembers(
     Raises:
         KeyError: a name is neither in ``own`` nor in `MATERIALS`.
     """
-    known = {**MATERIALS, **(own or {})}
+    known = known_materials(own or {})
     return np.stack([reflectance(known[name], np.asarray(wavelengths_nm, float)) for name in names])
 
 
@@ -113,7 +125,7 @@ def reflectance(material: Material, wavelengths_nm: Spectrum) -> Spectrum:
         + material.carotenoid * _carotenoid(wavelengths_nm)
         + material.anthocyanin * _peak(wavelengths_nm, 550.0, 33.0)
         + material.brown * np.exp(-(wavelengths_nm - 400.0) / 170.0)
-        + material.water * _water(wavelengths_nm)
+        + material.water * water_absorbance(wavelengths_nm)
     )
     return np.clip(material.plateau * 10.0**-absorbance, 0.0, 1.0)
 
@@ -138,6 +150,8 @@ def _carotenoid(w: Spectrum) -> Spectrum:
     return 0.8 * _peak(w, 412.0, 32.0) + 0.85 * _peak(w, 452.0, 16.0) + 0.75 * _peak(w, 482.0, 17.0)
 
 
-def _water(w: Spectrum) -> Spectrum:
-    """Liquid water: the overtone at 970 nm and the weak one at 750-840 nm."""
+def water_absorbance(wavelengths_nm: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Shape of liquid water's absorbance, of a tissue with water 1: the overtone at 970 nm and the weak one at
+    750-840 nm."""
+    w = wavelengths_nm
     return _peak(w, 970.0, 24.0) + 0.30 * _peak(w, 1010.0, 40.0) + 0.06 * _peak(w, 835.0, 18.0)

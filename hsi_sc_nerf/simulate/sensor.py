@@ -7,9 +7,8 @@ from importlib import resources
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from hsi_sc_nerf.simulate.lamps import lamp_photons
 from hsi_sc_nerf.simulate.scene import Sensor
-
-SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
 
 
 def band_centres_nm(bands: int) -> Float[np.ndarray, "bands"]:
@@ -20,12 +19,6 @@ def band_centres_nm(bands: int) -> Float[np.ndarray, "bands"]:
         return centres
     positions = np.linspace(0.0, len(centres) - 1.0, bands)
     return np.round(np.interp(positions, np.arange(len(centres)), centres), 2)
-
-
-def lamp_photons(wavelengths_nm: Float[np.ndarray, "bands"], temperature_k: float) -> Float[np.ndarray, "bands"]:
-    """Photon spectrum of a tungsten lamp, relative: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
-    exponent = SECOND_RADIATION_CONSTANT_NM_K / (wavelengths_nm * temperature_k)
-    return (wavelengths_nm / 1000.0) ** -4 / np.expm1(exponent)
 
 
 def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:

@@ -17,6 +17,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
+from hsi_sc_nerf.simulate.effects.stages import FramePlan
 from hsi_sc_nerf.simulate.frames import Capture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
 
@@ -28,7 +29,7 @@ METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
   <dataset>
     <key field="name">{name}</key>
     <key field="sensor">simulated SPECIM IQ</key>
-    <key field="integration time" unit="ms">10</key>
+    <key field="integration time" unit="ms">{integration_time_ms:g}</key>
   </dataset>
 </properties>
 """
@@ -92,13 +93,13 @@ def _move_into_place(building: Path, session_dir: Path) -> None:
 def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     scene = simulation.scene
     truth.write_truth(session_dir, simulation)
-    values = _session_values(scene, simulation.plan.nominal_step_deg)
+    values = _session_values(scene, simulation.plan)
     (session_dir / "session.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    _write_capture(session_dir, WHITE_REFERENCE, simulation.white(), simulation.wavelengths_nm)
+    _write_capture(session_dir, WHITE_REFERENCE, simulation.white(), simulation)
 
     def write_frame(number: int) -> None:
         capture, frame = simulation.captures[number], simulation.frame(number)
-        _write_capture(session_dir, capture, frame, simulation.wavelengths_nm)
+        _write_capture(session_dir, capture, frame, simulation)
         # Last, so that a frame whose truth is there is whole.
         truth.write_pixels(session_dir, capture, frame)
 
@@ -116,12 +117,12 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
             raise
 
 
-def _session_values(scene: Scene, nominal_step_deg: float) -> dict[str, object]:
+def _session_values(scene: Scene, plan: FramePlan) -> dict[str, object]:
     """What the instrument can't tell, as a user would write it down."""
     return {
         "object": scene.object.shape,
-        "nominal_step_deg": nominal_step_deg,
-        "direction": scene.turntable.direction,
+        "nominal_step_deg": plan.nominal_step_deg,
+        "direction": plan.direction,
         "marker_dictionary": scene.markers.dictionary,
         "marker_side_m": scene.markers.side_m,
         "container_diameter_m": scene.container.diameter_m,
@@ -130,12 +131,10 @@ def _session_values(scene: Scene, nominal_step_deg: float) -> dict[str, object]:
     }
 
 
-def _write_capture(
-    session_dir: Path, name: str, capture: Capture, wavelengths_nm: Float[np.ndarray, "bands"]
-) -> None:
-    folder = session_dir / name / "capture"
+def _write_capture(session_dir: Path, name: str, capture: Capture, simulation: Simulation) -> None:
+    folder, wavelengths_nm = session_dir / name / "capture", simulation.wavelengths_nm
     write_cube(folder / f"{name}.hdr", capture.counts, wavelengths_nm=wavelengths_nm, interleave="bil")
     write_cube(folder / f"DARKREF_{name}.hdr", capture.dark, wavelengths_nm=wavelengths_nm, interleave="bil")
     metadata = session_dir / name / "metadata"
     metadata.mkdir(exist_ok=True)
-    (metadata / f"{name}.xml").write_text(METADATA_XML.format(name=name), encoding="utf-8")
+    (metadata / f"{name}.xml").write_text(METADATA_XML.format(name=name, integration_time_ms=simulation.integration_time_ms), encoding="utf-8")

@@ -6,12 +6,40 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.effects.motion import AngleJitter
+from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
+from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
+from hsi_sc_nerf.simulate.effects.motion import (
+    AngleJitter,
+    AxisTilt,
+    Clockwise,
+    MissingFrames,
+    OffCentre,
+    PartialTurn,
+    RepeatedFrames,
+    Wobble,
+)
 from hsi_sc_nerf.simulate.effects.noise import PhotonNoise
 from hsi_sc_nerf.simulate.effects.stages import Effect
+from hsi_sc_nerf.simulate.effects.surroundings import TexturedBackground
 from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
 
-EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in (AngleJitter, PhotonNoise)}
+_ORDER: tuple[type[Effect], ...] = (
+    PartialTurn,
+    Clockwise,
+    AngleJitter,
+    AxisTilt,
+    Wobble,
+    RepeatedFrames,
+    MissingFrames,
+    OffCentre,
+    Deformation,
+    TexturedBackground,
+    Drying,
+    LampDrift,
+    IlluminationFalloff,
+    PhotonNoise,
+)
+EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
 """Every effect by its name, in the order in which effects of one stage act."""
 
 Stage = TypeVar("Stage", bound=Effect)

@@ -21,13 +21,17 @@ runs. Within a stage effects act in the order of `effects.EFFECTS`, whatever the
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.simulate.materials import Material
 
 
 class Effect:
@@ -55,6 +59,7 @@ class FramePlan:
         angles_deg: the turntable's true angle in each frame, positive counter-clockwise.
         elapsed: time of each frame as a share of the session, 0 to 1.
         nominal_step_deg: what the operator believes the step to be, positive.
+        direction: what the operator believes the turn to be, seen from above.
         tilts: rotation of the turntable's axis out of its place in each frame, or None where it keeps its place.
     """
 
@@ -62,6 +67,7 @@ class FramePlan:
     angles_deg: Float[np.ndarray, "n"]
     elapsed: Float[np.ndarray, "n"]
     nominal_step_deg: float
+    direction: Literal["ccw", "cw"]
     tilts: Float[np.ndarray, "n 3 3"] | None = None
 
     @property
@@ -109,8 +115,10 @@ class PlacementEffect(Effect):
 class DeformationEffect(Effect):
     """Changes the object's shape in the course of the session."""
 
-    def deform(self, vertices: Float[np.ndarray, "v 3"], base_z_m: float, elapsed: float) -> Float[np.ndarray, "v 3"]:
-        """The object's vertices at a time of the session; ``base_z_m`` is the height that it stands on."""
+    def deform(
+        self, vertices: Float[np.ndarray, "v 3"], foot_m: Float[np.ndarray, "3"], elapsed: float
+    ) -> Float[np.ndarray, "v 3"]:
+        """The object's vertices at a time of the session; ``foot_m`` is the point that it stands on."""
         raise NotImplementedError
 
 
@@ -149,6 +157,7 @@ class MaterialEffect(Effect):
     def spectra(
         self,
         endmembers: Float[np.ndarray, "*samples materials bands"],
+        materials: Sequence[Material],
         wavelengths_nm: Float[np.ndarray, "*samples bands"],
         elapsed: float,
     ) -> Float[np.ndarray, "*samples materials bands"]:
@@ -160,7 +169,7 @@ class IlluminationEffect(Effect):
     """Changes the lamps in time or over the image, for the object and the white tarp alike."""
 
     def factor(
-        self, size_px: int, wavelengths_nm: Float[np.ndarray, "bands"], elapsed: float
+        self, size_px: int, wavelengths_nm: Float[np.ndarray, "bands"], lamp_temperature_k: float, elapsed: float
     ) -> Float[np.ndarray, "#lines #samples #bands"]:
         """Light with the effect over light without it; 1 at the image's centre at the start of the session."""
         raise NotImplementedError
