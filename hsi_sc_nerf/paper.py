@@ -5,6 +5,7 @@ Options elsewhere take their defaults from here, so that a value that departs fr
 
 # Dataset acquisition (section "Imaging setup").
 BANDS = 204
+INTEGRATION_TIME_MS = 10.0
 WAVELENGTH_RANGE_NM = (397.32, 1003.58)
 FRAMES_PER_OBJECT = 60
 CONTAINER_DIAMETER_M = 0.09

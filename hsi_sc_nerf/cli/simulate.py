@@ -28,7 +28,7 @@ class SimulateCommand:
     seed: int | None = None
     """Grows another fruit of the same kind, instead of the scene's."""
     effects: tuple[str, ...] | None = None
-    """Physical effects instead of the scene's: names, or with strengths '{photon_noise: {full_well: 20000}}'."""
+    """Physical effects instead of the scene's: names, or with strengths '{read_noise: {electrons: 40}}'."""
 
     def main(self) -> None:
         """Run the command.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble, sensor
 from hsi_sc_nerf.simulate.effects import of_stage, stages
 from hsi_sc_nerf.simulate.effects.stages import effect_rng
@@ -32,7 +33,7 @@ class Capture:
     Attributes:
         counts: the cube.
         dark: its dark cube.
-        light: the noise-free light on the sensor, the image upright.
+        light: the noise-free light on the sensor, as the counts lie in the file.
     """
 
     counts: UInt16[np.ndarray, "lines samples bands"]
@@ -42,7 +43,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Frame(Capture):
-    """A capture of the object, and its truth, the image upright.
+    """A capture of the object, and its truth, which is upright.
 
     Attributes:
         material_weights: share of each material in each pixel, summing to 1.
@@ -73,6 +74,8 @@ class Simulation:
         self._chamber = [
             cover.cover(scene.camera.size_px, self.materials, effect_rng(scene.seed, cover)) for cover in covers
         ]
+        lenses = of_stage(effects, stages.LensEffect)
+        self.lens = lenses[0] if lenses else None
         self._optics = of_stage(effects, stages.OpticsEffect)
         self._material = of_stage(effects, stages.MaterialEffect)
         self._object_materials = [known_materials(scene.materials)[name] for name in thing.materials]
@@ -87,6 +90,16 @@ class Simulation:
         for detector in of_stage(effects, stages.DetectorEffect):
             self._seen_nm = detector.wavelengths_nm(self._seen_nm, scene.camera.size_px)
         self._signal_of_white = sensor.white_signal(scene.sensor, self._seen_nm)
+        self.integration_time_ms = paper.INTEGRATION_TIME_MS
+        for exposure in of_stage(effects, stages.ExposureEffect):
+            self._signal_of_white = self._signal_of_white * exposure.factor()
+            self.integration_time_ms *= exposure.factor()
+        self.detector_maps = {
+            effect.name: effect.detector_maps(
+                scene.camera.size_px, scene.sensor.bands, effect_rng(scene.seed, effect)
+            )
+            for effect in self._readout
+        }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
         self._seen_endmembers = self._seen_spectra(self.materials)
 
@@ -95,7 +108,7 @@ class Simulation:
         elapsed = float(self.plan.elapsed[number])
         renderer = self._renderer_at(elapsed)
         weights, coverage = renderer.render(
-            self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling
+            self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens
         )
         for cover in self._chamber:
             # The wall's share goes to what stands before it.
@@ -134,13 +147,15 @@ class Simulation:
         return assemble.build_renderer(self.scene, deformed, self.offset_m, self._chamber_materials)
 
     def _on_sensor(self, light: Light, elapsed: float) -> Light:
-        """The light after the lens and under the lamps of its time."""
+        """The light after the lens and under the lamps of its time, as it lies in the file."""
         weights = light.weights
         for effect in self._optics:
             weights = effect.image(weights)
         size_px = self.scene.camera.size_px
         lamp_k = self.scene.sensor.lamp_temperature_k
         factors = tuple(e.factor(size_px, self.wavelengths_nm, lamp_k, elapsed) for e in self._illumination)
+        for rotation in self._orientation:
+            weights, factors = rotation.orient(weights), tuple(map(rotation.orient, factors))
         return replace(light, weights=weights, illumination=factors)
 
     def _expose(
@@ -157,8 +172,6 @@ class Simulation:
         random = [effect_rng(self.scene.seed, effect, exposure, 1) for effect in self._readout]
         dark_lines = DARK_LINES if self._readout else PERFECT_DARK_LINES
         dark = self._digitise(np.zeros((dark_lines, samples, bands), np.float32), random)
-        for effect in self._orientation:
-            counts, dark = effect.orient(counts), effect.orient(dark)
         return counts, dark
 
     def _digitise(
@@ -168,9 +181,14 @@ class Simulation:
         counts = signal
         counts += self.scene.sensor.dark_level
         largest = 2**self.scene.sensor.bit_depth - 1
-        for effect, frame_rng in zip(self._readout, random, strict=True):
-            session_rng = effect_rng(self.scene.seed, effect)
-            context = stages.ReadoutContext(largest, self.scene.sensor.dark_level, frame_rng, session_rng)
+        for effect, rng in zip(self._readout, random, strict=True):
+            context = stages.ReadoutContext(
+                largest_count=largest,
+                dark_level=self.scene.sensor.dark_level,
+                electrons_per_count=self.scene.sensor.full_well_electrons / largest,
+                maps=self.detector_maps[effect.name],
+                rng=rng,
+            )
             counts = effect.read_out(counts, context)
         np.rint(counts, out=counts)
         return np.clip(counts, 0, largest, out=counts).astype(np.uint16)

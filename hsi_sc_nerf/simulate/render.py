@@ -12,6 +12,7 @@ import scipy.sparse
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.simulate.effects.stages import LensEffect
 from hsi_sc_nerf.simulate.mesh import Mesh
 
 RAYS_AT_ONCE = 2**19
@@ -55,11 +56,16 @@ class Renderer:
         self._scene.add_triangles(np.concatenate(vertices).astype(np.float32), self._triangles.astype(np.uint32))
 
     def render(
-        self, intrinsics: PinholeIntrinsics, camera_to_world: Float[np.ndarray, "4 4"], supersampling: int
+        self,
+        intrinsics: PinholeIntrinsics,
+        camera_to_world: Float[np.ndarray, "4 4"],
+        supersampling: int,
+        lens: LensEffect | None = None,
     ) -> tuple[Float[np.ndarray, "h w materials"], Float[np.ndarray, "h w"]]:
         """Material weights of each pixel (float32, summing to exactly 1) and the object's share of it.
 
-        A pixel is the mean over ``supersampling`` x ``supersampling`` rays, evenly spaced (a box filter).
+        A pixel is the mean over ``supersampling`` x ``supersampling`` rays, evenly spaced (a box filter), which a
+        ``lens`` bends.
         """
         weights = np.empty((intrinsics.h, intrinsics.w, len(self.materials)), np.float32)
         coverage = np.empty((intrinsics.h, intrinsics.w), np.float32)
@@ -67,7 +73,7 @@ class Renderer:
         lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
         for first in range(0, intrinsics.h, lines):
             rows = slice(first, min(first + lines, intrinsics.h))
-            directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling)
+            directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling, lens)
             # Three columns are too few for a matrix product to pay for its threads.
             directions = np.einsum("nk,jk->nj", directions, camera_to_world[:3, :3].astype(np.float32))
             of_rows, coverage_of_rows = self._mean_along_rays(camera_to_world[:3, 3], directions, supersampling**2)
@@ -117,7 +123,7 @@ def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray
 
 @lru_cache(maxsize=16)
 def _camera_rays(
-    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int
+    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int, lens: LensEffect | None
 ) -> Float[np.ndarray, "rays 3"]:
     """Directions, in the camera's axes, of the rays through some lines; a pixel's rays follow one another.
 
@@ -127,4 +133,6 @@ def _camera_rays(
     lines, samples = np.arange(first_line, end_line), np.arange(intrinsics.w)
     y, x, sub_y, sub_x = np.meshgrid(lines, samples, offsets, offsets, indexing="ij")
     pixels = np.stack([x + sub_x, y + sub_y], axis=-1).reshape(-1, 2)
+    if lens is not None:
+        pixels = lens.straighten(pixels, intrinsics)
     return pixel_rays(intrinsics, np.eye(4), pixels)[1].astype(np.float32)

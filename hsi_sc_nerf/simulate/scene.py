@@ -83,6 +83,8 @@ class Sensor:
     """Counts of the white tarp in its brightest band, as a share of the largest count."""
     dark_level: int = between(0, 1000, default=120)
     """Counts without light."""
+    full_well_electrons: float = between(100.0, 1e7, default=30_000.0)
+    """Electrons at the largest count, for the effects of noise."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ def override(
 ) -> Scene:
     """The scene with the given values in place of its own; ``None`` keeps the scene's.
 
-    Effects are given as in a scene file, each a text: ``photon_noise`` or ``{photon_noise: {full_well: 20000}}``.
+    Effects are given as in a scene file, each a text: ``photon_noise`` or ``{read_noise: {electrons: 40}}``.
 
     Raises:
         InputError: a value is out of range.

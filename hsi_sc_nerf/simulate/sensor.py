@@ -28,11 +28,22 @@ def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.n
     return np.interp(wavelengths_nm, nodes_nm, values)
 
 
-def white_signal(sensor: Sensor, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
+def white_signal(
+    sensor: Sensor, wavelengths_nm: Float[np.ndarray, "*samples bands"]
+) -> Float[np.ndarray, "*samples bands"]:
     """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count."""
-    signal = lamp_photons(wavelengths_nm, sensor.lamp_temperature_k) * quantum_efficiency(wavelengths_nm)
+    signal = _electrons_of_white(sensor, wavelengths_nm)
+    # The peak is that of the header's bands, even where a pixel sees another wavelength.
+    peak = _electrons_of_white(sensor, band_centres_nm(sensor.bands)).max()
     largest = 2**sensor.bit_depth - 1
-    return signal / signal.max() * (sensor.white_level * largest - sensor.dark_level)
+    return signal / peak * (sensor.white_level * largest - sensor.dark_level)
+
+
+def _electrons_of_white(
+    sensor: Sensor, wavelengths_nm: Float[np.ndarray, "*samples bands"]
+) -> Float[np.ndarray, "*samples bands"]:
+    """In arbitrary units."""
+    return lamp_photons(wavelengths_nm, sensor.lamp_temperature_k) * quantum_efficiency(wavelengths_nm)
 
 
 def expose(

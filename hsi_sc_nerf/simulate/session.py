@@ -9,8 +9,6 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
 from rich.progress import track
 
 from hsi_sc_nerf import __version__
@@ -29,7 +27,7 @@ METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
   <dataset>
     <key field="name">{name}</key>
     <key field="sensor">simulated SPECIM IQ</key>
-    <key field="integration time" unit="ms">10</key>
+    <key field="integration time" unit="ms">{integration_time_ms:g}</key>
   </dataset>
 </properties>
 """
@@ -95,11 +93,11 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     truth.write_truth(session_dir, simulation)
     values = _session_values(scene, simulation.plan)
     (session_dir / "session.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    _write_capture(session_dir, WHITE_REFERENCE, simulation.white(), simulation.wavelengths_nm)
+    _write_capture(session_dir, WHITE_REFERENCE, simulation.white(), simulation)
 
     def write_frame(number: int) -> None:
         capture, frame = simulation.captures[number], simulation.frame(number)
-        _write_capture(session_dir, capture, frame, simulation.wavelengths_nm)
+        _write_capture(session_dir, capture, frame, simulation)
         # Last, so that a frame whose truth is there is whole.
         truth.write_pixels(session_dir, capture, frame)
 
@@ -131,12 +129,12 @@ def _session_values(scene: Scene, plan: FramePlan) -> dict[str, object]:
     }
 
 
-def _write_capture(
-    session_dir: Path, name: str, capture: Capture, wavelengths_nm: Float[np.ndarray, "bands"]
-) -> None:
-    folder = session_dir / name / "capture"
+def _write_capture(session_dir: Path, name: str, capture: Capture, simulation: Simulation) -> None:
+    folder, wavelengths_nm = session_dir / name / "capture", simulation.wavelengths_nm
     write_cube(folder / f"{name}.hdr", capture.counts, wavelengths_nm=wavelengths_nm, interleave="bil")
     write_cube(folder / f"DARKREF_{name}.hdr", capture.dark, wavelengths_nm=wavelengths_nm, interleave="bil")
     metadata = session_dir / name / "metadata"
     metadata.mkdir(exist_ok=True)
-    (metadata / f"{name}.xml").write_text(METADATA_XML.format(name=name), encoding="utf-8")
+    (metadata / f"{name}.xml").write_text(
+        METADATA_XML.format(name=name, integration_time_ms=simulation.integration_time_ms), encoding="utf-8"
+    )

@@ -43,6 +43,8 @@ class Truth:
     volume_m3: float
     effects: dict[str, dict[str, Any]]
     """Strengths of each effect that was on, by its name."""
+    distortion: tuple[float, float, float, float]
+    """k1, k2, p1, p2 of OpenCV's model; all 0 for a pinhole camera."""
 
     @property
     def mesh_path(self) -> Path:
@@ -67,7 +69,7 @@ class Truth:
         return self.material_weights(capture) @ self.endmembers.astype(np.float32)
 
     def light(self, capture: str) -> Light:
-        """The noise-free light on the sensor; `Light.radiance` makes an image of it."""
+        """The noise-free light on the sensor, lying as the counts do; `Light.radiance` makes an image of it."""
         with np.load(pixels_path(self.session_dir, capture)) as arrays:
             factors = [name for name in arrays.files if name.startswith("illumination_")]
             weights = arrays["light_weights" if "light_weights" in arrays.files else "material_weights"]
@@ -76,6 +78,17 @@ class Truth:
                 spectra=arrays["light_spectra"] if "light_spectra" in arrays.files else self.endmembers,
                 illumination=tuple(arrays[name] for name in sorted(factors)),
             )
+
+    def detector_maps(self) -> dict[str, np.ndarray]:
+        """What the detector's pixels (samples, bands) have in common in all captures, by name; empty without any.
+
+        ``dark_offset`` (counts), ``dead`` and ``hot`` (which pixels are).
+        """
+        path = detector_path(self.session_dir)
+        if not path.exists():
+            return {}
+        with np.load(path) as arrays:
+            return dict(arrays)
 
     def _pixels(self, capture: str, key: str) -> np.ndarray:
         with np.load(pixels_path(self.session_dir, capture)) as arrays:
@@ -108,6 +121,7 @@ def load_truth(session_dir: str | Path) -> Truth:
             area_m2=values["mesh"]["area_m2"],
             volume_m3=values["mesh"]["volume_m3"],
             effects=values["effects"],
+            distortion=tuple(values.get("distortion", (0.0,) * 4)),
         )
     except FileNotFoundError as error:
         raise InputError(f"{session_dir}: has no truth ({path.name} is missing); simulate the session.") from error
@@ -136,12 +150,19 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         "container": dataclasses.asdict(scene.container),
         "mesh": {"area_m2": mesh.area_m2(), "volume_m3": mesh.volume_m3()},
     }
+    if simulation.lens is not None:
+        values["distortion"] = simulation.lens.coefficients()
     (folder / "truth.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     with (folder / "endmembers.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(["wavelength_nm", *materials])
         table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
     write_mesh(folder / "mesh.ply", mesh)
+    maps: dict[str, Any] = {}
+    for of_effect in simulation.detector_maps.values():
+        maps |= of_effect
+    if maps:
+        np.savez_compressed(detector_path(session_dir), **maps)
 
 
 def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
@@ -164,6 +185,11 @@ def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
     writing = path.with_suffix(".writing.npz")
     np.savez_compressed(writing, **arrays)
     os.replace(writing, path)
+
+
+def detector_path(session_dir: Path) -> Path:
+    """Where the detector's maps lie."""
+    return session_dir / "truth" / "detector.npz"
 
 
 def pixels_path(session_dir: Path, capture: str) -> Path:

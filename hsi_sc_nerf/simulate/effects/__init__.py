@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
+from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile
 from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
 from hsi_sc_nerf.simulate.effects.motion import (
     AngleJitter,
@@ -18,7 +19,9 @@ from hsi_sc_nerf.simulate.effects.motion import (
     RepeatedFrames,
     Wobble,
 )
-from hsi_sc_nerf.simulate.effects.noise import PhotonNoise
+from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
+from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur
+from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
 from hsi_sc_nerf.simulate.effects.stages import Effect
 from hsi_sc_nerf.simulate.effects.surroundings import TexturedBackground
 from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
@@ -37,7 +40,15 @@ _ORDER: tuple[type[Effect], ...] = (
     Drying,
     LampDrift,
     IlluminationFalloff,
+    LensDistortion,
+    OpticalBlur,
+    ImageRotation,
+    SpectralSmile,
+    Saturation,
     PhotonNoise,
+    DarkPattern,
+    ReadNoise,
+    BadPixels,
 )
 EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
 """Every effect by its name, in the order in which effects of one stage act."""
@@ -51,7 +62,7 @@ def of_stage(effects: Sequence[Effect], stage: type[Stage]) -> tuple[Stage, ...]
 
 
 def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
-    """Effects of a scene file's list: each a name, or a name with strengths (``photon_noise: {full_well: 2e4}``).
+    """Effects of a scene file's list: each a name, or a name with strengths (``read_noise: {electrons: 40}``).
 
     They come back in the order in which they act.
 

@@ -13,22 +13,23 @@ runs. Within a stage effects act in the order of `effects.EFFECTS`, whatever the
     optics        the image on the sensor
     material      the materials' spectra in each frame
     illumination  the lamps, in time and over the image
+    orientation   how the image lies on the sensor, and so in the file
     detector      which wavelength each detector pixel sees
+    exposure      how long the sensor collects light
     readout       from noise-free counts to what is digitised
-    orientation   how the image lies in the file
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, turntable_camera_to_world
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.simulate.materials import Material
@@ -47,7 +48,8 @@ def effect_rng(seed: int, effect: Effect, *exposure: int) -> np.random.Generator
     They depend on the scene's seed, the effect's name and the exposure alone, so that neither another effect nor the
     order in which frames are made changes them.
     """
-    return np.random.default_rng([seed, zlib.crc32(effect.name.encode()), *exposure])
+    # The length goes with them, because NumPy takes a seed that ends in zeros for the shorter one.
+    return np.random.default_rng([seed, zlib.crc32(effect.name.encode()), len(exposure), *exposure])
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,14 @@ class DeformationEffect(Effect):
 class LensEffect(Effect):
     """Bends the rays of the pinhole camera."""
 
-    def coefficients(self) -> Float[np.ndarray, "4"]:
+    def coefficients(self) -> tuple[float, float, float, float]:
         """k1, k2, p1, p2 of OpenCV's model."""
+        raise NotImplementedError
+
+    def straighten(
+        self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
+    ) -> Float[np.ndarray, "*n 2"]:
+        """Where a camera without the effect sees what is seen at these pixel coordinates."""
         raise NotImplementedError
 
 
@@ -185,6 +193,14 @@ class DetectorEffect(Effect):
         raise NotImplementedError
 
 
+class ExposureEffect(Effect):
+    """Changes how long the sensor collects light, in all captures of a session alike."""
+
+    def factor(self) -> float:
+        """The integration time over the one for which the sensor's ``white_level`` is right."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
 class ReadoutContext:
     """What a read-out knows beside the counts.
@@ -192,18 +208,27 @@ class ReadoutContext:
     Attributes:
         largest_count: of the digitiser.
         dark_level: counts without light.
-        frame_rng: random numbers of this exposure.
-        session_rng: the same numbers in every exposure, for what belongs to the detector.
+        electrons_per_count: the sensor's gain.
+        maps: of this effect, from its `ReadoutEffect.detector_maps`.
+        rng: random numbers of this exposure.
     """
 
     largest_count: int
     dark_level: int
-    frame_rng: np.random.Generator
-    session_rng: np.random.Generator
+    electrons_per_count: float
+    maps: Mapping[str, np.ndarray]
+    rng: np.random.Generator
 
 
 class ReadoutEffect(Effect):
     """Changes counts between the light and the digitiser: of frames, white and dark cubes alike."""
+
+    def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """What belongs to the detector's pixels (samples, bands) and is the same in every exposure, by name.
+
+        It is drawn once and kept in the truth; by default there is nothing.
+        """
+        return {}
 
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
@@ -213,8 +238,8 @@ class ReadoutEffect(Effect):
 
 
 class OrientationEffect(Effect):
-    """Changes how the image lies in the file."""
+    """Changes how the image lies on the sensor, whose line is the samples of the file."""
 
-    def orient(self, cube: np.ndarray) -> np.ndarray:
-        """The cube (lines, samples, ...) as it is written."""
+    def orient(self, image: np.ndarray) -> np.ndarray:
+        """An upright image (lines, samples, ...) as it lies in the file."""
         raise NotImplementedError

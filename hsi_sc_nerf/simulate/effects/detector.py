@@ -1,0 +1,100 @@
+"""The detector: what belongs to its pixels, one for each sample and band, and is the same in every exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.simulate.effects.stages import DetectorEffect, ExposureEffect, ReadoutContext, ReadoutEffect
+from hsi_sc_nerf.simulate.reading import between
+
+
+@dataclass(frozen=True)
+class SpectralSmile(DetectorEffect):
+    """Lines of one wavelength are curved on the detector: its pixels see other wavelengths than the header states.
+
+    The shift is a parabola along the detector's line: nothing in the middle, ``shift_nm`` at both ends. It is in all
+    captures, and calibration with the tarp's mean spectrum leaves it in.
+    """
+
+    name: ClassVar[str] = "spectral_smile"
+    shift_nm: float = between(-20.0, 20.0, default=1.5)
+    """Wavelength at the ends of the line less that in its middle, nm."""
+
+    def wavelengths_nm(
+        self, centres_nm: Float[np.ndarray, "bands"], samples: int
+    ) -> Float[np.ndarray, "samples bands"]:
+        """Wavelength of each detector pixel."""
+        from_middle = (2.0 * np.arange(samples) + 1.0) / samples - 1.0
+        return centres_nm + self.shift_nm * from_middle[:, None] ** 2
+
+
+@dataclass(frozen=True)
+class Saturation(ExposureEffect):
+    """The integration time is too long: what is too bright stops at the largest count.
+
+    A session has one integration time, as the paper's (10 ms): it was set for a dark object, and the white tarp is
+    taken with it as well. So calibration stays right wherever neither the object nor the tarp stops; a tarp at 0.82
+    of the largest count stops, in its brightest bands, from a factor of about 1.2 on.
+    """
+
+    name: ClassVar[str] = "saturation"
+    exposure_factor: float = between(1.0, 100.0, default=1.5)
+    """Integration time over the one at which the tarp counts the sensor's ``white_level``."""
+
+    def factor(self) -> float:
+        """`exposure_factor`."""
+        return self.exposure_factor
+
+
+@dataclass(frozen=True)
+class DarkPattern(ReadoutEffect):
+    """The dark level is another one in each detector pixel; a dark cube takes it off."""
+
+    name: ClassVar[str] = "dark_pattern"
+    spread: float = between(0.0, 1000.0, default=6.0)
+    """Standard deviation over the detector pixels, counts."""
+
+    def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """``dark_offset``: counts to add to the dark level, float32, normal."""
+        return {"dark_offset": np.float32(self.spread) * rng.standard_normal((samples, bands), dtype=np.float32)}
+
+    def read_out(
+        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
+    ) -> Float[np.ndarray, "lines samples bands"]:
+        """Add the pattern."""
+        return counts + context.maps["dark_offset"]
+
+
+@dataclass(frozen=True)
+class BadPixels(ReadoutEffect):
+    """Some detector pixels do not follow the light: dead ones stay at the dark level, hot ones at the largest count.
+
+    A detector pixel is one sample in one band, so each is a line across the image of its band.
+    """
+
+    name: ClassVar[str] = "bad_pixels"
+    dead_share: float = between(0.0, 0.5, default=0.0005)
+    """Share of the detector pixels that are dead."""
+    hot_share: float = between(0.0, 0.5, default=0.0005)
+    """Share of the detector pixels that are hot."""
+
+    def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """``dead`` and ``hot``: which pixels are, never both; their numbers are the shares, rounded."""
+        pixels = samples * bands
+        dead, hot = round(self.dead_share * pixels), round(self.hot_share * pixels)
+        chosen = rng.permutation(pixels)
+        maps = np.zeros((2, pixels), bool)
+        maps[0, chosen[:dead]] = True
+        maps[1, chosen[dead : dead + hot]] = True
+        return {"dead": maps[0].reshape(samples, bands), "hot": maps[1].reshape(samples, bands)}
+
+    def read_out(
+        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
+    ) -> Float[np.ndarray, "lines samples bands"]:
+        """Overwrite what the bad pixels read."""
+        counts = np.where(context.maps["dead"], np.float32(context.dark_level), counts)
+        return np.where(context.maps["hot"], np.float32(context.largest_count), counts)
