@@ -165,6 +165,17 @@ def test_cutting_edges_keeps_surface_and_columns(longest):
     assert np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=-1).max() <= longest
 
 
+def test_a_seam_that_an_exporter_rounded_is_closed(tmp_path):
+    vertices, triangles, uv = uv_sphere()
+    save(
+        tmp_path / "ball.obj", vertices + np.random.default_rng(0).uniform(-1e-9, 1e-9, vertices.shape), triangles, uv
+    )
+    ramp(tmp_path / "shares.png", 0)
+    texture = tmp_path / "shares.png"
+    mesh, _ = own_mesh.load(OwnMesh("mesh", tmp_path / "ball.obj", TWO, weight_texture=texture))
+    assert mesh.is_watertight()
+
+
 def test_welding_averages_columns_and_drops_empty_triangles():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [-0.0, 0, 0], [1, 0, 0]], float)
     mesh, columns = welded(vertices, np.array([[0, 1, 2], [3, 0, 2]]), np.array([[0.0], [1], [2], [4], [3]]))

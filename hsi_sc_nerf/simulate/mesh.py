@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,12 @@ def quads(corners: Float[np.ndarray, "q 4 3"]) -> Mesh:
 
 
 def snapped(vertices: Float[np.ndarray, "v 3"], tolerance_m: float) -> Float[np.ndarray, "v 3"]:
-    """Vertices that fall into the same cell of a grid of ``tolerance_m`` are put in exactly the same place."""
-    _, first, cell = np.unique(np.rint(vertices / tolerance_m), axis=0, return_index=True, return_inverse=True)
-    return vertices[first[cell.ravel()]]
+    """Vertices within ``tolerance_m`` of each other are put in exactly the same place, the first one's."""
+    near = cKDTree(vertices).query_pairs(tolerance_m, output_type="ndarray")
+    n = len(vertices)
+    _, group = connected_components(csr_array((np.ones(len(near)), near.T), shape=(n, n)), directed=False)
+    _, first = np.unique(group, return_index=True)
+    return vertices[first[group]]
 
 
 def welded(
