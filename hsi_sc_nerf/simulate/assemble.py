@@ -74,15 +74,15 @@ def _object_on_zero(thing: Object, rng: np.random.Generator) -> Part:
     return Part(shape.mesh, texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng))
 
 
-def support_parts(scene: Scene) -> list[Part]:
-    """Disc, container, and the markers on both.
+def support_parts(scene: Scene, step_m: float | None = None) -> list[Part]:
+    """Disc, container, and the markers on both; ``step_m`` as in `build_renderer`.
 
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
     parts = [
-        _plain(target.disc_mesh(scene.turntable), "disc"),
-        _plain(target.container_mesh(scene.container), "container_plastic"),
+        _plain(target.disc_mesh(scene.turntable, step_m), "disc"),
+        _plain(target.container_mesh(scene.container, step_m), "container_plastic"),
     ]
     on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
@@ -97,13 +97,19 @@ def build_renderer(
     thing: Part,
     offset_m: Float[np.ndarray, "3"] | float = 0.0,
     extra_materials: Sequence[str] = (),
+    step_m: float | None = None,
 ) -> Renderer:
     """The renderer of the whole scene around its object (from `object_part`), its support shifted by ``offset_m``.
 
-    ``extra_materials`` get columns of their own, for what is seen where rays miss everything.
+    ``extra_materials`` get columns of their own, for what is seen where rays miss everything. With ``step_m`` the
+    same surfaces have vertices at most about so far apart (metres), for light that is computed there.
     """
-    support = [replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support_parts(scene)]
-    return Renderer([thing, *support], extra_materials=extra_materials)
+    support = support_parts(scene, step_m)
+    parts = [thing, *(replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support)]
+    if step_m is not None:
+        # The diagonal of a square of that side is left whole.
+        parts = [part.refined(1.5 * step_m) for part in parts]
+    return Renderer(parts, extra_materials=extra_materials)
 
 
 def _plain(mesh: Mesh, material: str) -> Part:

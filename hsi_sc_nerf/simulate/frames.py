@@ -10,11 +10,13 @@ from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble, sensor
+from hsi_sc_nerf.simulate.colours import colour_spectra
 from hsi_sc_nerf.simulate.effects import of_stage, stages
 from hsi_sc_nerf.simulate.effects.stages import effect_rng
 from hsi_sc_nerf.simulate.light import Light
+from hsi_sc_nerf.simulate.lighting import Lighting
 from hsi_sc_nerf.simulate.materials import endmembers, known_materials
-from hsi_sc_nerf.simulate.render import Renderer, exact_weights
+from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_MATERIALS = ("white_tarp", "tarp_surround")
@@ -22,6 +24,8 @@ TARP_MARGIN = 0.08
 """Share of the image's side that the tarp leaves free along each edge."""
 PERFECT_DARK_LINES, DARK_LINES = 1, 64
 """Lines of a dark cube: of a perfect sensor, whose lines are all the same, and of any other."""
+LIGHT_STEP_M = 0.0025
+"""Light that is computed at points of the surface runs straight between points that are no further apart."""
 LINES_AT_ONCE = 64
 """Lines of an image that are exposed together, which keeps large frames within little memory."""
 
@@ -65,11 +69,13 @@ class Simulation:
         self.plan = assemble.frame_plan(scene)
         self.intrinsics = assemble.intrinsics(scene.camera)
         self.offset_m = sum((e.offset_m() for e in of_stage(effects, stages.PlacementEffect)), np.zeros(3))
+        self._light = of_stage(effects, stages.LightEffect)
         covers = of_stage(effects, stages.ChamberEffect)
         thing = assemble.object_part(scene)
         self.object_part = replace(thing, mesh=thing.mesh.moved(self.offset_m))
         self._chamber_materials = [name for cover in covers for name in cover.materials]
-        self.renderer = assemble.build_renderer(scene, self.object_part, self.offset_m, self._chamber_materials)
+        self.renderer = self._renderer_of(self.object_part)
+        self._lighting = self._lit(self.renderer)
         self.materials = self.renderer.materials
         self._chamber = [
             cover.cover(scene.camera.size_px, self.materials, effect_rng(scene.seed, cover)) for cover in covers
@@ -106,14 +112,20 @@ class Simulation:
     def frame(self, number: int) -> Frame:
         """The capture of one frame of the plan."""
         elapsed = float(self.plan.elapsed[number])
-        renderer = self._renderer_at(elapsed)
-        weights, coverage = renderer.render(
-            self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens
-        )
+        view = (self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens)
+        renderer, lighting = (self.renderer, self._lighting) if not self._deformation else self._deformed(elapsed)
+        if lighting is None:
+            weights, coverage = renderer.render(*view)
+        else:
+            rendering = lighting.render(*view)
+            weights, coverage, light_weights = rendering.material_weights, rendering.coverage, rendering.light_weights
         for cover in self._chamber:
             # The wall's share goes to what stands before it.
             covered = weights + weights[..., -1:] * (cover - np.eye(len(self.materials))[-1])
             weights = exact_weights(covered.reshape(-1, len(self.materials))).reshape(weights.shape)
+            if lighting is not None:
+                wall = light_weights[..., len(self.materials) - 1, None]
+                light_weights[..., : len(self.materials)] += wall * (cover - np.eye(len(self.materials))[-1])
         spectra = self._seen_endmembers
         if self._material:
             of_object = [self.materials.index(name) for name in self.object_part.materials]
@@ -122,7 +134,11 @@ class Simulation:
                 spectra[..., of_object, :] = effect.spectra(
                     spectra[..., of_object, :], self._object_materials, self._seen_nm, elapsed
                 )
-        light = self._on_sensor(Light(weights, spectra), elapsed)
+        if lighting is None:
+            light = Light(weights, spectra)
+        else:
+            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._seen_nm))
+        light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
         return Frame(counts, dark, light, weights, coverage, self.endmembers)
 
@@ -136,15 +152,24 @@ class Simulation:
         """Spectra as the detector sees them: a table, or one a sample where its wavelengths differ."""
         return np.moveaxis(endmembers(names, self._seen_nm, self.scene.materials), 0, -2)
 
-    def _renderer_at(self, elapsed: float) -> Renderer:
-        if not self._deformation:
-            return self.renderer
+    def _renderer_of(self, thing: Part) -> Renderer:
+        """The renderer of the object, perhaps deformed, on its support."""
+        step_m = LIGHT_STEP_M if of_stage(self._light, stages.SurfaceLightEffect) else None
+        return assemble.build_renderer(self.scene, thing, self.offset_m, self._chamber_materials, step_m)
+
+    def _lit(self, renderer: Renderer) -> Lighting | None:
+        """The light on the parts of a renderer, or None where it is even."""
+        return Lighting(renderer, self._light) if self._light else None
+
+    def _deformed(self, elapsed: float) -> tuple[Renderer, Lighting | None]:
+        """The renderer at a time of the session, and the light on it."""
         vertices = self.object_part.mesh.vertices
         foot_m = self.offset_m + np.array([0.0, 0.0, self.scene.container.height_m])
         for effect in self._deformation:
             vertices = effect.deform(vertices, foot_m, elapsed)
         deformed = replace(self.object_part, mesh=replace(self.object_part.mesh, vertices=vertices))
-        return assemble.build_renderer(self.scene, deformed, self.offset_m, self._chamber_materials)
+        renderer = self._renderer_of(deformed)
+        return renderer, self._lit(renderer)
 
     def _on_sensor(self, light: Light, elapsed: float) -> Light:
         """The light after the lens and under the lamps of its time, as it lies in the file."""

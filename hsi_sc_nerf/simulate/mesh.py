@@ -86,10 +86,16 @@ def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:
     return Mesh(vertices, np.concatenate([lower_cap, walls, upper_cap]))
 
 
-def cylinder(diameter_m: float, height_m: float, segments: int = 128) -> Mesh:
-    """A closed upright cylinder that stands on z = 0."""
+def cylinder(diameter_m: float, height_m: float, segments: int = 128, step_m: float | None = None) -> Mesh:
+    """A closed upright cylinder that stands on z = 0, with rings of vertices every ``step_m`` or only at its rims."""
     r = diameter_m / 2.0
-    return revolve(np.array([[0.0, 0.0], [r, 0.0], [r, height_m], [0.0, height_m]]), segments)
+    profile = np.array([[0.0, 0.0], [r, 0.0], [r, height_m], [0.0, height_m]])
+    if step_m is not None:
+        lengths_m = np.linalg.norm(np.diff(profile, axis=0), axis=1)
+        steps = np.ceil(lengths_m / step_m).astype(int)
+        position = np.concatenate([i + np.arange(n) / n for i, n in enumerate(steps)] + [[3.0]])
+        profile = np.stack([np.interp(position, np.arange(4), column) for column in profile.T], axis=-1)
+    return revolve(profile, segments)
 
 
 def quads(corners: Float[np.ndarray, "q 4 3"]) -> Mesh:

@@ -1,21 +1,23 @@
-"""Ray casting: which materials, in which shares, each pixel sees."""
+"""Ray casting: what each pixel sees, and which materials, in which shares."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 import open3d as o3d
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.simulate.effects.stages import LensEffect
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.simulate.mesh import Mesh, subdivided
 
 RAYS_AT_ONCE = 2**19
+RAY_START_M = 2e-5
+"""How far above a surface a ray starts that leaves it, so that it does not hit what it leaves."""
 WEIGHT_STEPS = 2048
 """Weights are multiples of 1 / 2048, which float16 holds exactly, so that stored weights sum to exactly 1."""
 
@@ -30,11 +32,102 @@ class Part:
     is_object: bool = False
     """Whether this is the thing that is scanned, not its surroundings."""
 
+    def refined(self, longest_edge_m: float) -> Part:
+        """The same surface of triangles with shorter edges."""
+        columns, triangles = subdivided(
+            np.concatenate([self.mesh.vertices, self.weights], axis=1), self.mesh.triangles, longest_edge_m
+        )
+        return replace(self, mesh=Mesh(columns[:, :3], triangles), weights=columns[:, 3:])
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays hit; ``rays_per_pixel`` rays that follow one another belong to one pixel.
+
+    Attributes:
+        renderer: whose parts are hit.
+        origins, directions: of all rays.
+        ray: the rays that hit something, by index; what follows has one entry for each of them.
+        triangle: of the renderer's.
+        barycentric: share of each of the triangle's corners.
+        distance_m: along the ray.
+    """
+
+    renderer: Renderer
+    origins: Float[np.ndarray, "rays 3"]
+    directions: Float[np.ndarray, "rays 3"]
+    rays_per_pixel: int
+    ray: Int[np.ndarray, "hits"]
+    triangle: Int[np.ndarray, "hits"]
+    barycentric: Float[np.ndarray, "3 hits"]
+    distance_m: Float[np.ndarray, "hits"]
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels the rays belong to."""
+        return len(self.directions) // self.rays_per_pixel
+
+    @property
+    def pixel(self) -> Int[np.ndarray, "hits"]:
+        """The pixel of each hit."""
+        return self.ray // self.rays_per_pixel
+
+    @cached_property
+    def is_object(self) -> Bool[np.ndarray, "hits"]:
+        """Whether the thing that is scanned is hit."""
+        return self.renderer.is_object[self.triangle]
+
+    def positions(self) -> Float[np.ndarray, "hits 3"]:
+        """Places, metres."""
+        return self.origins[self.ray] + self.distance_m[:, None] * self.directions[self.ray]
+
+    @cached_property
+    def is_behind(self) -> Bool[np.ndarray, "hits"]:
+        """Whether the triangle is seen from behind."""
+        normals = self.renderer.facet_normals[self.triangle]
+        return np.einsum("nk,nk->n", normals, self.directions[self.ray]) > 0.0
+
+    @cached_property
+    def facing_normals(self) -> Float[np.ndarray, "hits 3"]:
+        """Unit normals of the triangles on the side that is seen."""
+        normals = self.renderer.facet_normals[self.triangle]
+        return np.where(self.is_behind[:, None], -normals, normals)
+
+    def is_free(self, directions: Float[np.ndarray, "*n 3"], some: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+        """Whether rays from some of the hits, one direction each or the same for all, hit nothing."""
+        starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
+        return self.renderer.is_free(starts, np.broadcast_to(directions, starts.shape))
+
+    def mix(
+        self,
+        triangles: Int[np.ndarray, "t 3"],
+        columns: int,
+        factor: Float[np.ndarray, "hits"] | float = 1.0,
+    ) -> scipy.sparse.csr_array:
+        """How much of each corner each pixel sees: the mean over its rays, each times ``factor``.
+
+        ``triangles`` are the renderer's triangles by whatever ``columns`` things lie at their corners.
+        """
+        return scipy.sparse.csr_array(
+            (
+                np.concatenate(list(self.barycentric * factor)) / self.rays_per_pixel,
+                (np.tile(self.pixel, 3), np.concatenate(list(triangles[self.triangle].T))),
+            ),
+            shape=(self.pixels, columns),
+        )
+
+    def mean(self, values: Float[np.ndarray, "hits"]) -> Float[np.ndarray, "pixels"]:
+        """Mean over each pixel's rays of what is 0 where a ray hits nothing."""
+        return np.bincount(self.pixel, values, minlength=self.pixels) / self.rays_per_pixel
+
 
 class Renderer:
     """Casts rays at a fixed set of parts; whatever a ray misses is the chamber.
 
-    ``materials`` names the columns of the weights; the last one is the chamber, before it come the extra ones.
+    Attributes:
+        materials: names the columns of the weights; the last one is the chamber, before it come the extra ones.
+        vertices, triangles, weights: of all parts, one after the other.
+        is_object: which triangles belong to the thing that is scanned.
     """
 
     def __init__(self, parts: Sequence[Part], chamber: str = "chamber", extra_materials: Sequence[str] = ()) -> None:
@@ -49,11 +142,19 @@ class Renderer:
             of_part[:, [self.materials.index(name) for name in part.materials]] = part.weights
             weights.append(of_part)
             is_object.append(np.full(len(part.mesh.triangles), part.is_object))
-        self._triangles = np.concatenate(triangles)
-        self._weights = np.concatenate(weights)
-        self._is_object = np.concatenate(is_object)
+        self.vertices = np.concatenate(vertices)
+        self.triangles = np.concatenate(triangles)
+        self.weights = np.concatenate(weights)
+        self.is_object = np.concatenate(is_object)
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(np.concatenate(vertices).astype(np.float32), self._triangles.astype(np.uint32))
+        self._scene.add_triangles(self.vertices.astype(np.float32), self.triangles.astype(np.uint32))
+
+    @cached_property
+    def facet_normals(self) -> Float[np.ndarray, "t 3"]:
+        """Unit normal of each triangle, outwards."""
+        a, b, c = (self.vertices[corner] for corner in self.triangles.T)
+        doubled = np.cross(b - a, c - a)
+        return (doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-30)).astype(np.float32)
 
     def render(
         self,
@@ -69,45 +170,64 @@ class Renderer:
         """
         weights = np.empty((intrinsics.h, intrinsics.w, len(self.materials)), np.float32)
         coverage = np.empty((intrinsics.h, intrinsics.w), np.float32)
-        # As many lines at once as keep the memory small.
+        for rows, hits in self.camera_hits(intrinsics, camera_to_world, supersampling, lens):
+            weights[rows] = self.material_weights(hits).reshape(-1, intrinsics.w, len(self.materials))
+            coverage[rows] = hits.mean(hits.is_object).reshape(-1, intrinsics.w)
+        return weights, coverage
+
+    def camera_hits(
+        self,
+        intrinsics: PinholeIntrinsics,
+        camera_to_world: Float[np.ndarray, "4 4"],
+        supersampling: int,
+        lens: LensEffect | None = None,
+    ) -> Iterator[tuple[slice, Hits]]:
+        """What the rays of a camera hit: some lines of the image after the others, to keep the memory small."""
         lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
         for first in range(0, intrinsics.h, lines):
             rows = slice(first, min(first + lines, intrinsics.h))
             directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling, lens)
             # Three columns are too few for a matrix product to pay for its threads.
             directions = np.einsum("nk,jk->nj", directions, camera_to_world[:3, :3].astype(np.float32))
-            of_rows, coverage_of_rows = self._mean_along_rays(camera_to_world[:3, 3], directions, supersampling**2)
-            weights[rows] = of_rows.reshape(-1, intrinsics.w, len(self.materials))
-            coverage[rows] = coverage_of_rows.reshape(-1, intrinsics.w)
-        return weights, coverage
+            origins = np.broadcast_to(camera_to_world[:3, 3].astype(np.float32), directions.shape)
+            yield rows, self.cast(origins, directions, supersampling**2)
 
-    def _mean_along_rays(
-        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
-    ) -> tuple[Float[np.ndarray, "pixels materials"], Float[np.ndarray, "pixels"]]:
-        """Weights and object share of pixels that are runs of ``rays_per_pixel`` rays."""
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origin, directions
-        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
+    def cast(
+        self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
+    ) -> Hits:
+        """Where rays first hit a part; directions are of unit length."""
+        hits = self._scene.cast_rays(_ray_tensor(origins, directions))
         triangle = hits["primitive_ids"].numpy()
-        hit = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
-        triangle = triangle[hit]
-        u, v = hits["primitive_uvs"].numpy()[hit].T
-        a, b, c = self._triangles[triangle].T
-
-        # Each ray adds its hit's barycentric mix of three vertices to its pixel: one sparse matrix product.
-        pixel = hit // rays_per_pixel
-        pixels = len(directions) // rays_per_pixel
-        mix = scipy.sparse.csr_array(
-            (
-                np.concatenate([1.0 - u - v, u, v]) / rays_per_pixel,
-                (np.tile(pixel, 3), np.concatenate([a, b, c])),
-            ),
-            shape=(pixels, len(self._weights)),
+        ray = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
+        u, v = hits["primitive_uvs"].numpy()[ray].T
+        return Hits(
+            renderer=self,
+            origins=origins,
+            directions=directions,
+            rays_per_pixel=rays_per_pixel,
+            ray=ray,
+            triangle=triangle[ray],
+            barycentric=np.stack([1.0 - u - v, u, v]),
+            distance_m=hits["t_hit"].numpy()[ray],
         )
-        weights = mix @ self._weights
+
+    def is_free(
+        self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
+    ) -> Bool[np.ndarray, "rays"]:
+        """Whether rays hit nothing."""
+        return ~self._scene.test_occlusions(_ray_tensor(origins, directions)).numpy()
+
+    def material_weights(self, hits: Hits) -> Float[np.ndarray, "pixels materials"]:
+        """Share of each material in each pixel, summing to exactly 1."""
+        weights = hits.mix(self.triangles, len(self.weights)) @ self.weights
         weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
-        coverage = np.bincount(pixel, self._is_object[triangle], minlength=pixels) / rays_per_pixel
-        return exact_weights(weights), coverage
+        return exact_weights(weights)
+
+
+def _ray_tensor(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> o3d.core.Tensor:
+    rays = np.empty((len(directions), 6), np.float32)
+    rays[:, :3], rays[:, 3:] = origins, directions
+    return o3d.core.Tensor.from_numpy(rays)
 
 
 def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray, "n materials"]:

@@ -106,14 +106,14 @@ def plaque_back(frame: MarkerFrame, markers: Markers) -> Mesh:
     return quads(corners[None])
 
 
-def container_mesh(container: Container) -> Mesh:
-    """The container with its flat lid, standing on the disc."""
-    return cylinder(container.diameter_m, container.height_m)
+def container_mesh(container: Container, step_m: float | None = None) -> Mesh:
+    """The container with its flat lid, standing on the disc; ``step_m`` as in `mesh.cylinder`."""
+    return cylinder(container.diameter_m, container.height_m, step_m=step_m)
 
 
-def disc_mesh(turntable: Turntable) -> Mesh:
-    """The turntable's disc, just below the markers that lie in z = 0."""
-    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M).moved(
+def disc_mesh(turntable: Turntable, step_m: float | None = None) -> Mesh:
+    """The turntable's disc, just below the markers that lie in z = 0; ``step_m`` as in `mesh.cylinder`."""
+    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, step_m=step_m).moved(
         np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M])
     )
 

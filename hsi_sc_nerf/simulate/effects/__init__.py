@@ -8,7 +8,9 @@ from typing import Any, TypeVar
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
 from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile
+from hsi_sc_nerf.simulate.effects.gloss import Gloss
 from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
+from hsi_sc_nerf.simulate.effects.lamp import Lamp
 from hsi_sc_nerf.simulate.effects.motion import (
     AngleJitter,
     AxisTilt,
@@ -22,8 +24,10 @@ from hsi_sc_nerf.simulate.effects.motion import (
 from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
 from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur
 from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
+from hsi_sc_nerf.simulate.effects.shading import ChamberShading, InterReflection
 from hsi_sc_nerf.simulate.effects.stages import Effect
 from hsi_sc_nerf.simulate.effects.surroundings import TexturedBackground
+from hsi_sc_nerf.simulate.effects.translucency import Translucency
 from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
 
 _ORDER: tuple[type[Effect], ...] = (
@@ -36,6 +40,11 @@ _ORDER: tuple[type[Effect], ...] = (
     MissingFrames,
     OffCentre,
     Deformation,
+    ChamberShading,
+    InterReflection,
+    Translucency,
+    Lamp,
+    Gloss,
     TexturedBackground,
     Drying,
     LampDrift,

@@ -32,7 +32,9 @@ from jaxtyping import Float
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, turntable_camera_to_world
 
 if TYPE_CHECKING:
+    from hsi_sc_nerf.simulate.lighting import HitLight, SurfaceLight
     from hsi_sc_nerf.simulate.materials import Material
+    from hsi_sc_nerf.simulate.render import Hits
 
 
 class Effect:
@@ -138,6 +140,26 @@ class LensEffect(Effect):
         raise NotImplementedError
 
 
+class LightEffect(Effect):
+    """Changes how much light each visible point sends to the camera, and of which colours."""
+
+
+class SurfaceLightEffect(LightEffect):
+    """Changes the light of the surface, which is the same from everywhere and turns with the object."""
+
+    def on_surface(self, light: SurfaceLight) -> SurfaceLight:
+        """The surface's light with the effect."""
+        raise NotImplementedError
+
+
+class ViewLightEffect(LightEffect):
+    """Changes what the surface's light becomes on its way to the camera; acts after those on the surface."""
+
+    def at_hits(self, hits: Hits, light: HitLight, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
+        """The light with the effect, where the camera's rays hit."""
+        raise NotImplementedError
+
+
 class ChamberEffect(Effect):
     """Puts something in front of the chamber's wall: it stands still in the image."""
 
@@ -233,7 +255,10 @@ class ReadoutEffect(Effect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Counts with the effect, not yet rounded or clipped; dark counts are in them already."""
+        """Counts with the effect, not yet rounded or clipped; dark counts are in them already.
+
+        ``counts`` (float32) may be overwritten.
+        """
         raise NotImplementedError
 
 
