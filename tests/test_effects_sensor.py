@@ -406,7 +406,8 @@ def by_definition(changed, renderer, exposure):
 
     if "photon_noise" in on:
         electrons = ((counts - DARK) * ELECTRONS_PER_COUNT).astype(np.float32)
-        counts = poisson(electrons, rng("photon_noise", exposure, 0)) / ELECTRONS_PER_COUNT + DARK
+        random = rng("photon_noise", exposure, 0)
+        counts = np.stack([poisson(line, random) for line in electrons]) / ELECTRONS_PER_COUNT + DARK
     if "dark_pattern" in on:
         counts = counts + 9.0 * rng("dark_pattern").standard_normal(counts.shape[1:], dtype=np.float32)
     if "read_noise" in on:

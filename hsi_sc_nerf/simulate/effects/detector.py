@@ -66,7 +66,8 @@ class DarkPattern(ReadoutEffect):
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
         """Add the pattern."""
-        return counts + context.maps["dark_offset"]
+        counts += context.maps["dark_offset"]
+        return counts
 
 
 @dataclass(frozen=True)
@@ -96,5 +97,6 @@ class BadPixels(ReadoutEffect):
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
         """Overwrite what the bad pixels read."""
-        counts = np.where(context.maps["dead"], np.float32(context.dark_level), counts)
-        return np.where(context.maps["hot"], np.float32(context.largest_count), counts)
+        counts[:, context.maps["dead"]] = context.dark_level
+        counts[:, context.maps["hot"]] = context.largest_count
+        return counts
