@@ -9,6 +9,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
+import numpy as np
 from rich.progress import track
 
 from hsi_sc_nerf import __version__
@@ -45,11 +46,11 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
     """
     session_dir = Path(session_dir)
     _check_free(session_dir)
-    stamp = hashlib.sha256(f"{__version__} {scene!r}".encode()).hexdigest()[:12]
-    building = session_dir.absolute().parent / f".partial-{stamp}-{session_dir.absolute().name}"
+    simulation = Simulation(scene)
+    building = session_dir.absolute().parent / f".partial-{_stamp(simulation)}-{session_dir.absolute().name}"
     try:
         building.mkdir(parents=True, exist_ok=True)
-        _write(Simulation(scene), building, progress)
+        _write(simulation, building, progress)
         _move_into_place(building, session_dir)
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
@@ -60,6 +61,15 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
         shutil.rmtree(building, ignore_errors=True)
         raise
     return session_dir
+
+
+def _stamp(simulation: Simulation) -> str:
+    """Tells sessions apart, so that a run never goes on with frames of another object or other effects."""
+    stamp = hashlib.sha256(f"{__version__} {simulation.scene!r}".encode())
+    # The scene has the path of a mesh of one's own, not what is in the file.
+    for array in (simulation.object_part.mesh.vertices, simulation.object_part.weights):
+        stamp.update(np.ascontiguousarray(array).tobytes())
+    return stamp.hexdigest()[:12]
 
 
 def _check_free(session_dir: Path) -> None:
@@ -118,7 +128,7 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
 def _session_values(scene: Scene, plan: FramePlan) -> dict[str, object]:
     """What the instrument can't tell, as a user would write it down."""
     return {
-        "object": scene.object.shape,
+        "object": scene.name,
         "nominal_step_deg": plan.nominal_step_deg,
         "direction": plan.direction,
         "marker_dictionary": scene.markers.dictionary,

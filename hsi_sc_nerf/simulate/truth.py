@@ -140,7 +140,7 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
     wavelengths_nm, materials = simulation.wavelengths_nm, simulation.materials
     layout = marker_layout(scene.markers, scene.container, scene.turntable)
     values = {
-        "object": scene.object.shape,
+        "object": scene.name,
         "intrinsics": dataclasses.asdict(simulation.intrinsics),
         "frames": [{"capture": name, "angle_deg": angle, "camera_to_world": c2w} for name, angle, c2w in frames],
         "marker_layout": {str(number): (c + simulation.offset_m).tolist() for number, c in layout.items()},
