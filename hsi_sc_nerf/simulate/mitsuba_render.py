@@ -26,6 +26,8 @@ except ImportError as error:
     raise InputError("Mitsuba is not installed; install it with: pip install 'hsi-sc-nerf[mitsuba]'.") from error
 
 mi.set_variant("scalar_spectral")
+# It warns of the slowness of integrators in Python, which small pictures can bear.
+mi.set_log_level(mi.LogLevel.Error)
 
 Transport = Literal["even", "chamber", "one_bounce", "many_bounces"]
 """How light comes to what is seen: evenly to every point; from the chamber, where nothing hides it; by way of one

@@ -1,0 +1,243 @@
+"""Our renderer against Mitsuba 3: one frame of a scene, rendered by both under each transport of light.
+
+    uv run --extra mitsuba python benchmarks/mitsuba_agreement.py --output-dir /tmp/agreement --scene pear
+
+Mitsuba renders each picture several times with other random numbers; their scatter is the Monte-Carlo error that the
+difference has to be judged by.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.simulate import mitsuba_render
+from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
+
+matplotlib.use("agg")
+import matplotlib.pyplot as plt
+
+BOTH = ("chamber_shading", "inter_reflection")
+COMPARISONS: dict[mitsuba_render.Transport, tuple[str, ...]] = {
+    "even": (),
+    "chamber": ("chamber_shading",),
+    "one_bounce": BOTH,
+    "many_bounces": BOTH,
+}
+"""Our effects beside each transport of Mitsuba's. Ours has one bounce at most, so that the last one must differ."""
+LARGEST_DIFFERENCE = 0.05
+"""End of the colour scale of the picture's differences."""
+
+
+@dataclass(frozen=True)
+class Ours:
+    """One frame as our renderer sees it.
+
+    Attributes:
+        radiance: relative to the white tarp's, the chamber as bright as in Mitsuba.
+        weights: share of each material in each pixel; the last one is the chamber.
+        materials: their names.
+        ray_grid: error of our evenly spaced rays (RMS), from two numbers of rays a pixel in even light.
+        seconds: for light and frame together.
+    """
+
+    radiance: Float[np.ndarray, "lines samples bands"]
+    weights: Float[np.ndarray, "lines samples materials"]
+    materials: tuple[str, ...]
+    ray_grid: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far two renderings of one frame are apart, in units of reflectance, where not the chamber alone is seen.
+
+    Attributes:
+        ours: our radiance.
+        mitsuba: the mean of its renderings.
+        rms: root mean square difference over pixels and bands.
+        monte_carlo: the part of it that Mitsuba's random numbers explain.
+        ray_grid: the part that our evenly spaced rays explain.
+        bias: mean of Mitsuba minus ours, and its standard error.
+        bias_of_material: the same for each material, pixels weighted by its share.
+        seconds: one rendering of ours, one of Mitsuba's.
+    """
+
+    ours: Float[np.ndarray, "lines samples bands"]
+    mitsuba: Float[np.ndarray, "lines samples bands"]
+    rms: float
+    monte_carlo: float
+    ray_grid: float
+    bias: tuple[float, float]
+    bias_of_material: dict[str, tuple[float, float]]
+    seconds: tuple[float, float]
+
+    @property
+    def expected(self) -> float:
+        """The difference that two right renderers would have."""
+        return float(np.hypot(self.monte_carlo, self.ray_grid))
+
+
+def render_ours(scene: Scene, frame: int) -> Ours:
+    """Render one frame under the scene's effects; with any, the chamber is a lamp of radiance 1 and seen as that."""
+    start = time.perf_counter()
+    simulation = Simulation(scene)
+    rendered = simulation.frame(frame)
+    radiance = rendered.light.radiance().astype(float)
+    seconds = time.perf_counter() - start
+    weights = rendered.material_weights
+    camera = dataclasses.replace(scene.camera, supersampling=max(1, scene.camera.supersampling - 1))
+    plain = Simulation(dataclasses.replace(scene, camera=camera, effects=()))
+    other_grid = (plain.frame(frame).material_weights - weights) @ rendered.endmembers
+    if scene.effects:
+        radiance += weights[..., -1:] * (1.0 - rendered.endmembers[-1])
+    ray_grid = _rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
+    return Ours(radiance, weights, simulation.materials, ray_grid, seconds)
+
+
+def compare(
+    scene: Scene, frame: int, transport: mitsuba_render.Transport, ours: Ours, rays_per_pixel: int, repeats: int
+) -> Agreement:
+    """Render one frame with Mitsuba and hold it against ours."""
+    start = time.perf_counter()
+    renders = np.stack(
+        [
+            mitsuba_render.render(scene, frame, transport, rays_per_pixel=rays_per_pixel, seed=seed)
+            for seed in track(range(repeats), f"{scene.name}, {transport}", transient=True)
+        ]
+    )
+    seconds = (time.perf_counter() - start) / repeats
+    difference = renders - ours.radiance
+    seen = ours.weights[..., -1] < 1.0
+    return Agreement(
+        ours=ours.radiance,
+        mitsuba=renders.mean(axis=0),
+        rms=_rms(difference.mean(axis=0)[seen]),
+        monte_carlo=_rms(renders.std(axis=0, ddof=1)[seen]) / np.sqrt(repeats),
+        ray_grid=ours.ray_grid,
+        bias=_weighted_mean(difference, seen.astype(float)),
+        bias_of_material={
+            name: _weighted_mean(difference, ours.weights[..., i])
+            for i, name in enumerate(ours.materials)
+            if ours.weights[..., i].any()
+        },
+        seconds=(ours.seconds, seconds),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _weighted_mean(
+    difference: Float[np.ndarray, "repeats lines samples bands"], weights: Float[np.ndarray, "lines samples"]
+) -> tuple[float, float]:
+    """Mean over pixels and bands, and its standard error from the scatter of each pixel's repeats."""
+    of_pixel = difference.mean(axis=-1)
+    variance = of_pixel.var(axis=0, ddof=1) / len(of_pixel)
+    mean = (of_pixel.mean(axis=0) * weights).sum() / weights.sum()
+    return float(mean), float(np.sqrt((variance * weights**2).sum()) / weights.sum())
+
+
+@dataclass(frozen=True)
+class MitsubaAgreement:
+    """Render one frame of a scene with our renderer and with Mitsuba 3 and compare them."""
+
+    output_dir: Path
+    """Folder for the picture and the JSON file."""
+    scene: str = "pear"
+    """A shipped scene's name, or a scene file; its effects are left out."""
+    frame: int = 0
+    """Which frame of the full turn."""
+    size_px: int = 64
+    """Side of the image."""
+    bands: int = 6
+    """Bands over the sensor's range."""
+    rays_per_pixel: int = 144
+    """Mitsuba's rays in each of its pictures; best a multiple of the bands, and the product of two near numbers."""
+    repeats: int = 4
+    """How many pictures Mitsuba makes of each; their scatter is the Monte-Carlo error."""
+    supersampling: int = 16
+    """Our rays along each side of a pixel."""
+
+    def main(self) -> None:
+        """Render, print the tables, write picture and JSON."""
+        scene = override(load_scene(self.scene), size_px=self.size_px, bands=self.bands, effects=())
+        scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, supersampling=self.supersampling))
+        ours = {
+            effects: render_ours(override(scene, effects=effects), self.frame)
+            for effects in track(dict.fromkeys(COMPARISONS.values()), f"{scene.name}, ours", transient=True)
+        }
+        found = {
+            transport: compare(scene, self.frame, transport, ours[effects], self.rays_per_pixel, self.repeats)
+            for transport, effects in COMPARISONS.items()
+        }
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        stem = self.output_dir / f"mitsuba-{scene.name}"
+        stem.with_suffix(".json").write_text(json.dumps(self._report(found), indent=1) + "\n", encoding="utf-8")
+        _picture(found, scene, stem.with_suffix(".png"))
+        _print(found)
+
+    def _report(self, found: dict[mitsuba_render.Transport, Agreement]) -> dict[str, Any]:
+        numbers = ("rms", "monte_carlo", "ray_grid", "expected", "bias", "bias_of_material", "seconds")
+        settings = {key: value for key, value in dataclasses.asdict(self).items() if key != "output_dir"}
+        return {
+            **settings,
+            "mitsuba": mitsuba_render.mi.__version__,
+            "transports": {name: {key: getattr(each, key) for key in numbers} for name, each in found.items()},
+        }
+
+
+def _print(found: dict[mitsuba_render.Transport, Agreement]) -> None:
+    table = Table("transport", "ours", "RMS", "expected", "Monte Carlo", "ray grid", "bias", "ours, s", "Mitsuba, s")
+    of_material = Table("bias ± standard error, 1e-3", *found)
+    for transport, each in found.items():
+        table.add_row(
+            transport,
+            ", ".join(COMPARISONS[transport]) or "no effect",
+            *(f"{value:.5f}" for value in (each.rms, each.expected, each.monte_carlo, each.ray_grid)),
+            f"{each.bias[0]:+.5f}",
+            *(f"{value:.1f}" for value in each.seconds),
+        )
+    for material in found["even"].bias_of_material:
+        row = [each.bias_of_material[material] for each in found.values()]
+        of_material.add_row(material, *(f"{1e3 * bias:+.2f} ± {1e3 * error:.2f}" for bias, error in row))
+    Console().print(table)
+    Console().print(of_material)
+
+
+def _picture(found: dict[mitsuba_render.Transport, Agreement], scene: Scene, path: Path) -> None:
+    """Ours, Mitsuba's and the difference, a row for each transport."""
+    centres_nm = mitsuba_render.sensor.band_centres_nm(scene.sensor.bands)
+    rgb = [int(np.abs(centres_nm - wanted_nm).argmin()) for wanted_nm in paper.PSEUDO_RGB_NM]
+    figure, axes = plt.subplots(len(found), 3, figsize=(7.0, 2.3 * len(found)), layout="constrained", squeeze=False)
+    for row, (transport, each) in zip(axes, found.items(), strict=True):
+        row[0].imshow(each.ours[..., rgb].clip(0.0, 1.0) ** (1.0 / 2.2))
+        row[1].imshow(each.mitsuba[..., rgb].clip(0.0, 1.0) ** (1.0 / 2.2))
+        difference = (each.mitsuba - each.ours).mean(axis=-1)
+        image = row[2].imshow(difference, cmap="RdBu_r", vmin=-LARGEST_DIFFERENCE, vmax=LARGEST_DIFFERENCE)
+        figure.colorbar(image, ax=row[2])
+        ours = " + ".join(COMPARISONS[transport]).replace("_", " ") or "no effect"
+        for axis, title in zip(row, (ours, f"Mitsuba: {transport}".replace("_", " "), "Mitsuba - ours"), strict=True):
+            axis.set_title(title, fontsize=8)
+            axis.set_axis_off()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(MitsubaAgreement).main()
