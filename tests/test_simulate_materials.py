@@ -1,14 +1,12 @@
 """Spectra carry the features they are named for; the sensor's counts follow its definition."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.scene import Sensor
-from hsi_sc_nerf.simulate.sensor import band_centres_nm, expose, lamp_photons, quantum_efficiency, white_signal
+from hsi_sc_nerf.simulate.sensor import band_centres_nm, digitise, lamp_photons, quantum_efficiency, white_signal
 
 WAVELENGTHS_NM = band_centres_nm(204)
 
@@ -70,16 +68,15 @@ def test_lamp_is_plancks_law():
 def test_white_peaks_at_its_level_and_dark_at_its():
     sensor = Sensor()
     signal = white_signal(sensor, WAVELENGTHS_NM)
-    white = expose(np.ones((1, 1)), np.ones((1, len(signal))), sensor, signal)[0]
+    white = digitise(signal + sensor.dark_level, sensor)
     assert white.dtype == np.uint16
     assert white.max() == round(0.82 * 4095)
     # Each band has signal enough to calibrate with.
     assert white.min() > sensor.dark_level + 90
-    assert (expose(np.zeros((1, 1)), np.ones((1, len(signal))), sensor, signal) == sensor.dark_level).all()
     assert (quantum_efficiency(WAVELENGTHS_NM) < 1.0).all()
 
 
-def test_counts_stop_at_the_largest():
-    sensor = dataclasses.replace(Sensor(), white_level=1.0)
-    signal = white_signal(sensor, WAVELENGTHS_NM)
-    assert expose(np.full((1, 1), 2.0), np.ones((1, len(signal))), sensor, signal).max() == 4095
+def test_counts_are_whole_and_stop_at_both_ends():
+    counts = digitise(np.array([-3.0, 0.4, 0.6, 4094.4, 4096.0, 1e9]), Sensor())
+    assert counts.dtype == np.uint16
+    assert counts.tolist() == [0, 0, 1, 4094, 4095, 4095]

@@ -205,7 +205,7 @@ class Simulation:
         """Counts of a signal (counts above dark), which is overwritten."""
         counts = signal
         counts += self.scene.sensor.dark_level
-        largest = 2**self.scene.sensor.bit_depth - 1
+        largest = sensor.largest_count(self.scene.sensor)
         for effect, rng in zip(self._readout, random, strict=True):
             context = stages.ReadoutContext(
                 largest_count=largest,
@@ -215,8 +215,7 @@ class Simulation:
                 rng=rng,
             )
             counts = effect.read_out(counts, context)
-        np.rint(counts, out=counts)
-        return np.clip(counts, 0, largest, out=counts).astype(np.uint16)
+        return sensor.digitise(counts, self.scene.sensor)
 
 
 def white_capture_weights(size_px: int) -> Float[np.ndarray, "lines samples 2"]:

@@ -35,8 +35,7 @@ def white_signal(
     signal = _electrons_of_white(sensor, wavelengths_nm)
     # The peak is that of the header's bands, even where a pixel sees another wavelength.
     peak = _electrons_of_white(sensor, band_centres_nm(sensor.bands)).max()
-    largest = 2**sensor.bit_depth - 1
-    return signal / peak * (sensor.white_level * largest - sensor.dark_level)
+    return signal / peak * (sensor.white_level * largest_count(sensor) - sensor.dark_level)
 
 
 def _electrons_of_white(
@@ -46,14 +45,12 @@ def _electrons_of_white(
     return lamp_photons(wavelengths_nm, sensor.lamp_temperature_k) * quantum_efficiency(wavelengths_nm)
 
 
-def expose(
-    weights: Float[np.ndarray, "*n materials"],
-    endmembers: Float[np.ndarray, "materials bands"],
-    sensor: Sensor,
-    signal_of_white: Float[np.ndarray, "bands"],
-) -> UInt16[np.ndarray, "*n bands"]:
-    """Counts of pixels that mix the materials by ``weights``."""
-    counts = weights.astype(np.float32) @ (endmembers * signal_of_white).astype(np.float32)
-    counts += sensor.dark_level
+def largest_count(sensor: Sensor) -> int:
+    """Where the digitiser stops."""
+    return 2**sensor.bit_depth - 1
+
+
+def digitise(counts: Float[np.ndarray, "*n"], sensor: Sensor) -> UInt16[np.ndarray, "*n"]:
+    """Whole counts from 0 to the largest; what it is given is overwritten."""
     np.rint(counts, out=counts)
-    return np.clip(counts, 0, 2**sensor.bit_depth - 1, out=counts).astype(np.uint16)
+    return np.clip(counts, 0, largest_count(sensor), out=counts).astype(np.uint16)
