@@ -16,8 +16,8 @@ from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 CREASE_DEG = 40.0
 """Facets that meet at more than this have points of their own along the edge: light changes at once there."""
 POINTS_AT_ONCE = 4096
-COVER_DISTANCE_M, COVER_SHARE = 0.001, 0.85
-"""A point is covered if this share of what it sees is nearer than this, or is seen from behind."""
+COVER_DISTANCE_M, COVER_SHARE = 0.001, 0.6
+"""A point is covered if this share of what it sees is seen from behind or, on the object's support, is so near."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -119,8 +119,10 @@ class Surface:
             hits = self.renderer.cast(start, along, directions)
             count = some.stop - some.start
             free[some] = 1.0 - np.bincount(hits.pixel, minlength=count) / directions
-            close = hits.is_behind | (hits.distance_m < COVER_DISTANCE_M)
-            covered[some] = np.bincount(hits.pixel, close, minlength=count) >= COVER_SHARE * directions
+            near = (hits.distance_m < COVER_DISTANCE_M) & ~self.is_object[some][hits.pixel]
+            covered[some] = (
+                np.bincount(hits.pixel, hits.is_behind | near, minlength=count) >= COVER_SHARE * directions
+            )
             seen.append(hits.mix(self.triangles, points, (~hits.is_behind).astype(np.float32)))
         uncover = self._from_uncovered_neighbours(covered)
         return Surroundings(uncover @ free, scipy.sparse.csr_array(uncover @ scipy.sparse.vstack(seen, format="csr")))

@@ -17,7 +17,7 @@ from hsi_sc_nerf.simulate.reading import between
 if TYPE_CHECKING:
     from hsi_sc_nerf.simulate.lighting import SurfaceLight
 
-DIRECTIONS = 64
+DIRECTIONS = 96
 
 
 @dataclass(frozen=True)
