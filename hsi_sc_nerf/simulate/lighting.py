@@ -7,6 +7,9 @@ radiance. With them the light of a pixel is the mean over its rays of
 
 where ``chamber_lit`` and ``lamp_lit``, as weights of colours, belong to the surface (`SurfaceLight`), and the factors
 ``chamber`` and ``lamp`` and what is mirrored depend on where camera and lamp stand (`HitLight`).
+
+They act in this order: shading by the chamber, inter-reflection of what is so lit, translucency of what a matte
+surface would then send; the lamp takes its share from the chamber; gloss lies over it all.
 """
 
 from __future__ import annotations
