@@ -203,14 +203,14 @@ class MitsubaAgreement:
 
 
 def _print(found: dict[mitsuba_render.Transport, Agreement]) -> None:
-    table = Table("transport", "ours", "RMS", "expected", "Monte Carlo", "ray grid", "bias", "ours, s", "Mitsuba, s")
-    of_material = Table("bias ± standard error, 1e-3", *found)
+    table = Table("1e-3", "RMS", "expected", "Monte Carlo", "ray grid", "bias", "our s", "its s")
+    of_material = Table("bias, 1e-3", *found)
     for transport, each in found.items():
+        numbers = (each.rms, each.expected, each.monte_carlo, each.ray_grid)
         table.add_row(
             transport,
-            ", ".join(COMPARISONS[transport]) or "no effect",
-            *(f"{value:.5f}" for value in (each.rms, each.expected, each.monte_carlo, each.ray_grid)),
-            f"{each.bias[0]:+.5f}",
+            *(f"{1e3 * value:.1f}" for value in numbers),
+            f"{1e3 * each.bias[0]:+.2f}",
             *(f"{value:.1f}" for value in each.seconds),
         )
     for material in found["even"].bias_of_material:

@@ -41,6 +41,18 @@ def test_matte_scene_in_even_light_agrees_within_monte_carlo_error(name):
         assert abs(bias) < 4.0 * error + 2e-4
 
 
+@pytest.mark.parametrize(
+    ("transport", "effects"),
+    [("chamber", ["chamber_shading"]), ("one_bounce", ["chamber_shading", "inter_reflection"])],
+)
+def test_shading_and_one_bounce_agree(transport, effects):
+    found = agreement(small("sphere"), transport, effects)
+    # Light at points a few mm apart is less sharp than Mitsuba's at the foot of things.
+    assert found.rms < 1.5 * found.expected
+    for bias, error in (found.bias, found.bias_of_material["matte_white"]):
+        assert abs(bias) < 4.0 * error + 2e-3
+
+
 def test_unseen_chamber_has_its_own_spectrum_in_even_light_and_is_the_lamp_otherwise():
     scene = small("sphere")
     level = mitsuba_agreement.render_ours(scene, 0).radiance[0, 0]
