@@ -35,7 +35,8 @@ class Light:
         spectra = (self.spectra * (signal[..., None, :] if signal.ndim else signal)).astype(np.float32)
         weights = self.weights[rows].astype(np.float32, copy=False)
         if spectra.ndim == 2:
-            radiance = weights @ spectra
+            # One large product: many small ones lose their time between the cores.
+            radiance = (weights.reshape(-1, len(spectra)) @ spectra).reshape(*weights.shape[:2], -1)
         else:
             # A table a sample: one product of matrices for each.
             radiance = np.matmul(weights.swapaxes(0, 1), spectra).swapaxes(0, 1).copy()
