@@ -1,3 +1,6 @@
+import dataclasses
+from pathlib import Path
+
 """Scene files: the shipped ones load, and bad ones are refused in one sentence."""
 
 import numpy as np
@@ -5,6 +8,7 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble
+from hsi_sc_nerf.simulate.effects import EFFECTS
 from hsi_sc_nerf.simulate.scene import SHIPPED_SCENES, load_scene, override, parse_scene
 from hsi_sc_nerf.simulate.target import marker_layout
 
@@ -76,7 +80,7 @@ def test_bad_scene_files_get_one_sentence(text, sentence):
 
 
 def test_a_scene_that_does_not_exist_is_named():
-    with pytest.raises(InputError, match="pineapple: neither a shipped scene .*pear, apple, maize"):
+    with pytest.raises(InputError, match=r"pineapple: neither a shipped scene .*pear, apple, maize"):
         load_scene("pineapple")
 
 
@@ -118,3 +122,11 @@ def test_layout_is_square_planar_distinct_and_faces_outwards():
         else:
             np.testing.assert_allclose(corners[:, 2], 0.0, atol=1e-15)
             assert inwards[2] < 0
+
+
+def test_every_effect_and_strength_is_documented():
+    page = (Path(__file__).parents[1] / "docs" / "effects.md").read_text(encoding="utf-8")
+    for name, effect in EFFECTS.items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
+        for strength in dataclasses.fields(effect):
+            assert f"`{strength.name}` ({strength.default:g})" in row
