@@ -1,7 +1,7 @@
+"""Scene files: the shipped ones load, and bad ones are refused in one sentence."""
+
 import dataclasses
 from pathlib import Path
-
-"""Scene files: the shipped ones load, and bad ones are refused in one sentence."""
 
 import numpy as np
 import pytest

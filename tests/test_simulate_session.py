@@ -187,7 +187,9 @@ def detect(image, enlarge):
 def test_enough_markers_are_found_in_small_images(name):
     scene = load_scene(name)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
-    found = [len(detect(green_image(scene, renderer, p), 4)) for p in assemble.frame_plan(scene).camera_to_world[:12:2]]
+    found = [
+        len(detect(green_image(scene, renderer, p), 4)) for p in assemble.frame_plan(scene).camera_to_world[:12:2]
+    ]
     assert min(found) >= 3
     assert np.mean(found) >= 5
 
