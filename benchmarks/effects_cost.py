@@ -50,7 +50,7 @@ class EffectsCost:
     """Scenes to measure on."""
     effects: tuple[str, ...] = tuple(EFFECTS)
     """Effects to measure."""
-    frames: int = 6
+    frames: int = 8
     """Frames in the turn."""
     size: int = 128
     """Width and height of the images, pixels."""

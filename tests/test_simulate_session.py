@@ -13,9 +13,10 @@ from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
-from hsi_sc_nerf.simulate import assemble, session
+from hsi_sc_nerf.simulate import assemble, own_mesh, session
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import Mesh, revolve
+from hsi_sc_nerf.simulate.objects import OwnMesh
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -109,6 +110,15 @@ def test_mesh_on_disk_is_the_object_on_the_lid(small_session):
     assert mesh.area_m2() == pytest.approx(truth.area_m2, rel=1e-6)
     assert mesh.vertices[:, 2].min() == pytest.approx(0.07)
     assert ply.get_surface_area() == pytest.approx(truth.area_m2, rel=1e-6)
+
+
+def test_mesh_on_disk_carries_its_materials_and_serves_as_a_mesh_of_ones_own(small_session):
+    part = assemble.object_part(load_scene("apple"))
+    again = OwnMesh("mesh", load_truth(small_session).mesh_path, part.materials)
+    mesh, weights = own_mesh.load(again)
+    assert mesh.volume_m3() == pytest.approx(part.mesh.volume_m3(), rel=1e-6)
+    # Reading orders the vertices anew.
+    np.testing.assert_allclose(np.sort(weights, axis=0), np.sort(part.weights, axis=0), atol=1e-6)
 
 
 def test_object_weights_are_only_where_the_object_is(small_session):

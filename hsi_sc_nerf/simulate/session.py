@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.progress import track
 
 from hsi_sc_nerf import __version__
@@ -46,7 +47,8 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
     """
     session_dir = Path(session_dir)
     _check_free(session_dir)
-    simulation = Simulation(scene)
+    with Console(stderr=True, quiet=not progress).status(f"preparing {scene.name} and its light"):
+        simulation = Simulation(scene)
     building = session_dir.absolute().parent / f".partial-{_stamp(simulation)}-{session_dir.absolute().name}"
     try:
         building.mkdir(parents=True, exist_ok=True)

@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float
+from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 from hsi_sc_nerf.simulate.frames import Frame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
 
 
@@ -53,8 +54,9 @@ class Truth:
 
     def mesh(self) -> Mesh:
         """The object alone, object frame, metres."""
-        read = o3d.io.read_triangle_mesh(str(self.mesh_path))
-        return Mesh(np.asarray(read.vertices), np.asarray(read.triangles))
+        read = PlyData.read(str(self.mesh_path))
+        vertices = np.stack([np.asarray(read["vertex"][axis], float) for axis in "xyz"], axis=-1)
+        return Mesh(vertices, np.stack(read["face"]["vertex_indices"]).astype(np.int32))
 
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
         """Share of each material in each pixel, summing to 1."""
@@ -157,7 +159,7 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         table = csv.writer(file)
         table.writerow(["wavelength_nm", *materials])
         table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
-    write_mesh(folder / "mesh.ply", mesh)
+    write_mesh(folder / "mesh.ply", simulation.object_part)
     maps: dict[str, Any] = {}
     for of_effect in simulation.detector_maps.values():
         maps |= of_effect
@@ -197,11 +199,12 @@ def pixels_path(session_dir: Path, capture: str) -> Path:
     return session_dir / "truth" / "pixels" / f"{capture}.npz"
 
 
-def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary PLY with its vertex normals."""
-    written = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles)
-    )
-    written.compute_vertex_normals()
-    if not o3d.io.write_triangle_mesh(str(path), written):
-        raise OSError(f"could not write {path}")
+def write_mesh(path: Path, part: Part) -> None:
+    """Write a part as binary PLY: vertices, and a property ``weight_NAME`` a material, as own meshes have them."""
+    names = ["x", "y", "z", *(f"weight_{name}" for name in part.materials)]
+    vertices = np.zeros(len(part.mesh.vertices), [(name, "f8" if name in "xyz" else "f4") for name in names])
+    for name, column in zip(names, np.column_stack([part.mesh.vertices, part.weights]).T, strict=True):
+        vertices[name] = column
+    faces = np.zeros(len(part.mesh.triangles), [("vertex_indices", "i4", (3,))])
+    faces["vertex_indices"] = part.mesh.triangles
+    PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(str(path))
