@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from hsi_sc_nerf.data.calibration import dark_counts, normalise
+from hsi_sc_nerf.data.calibration.reflectance import dark_counts, normalise
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.effects import EFFECTS
 from hsi_sc_nerf.simulate.frames import Capture, Simulation

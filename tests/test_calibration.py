@@ -8,13 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsi_sc_nerf.data.calibration import (
-    CalibrationConfig,
-    calibrate,
-    dark_counts,
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import calibrate, dark_counts, normalise
+from hsi_sc_nerf.data.calibration.white_reference import (
     deviation_map,
     find_coarse_roi,
-    normalise,
     smooth_spectrum,
     white_mask,
     white_reference,
@@ -191,7 +189,7 @@ def test_real_maize_kernel():
         for name in ("4-22-22_right_same_B73_top_00", "dark_reference_crop", "white_reference_crop")
     )
     reference = white_reference(Capture("white", white, dark), CONFIG)
-    reflectance = calibrate(Capture("kernel", kernel, dark), reference, CONFIG)
+    reflectance = calibrate(Capture("kernel", kernel, dark), reference.spectrum, CONFIG)
     assert reflectance.dtype == np.float32
     assert reflectance.min() >= 0.0
     assert reflectance.max() <= 1.0

@@ -11,7 +11,9 @@ import pytest
 from scipy import stats
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.calibration import CalibrationConfig, dark_counts, normalise, white_reference
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import dark_counts, normalise
+from hsi_sc_nerf.data.calibration.white_reference import white_reference
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.errors import InputError

@@ -11,12 +11,17 @@ from spectral.io import envi as spy
 from hsi_sc_nerf.data.atomic import write_png
 from hsi_sc_nerf.data.frames import border_spectrum
 from hsi_sc_nerf.data.packed import (
+    FLAGGED,
+    LARGEST_REFLECTANCE,
     REFLECTANCE_SCALE,
     Container,
     PackedDataset,
     PackedFrame,
+    PixelFlag,
     is_packed,
     open_packed,
+    pack,
+    unpack,
     write_packed_cube,
     write_transforms,
 )
@@ -31,15 +36,17 @@ def dataset(tmp_path) -> PackedDataset:
     rng = np.random.default_rng(0)
     frames = []
     for name in ("a", "b"):
-        write_packed_cube(tmp_path / "cubes" / f"{name}.hdr", rng.random((4, 5, 3)), WAVELENGTHS_NM)
+        write_packed_cube(tmp_path / "cubes" / f"{name}.hdr", pack(rng.random((4, 5, 3))), WAVELENGTHS_NM)
         write_png(tmp_path / "images" / f"{name}.png", rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
         write_png(tmp_path / "masks" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * 255)
+        write_png(tmp_path / "flags" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * PixelFlag.SATURATED)
         frames.append(
             PackedFrame(
                 capture=name,
                 image_path=tmp_path / "images" / f"{name}.png",
                 mask_path=tmp_path / "masks" / f"{name}.png",
                 cube_path=tmp_path / "cubes" / f"{name}.hdr",
+                flags_path=tmp_path / "flags" / f"{name}.png",
                 angle_deg=12.5,
                 reprojection_error_px=0.25,
                 camera_to_world=look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.1]),
@@ -120,9 +127,12 @@ def test_cubes_open_in_spy_as_reflectance(dataset):
     np.testing.assert_allclose(np.asarray(cube.load()), expected, atol=1e-5)
 
 
-def test_reflectance_outside_the_range_is_clipped(tmp_path):
-    write_packed_cube(tmp_path / "c.hdr", np.array([[[-0.5, 0.5, 7.0]]]), WAVELENGTHS_NM)
-    assert np.fromfile(tmp_path / "c.bip", "<u2").tolist() == [0, 32768, 65535]
+def test_packing_clips_and_flags(tmp_path):
+    packed = pack(np.array([-0.5, 0.5, 7.0, np.nan]))
+    assert packed.tolist() == [0, 25_000, 65_534, FLAGGED]
+    reflectance, valid = unpack(packed)
+    np.testing.assert_allclose(reflectance, [0.0, 0.5, LARGEST_REFLECTANCE, 0.0], rtol=1e-6)
+    assert valid.tolist() == [True, True, True, False]
 
 
 def test_is_packed(tmp_path, dataset):
@@ -169,6 +179,6 @@ def test_border_spectrum_is_the_background(tmp_path):
     foreground = np.zeros((64, 64), bool)
     foreground[:40, 10:50] = True
     reflectance[foreground] = 0.1
-    write_packed_cube(tmp_path / "c.hdr", reflectance, WAVELENGTHS_NM)
+    write_packed_cube(tmp_path / "c.hdr", pack(reflectance), WAVELENGTHS_NM)
     np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), [0.7, 0.8, 0.9], atol=1e-4)
     assert np.isnan(border_spectrum(tmp_path / "c.hdr", np.ones((64, 64), bool))).all()

@@ -26,7 +26,7 @@ from capture_factory import (
 )
 
 from hsi_sc_nerf.data import process as process_module
-from hsi_sc_nerf.data.calibration import CalibrationConfig
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, Container, open_packed
 from hsi_sc_nerf.data.process import ProcessConfig, process_session

@@ -13,10 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
-from hsi_sc_nerf.data.calibration import CalibrationConfig, WhiteReference, calibrate
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import calibrate
+from hsi_sc_nerf.data.calibration.white_reference import WhiteReference
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.masks import MaskConfig, foreground_score
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, write_packed_cube
+from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, pack, write_packed_cube
 from hsi_sc_nerf.data.pseudo_rgb import gray_image, pseudo_rgb
 from hsi_sc_nerf.data.session import Capture
 from hsi_sc_nerf.errors import InputError
@@ -28,6 +30,7 @@ class FramePaths:
 
     image: Path
     cube: Path
+    flags: Path
     mask: Path
     notes: Path
 
@@ -37,6 +40,7 @@ class FramePaths:
         return FramePaths(
             image=root / "images" / f"{capture}.png",
             cube=root / "cubes" / f"{capture}.hdr",
+            flags=root / "flags" / f"{capture}.png",
             mask=root / "masks" / f"{capture}.png",
             notes=root / ".notes" / f"{capture}.npz",
         )
@@ -85,8 +89,9 @@ def process_frame(
         InputError: the raw cube cannot be read or the disk is full.
     """
     wavelengths_nm = capture.cube.wavelengths_nm
-    reflectance = calibrate(capture, white, calibration)
-    write_packed_cube(paths.cube, reflectance, wavelengths_nm)
+    reflectance = calibrate(capture, white.spectrum, calibration)
+    write_packed_cube(paths.cube, pack(reflectance), wavelengths_nm)
+    write_png(paths.flags, np.zeros(reflectance.shape[:2], np.uint8))
     write_png(paths.image, pseudo_rgb(reflectance, wavelengths_nm, pseudo_rgb_nm))
     notes = FrameNotes(
         fingerprint,

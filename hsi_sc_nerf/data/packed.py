@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from enum import IntFlag
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,25 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
 from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 
 # Reflectance 1 in the packed cubes' uint16, as their headers say ("reflectance scale factor").
-REFLECTANCE_SCALE = 65535
+REFLECTANCE_SCALE = 50_000
+# A value that is no measurement, as their headers say ("data ignore value").
+FLAGGED = 65_535
+LARGEST_REFLECTANCE = (FLAGGED - 1) / REFLECTANCE_SCALE
 TRANSFORMS_NAME = "transforms.json"
+
+
+class PixelFlag(IntFlag):
+    """Why some band of a pixel is flagged; a pixel may have several."""
+
+    SATURATED = 1
+    DEAD = 2
+    NO_DATA = 4
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,7 @@ class PackedFrame:
         image_path: pseudo-RGB picture.
         mask_path: foreground mask.
         cube_path: header of the reflectance cube.
+        flags_path: picture of the pixels' flags.
         angle_deg: the turntable's angle relative to the first frame, counter-clockwise seen from above.
         reprojection_error_px: root mean square of the marker corners in this frame.
         camera_to_world: pose in the object frame, OpenGL axes, metres.
@@ -47,12 +61,13 @@ class PackedFrame:
     image_path: Path
     mask_path: Path
     cube_path: Path
+    flags_path: Path
     angle_deg: float
     reprojection_error_px: float
     camera_to_world: Float[np.ndarray, "4 4"]
 
     def cube(self) -> UInt16[np.ndarray, "lines samples bands"]:
-        """Memory map of reflectance times ``REFLECTANCE_SCALE``."""
+        """Memory map of reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none (`unpack`)."""
         return open_cube(self.cube_path).memmap()
 
     def mask(self) -> Bool[np.ndarray, "lines samples"]:
@@ -61,6 +76,13 @@ class PackedFrame:
         if mask is None:
             raise InputError(f"{self.mask_path}: is no readable mask; process the session again.")
         return mask > 127
+
+    def flags(self) -> UInt8[np.ndarray, "lines samples"]:
+        """`PixelFlag`s of each pixel."""
+        flags = cv2.imread(str(self.flags_path), cv2.IMREAD_GRAYSCALE)
+        if flags is None:
+            raise InputError(f"{self.flags_path}: is no readable picture of flags; process the session again.")
+        return flags.astype(np.uint8)
 
     def pseudo_rgb(self) -> UInt8[np.ndarray, "lines samples 3"]:
         """The pseudo-RGB picture."""
@@ -86,6 +108,10 @@ class PackedDataset:
         background_reflectance: median spectrum of the chamber behind the object.
         container: what the object stands on, if its size is known.
         frames: in capture order.
+        flagged_values: how many values of all cubes are ``FLAGGED``.
+        bad_bands_nm: centres of the file's bands that were left out because they measure nothing.
+        uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
+        typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
         fingerprint: of the session and the settings that this was made from.
     """
 
@@ -100,6 +126,10 @@ class PackedDataset:
     background_reflectance: Float[np.ndarray, "bands"]
     container: Container | None
     frames: tuple[PackedFrame, ...]
+    flagged_values: int = 0
+    bad_bands_nm: Float[np.ndarray, "bad"] = field(default_factory=lambda: np.zeros(0))
+    uncertainty: ReflectanceUncertainty | None = None
+    typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     fingerprint: str | None = None
 
     @property
@@ -136,7 +166,7 @@ def open_packed(path: Path) -> PackedDataset:
     if not dataset.frames:
         raise InputError(f"{path}: lists no frames; process the session again.")
     for frame in dataset.frames:
-        for file in (frame.image_path, frame.mask_path, frame.cube_path):
+        for file in (frame.image_path, frame.mask_path, frame.cube_path, frame.flags_path):
             if not file.is_file():
                 raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
     return dataset
@@ -168,11 +198,16 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "fingerprint": dataset.fingerprint,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
         "background_reflectance": dataset.background_reflectance.tolist(),
+        "bad_bands_nm": dataset.bad_bands_nm.tolist(),
+        "flagged_values": dataset.flagged_values,
+        "uncertainty": None if dataset.uncertainty is None else _as_lists(asdict(dataset.uncertainty)),
+        "typical_uncertainty": None if dataset.typical_uncertainty is None else dataset.typical_uncertainty.tolist(),
         "frames": [
             {
                 "file_path": relative(frame.image_path),
                 "mask_path": relative(frame.mask_path),
                 "cube_path": relative(frame.cube_path),
+                "flags_path": relative(frame.flags_path),
                 "capture": frame.capture,
                 "angle_deg": float(frame.angle_deg),
                 "reprojection_error_px": float(frame.reprojection_error_px),
@@ -186,26 +221,46 @@ def write_transforms(dataset: PackedDataset) -> Path:
     return path
 
 
+def pack(reflectance: Float[np.ndarray, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+    """Reflectance in [0, ``LARGEST_REFLECTANCE``] as 16-bit numbers, rounded; nan becomes ``FLAGGED``."""
+    flagged = np.isnan(reflectance)
+    counts = np.rint(np.where(flagged, 0.0, reflectance) * REFLECTANCE_SCALE)
+    return np.where(flagged, FLAGGED, np.clip(counts, 0, FLAGGED - 1)).astype(np.uint16)
+
+
+def unpack(
+    counts: UInt16[np.ndarray, "*shape"],
+) -> tuple[Float[np.ndarray, "*shape"], Bool[np.ndarray, "*shape"]]:
+    """Reflectance (float32, 0 where flagged) of packed numbers, and which of them are measurements."""
+    valid = counts != FLAGGED
+    reflectance = counts.astype(np.float32)
+    reflectance /= REFLECTANCE_SCALE
+    reflectance *= valid
+    return reflectance, valid
+
+
 def write_packed_cube(
     header_path: Path,
-    reflectance: Float[np.ndarray, "lines samples bands"],
+    counts: UInt16[np.ndarray, "lines samples bands"],
     wavelengths_nm: Float[np.ndarray, "bands"],
 ) -> None:
-    """Write reflectance in [0, 1] as a 16-bit BIP ENVI cube (rounded to 1 / ``REFLECTANCE_SCALE``).
+    """Write packed reflectance (`pack`) as a 16-bit BIP ENVI cube.
 
     Raises:
         InputError: the operating system refused to write.
     """
-    counts = np.clip(reflectance, 0.0, 1.0)
-    counts *= REFLECTANCE_SCALE
     write_cube(
         header_path,
-        np.rint(counts, out=counts).astype(np.uint16),
+        counts,
         wavelengths_nm=wavelengths_nm,
         interleave="bip",
         data_suffix=".bip",
-        extra_header={"reflectance scale factor": REFLECTANCE_SCALE},
+        extra_header={"reflectance scale factor": REFLECTANCE_SCALE, "data ignore value": FLAGGED},
     )
+
+
+def _as_lists(arrays: dict[str, Any]) -> dict[str, Any]:
+    return {name: array.tolist() for name, array in arrays.items()}
 
 
 def _transforms_path(path: Path) -> Path:
@@ -215,7 +270,8 @@ def _transforms_path(path: Path) -> Path:
 
 def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
     intrinsics = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
-    container = content["container"]
+    container, uncertainty = content["container"], content["uncertainty"]
+    typical = content["typical_uncertainty"]
     wavelengths_nm = np.array(content["wavelengths_nm"], dtype=float)
     return PackedDataset(
         root=root,
@@ -228,12 +284,21 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
         object_box_m=np.array(content["object_box_m"], dtype=float).reshape(2, 3),
         background_reflectance=np.array(content["background_reflectance"], float).reshape(wavelengths_nm.shape),
         container=None if container is None else Container(container["diameter_m"], container["height_m"]),
+        flagged_values=int(content["flagged_values"]),
+        bad_bands_nm=np.array(content["bad_bands_nm"], dtype=float),
+        uncertainty=None
+        if uncertainty is None
+        else ReflectanceUncertainty(
+            **{field.name: np.array(uncertainty[field.name], float) for field in fields(ReflectanceUncertainty)}
+        ),
+        typical_uncertainty=None if typical is None else np.array(typical, float).reshape(wavelengths_nm.shape),
         frames=tuple(
             PackedFrame(
                 capture=str(frame["capture"]),
                 image_path=root / frame["file_path"],
                 mask_path=root / frame["mask_path"],
                 cube_path=root / frame["cube_path"],
+                flags_path=root / frame["flags_path"],
                 angle_deg=float(frame["angle_deg"]),
                 reprojection_error_px=float(frame["reprojection_error_px"]),
                 camera_to_world=np.array(frame["transform_matrix"], dtype=float).reshape(4, 4),

@@ -15,7 +15,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import write_json, write_png
-from hsi_sc_nerf.data.calibration import CalibrationConfig, WhiteReference, white_reference
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.white_reference import WhiteReference, white_reference
 from hsi_sc_nerf.data.fingerprint import capture_files, fingerprint, session_fingerprint
 from hsi_sc_nerf.data.frames import FrameNotes, FramePaths, border_spectrum, finished_notes, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask
@@ -244,6 +245,7 @@ def _posed_frames(output_dir: Path, names: Sequence[str], poses: TurntablePoses)
                 image_path=paths.image,
                 mask_path=paths.mask,
                 cube_path=paths.cube,
+                flags_path=paths.flags,
                 angle_deg=float(poses.angles_deg[i]),
                 reprojection_error_px=float(poses.reprojection_error_px[i]),
                 camera_to_world=poses.camera_to_world[i],

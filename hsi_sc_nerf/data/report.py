@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
-from hsi_sc_nerf.data.calibration import WhiteReference
+from hsi_sc_nerf.data.calibration.white_reference import WhiteReference
 from hsi_sc_nerf.data.envi import Cube
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands, to_8_bit
 

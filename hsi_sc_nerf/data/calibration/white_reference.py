@@ -1,7 +1,7 @@
-"""White-reference calibration: the paper's Algorithm 1, one function a step.
+"""The spectrum of the white tarp: steps 1 to 5 of the paper's Algorithm 1, a function each.
 
-Dark counts, where there is a dark cube, are taken off the object's and the tarp's counts before the one is
-divided by the other. The spatial steps (ROI, deviation, mask) use the tarp's counts as they are.
+The spatial steps (ROI, deviation, mask) use the tarp's counts as they are; dark counts, where there is a dark cube,
+are taken off its mean spectrum.
 """
 
 from __future__ import annotations
@@ -11,36 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
-from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import dark_counts
 from hsi_sc_nerf.data.regions import ellipse_close_open, largest_component
 from hsi_sc_nerf.data.session import Capture
 from hsi_sc_nerf.errors import InputError
-
-
-@dataclass(frozen=True)
-class CalibrationConfig:
-    """Settings of the white-reference calibration; the defaults are the paper's."""
-
-    roi: tuple[int, int, int, int] | None = None
-    """Where the white tarp is in its image: x0 y0 x1 y1 in pixels, x1 and y1 excluded. Found by itself if not
-    given."""
-    percentile: float = paper.WHITE_PERCENTILE
-    """How much of the tarp is kept: the share (in percent) of its pixels that deviate least from its mean."""
-    morphology_min_px: int = paper.WHITE_MORPHOLOGY_MIN_PX
-    """Smallest diameter of the ellipse that closes and opens the tarp's mask, pixels."""
-    morphology_fraction: int = paper.WHITE_MORPHOLOGY_FRACTION
-    """The ellipse's diameter is the tarp's shorter side divided by this, where that is larger."""
-    smoothing_bands: int = paper.WHITE_SMOOTHING_BANDS
-    """Width of the moving average along the white spectrum, bands; 1 leaves the spectrum as measured."""
-    smoothing_max_nm: float = 15.0
-    """The moving average spans no more than this, nm: five bands of a camera with few, broad bands would smooth the
-    lamp's own spectrum away. The paper's five bands span 12 nm."""
-    bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
-    """Reflectance is clipped to these."""
-    roi_brightness: float = 0.5
-    """The tarp is looked for where the image is brighter than this share of its brightest part."""
-    max_deviation: float = 0.5
-    """A tarp whose kept pixels deviate from their mean by more than this (relative) is refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,37 +88,6 @@ def smooth_spectrum(
     return smoothed
 
 
-def dark_counts(
-    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int
-) -> Float[np.ndarray, "1 columns bands"] | None:
-    """What the sensor counts without light: the mean over the dark cube's lines, for each sample and band.
-
-    A dark cube of another width cannot be matched sample by sample and gives one spectrum (columns = 1).
-    """
-    if dark is None:
-        return None
-    over_lines = dark.mean(axis=0, keepdims=True, dtype=np.float64)
-    columns = over_lines if dark.shape[1] == samples else over_lines.mean(axis=1, keepdims=True)
-    return columns.astype(np.float32)
-
-
-def normalise(
-    counts: Num[np.ndarray, "lines samples bands"],
-    dark: Float[np.ndarray, "1 columns bands"] | None,
-    white: Float[np.ndarray, "bands"],
-    bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS,
-) -> Float[np.ndarray, "lines samples bands"]:
-    """Step 6: reflectance (S - D) / (W - D), clipped to ``bounds``; float32.
-
-    ``white`` is W - D, positive in each band (``white_reference`` sees to it).
-    """
-    reflectance = np.array(counts, dtype=np.float32, order="C")
-    if dark is not None:
-        reflectance -= dark
-    reflectance /= white.astype(np.float32)
-    return np.clip(reflectance, *bounds, out=reflectance)
-
-
 def white_reference(capture: Capture, config: CalibrationConfig) -> WhiteReference:
     """Steps 1 to 5 on the capture of the white tarp.
 
@@ -187,12 +131,3 @@ def white_reference(capture: Capture, config: CalibrationConfig) -> WhiteReferen
         )
     smoothed = smooth_spectrum(measured, capture.cube.wavelengths_nm, config.smoothing_bands, config.smoothing_max_nm)
     return WhiteReference(roi, deviation, mask, measured, smoothed)
-
-
-def calibrate(
-    capture: Capture, white: WhiteReference, config: CalibrationConfig
-) -> Float[np.ndarray, "lines samples bands"]:
-    """Reflectance of a frame, read from disk and normalised with the tarp's spectrum."""
-    counts = capture.cube.memmap()
-    dark = dark_counts(None if capture.dark is None else capture.dark.memmap(), counts.shape[1])
-    return normalise(counts, dark, white.spectrum, config.bounds)

@@ -1,0 +1,1 @@
+"""From counts to reflectance: white and dark references, defects, drift of the lamps, uncertainty."""
