@@ -9,6 +9,7 @@ import pytest
 from spectral.io import envi as spy
 
 from hsi_sc_nerf.data.atomic import write_png
+from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
 from hsi_sc_nerf.data.frames import border_spectrum
 from hsi_sc_nerf.data.packed import (
     FLAGGED,
@@ -64,6 +65,11 @@ def dataset(tmp_path) -> PackedDataset:
         background_reflectance=np.array([0.9, 0.91, 0.92]),
         container=Container(0.09, 0.07),
         frames=tuple(frames),
+        flagged_values=7,
+        bad_bands_nm=np.array([397.5, 1003.5]),
+        fwhm_nm=np.array([7.0, 7.1, 7.2]),
+        uncertainty=ReflectanceUncertainty(*np.array([[1e-6, 2e-6, 3e-6], [1e-5, 2e-5, 3e-5], [1e-4, 2e-4, 3e-4]])),
+        typical_uncertainty=np.array([0.004, 0.005, 0.006]),
         fingerprint="f00",
     )
 
@@ -89,6 +95,29 @@ def test_round_trip(dataset, container):
             ("a", 12.5, 0.25),
             ("b", 12.5, 0.25),
         ]
+        assert [f.flags_path for f in opened.frames] == [f.flags_path for f in dataset.frames]
+
+
+def test_round_trip_of_what_calibration_found(dataset):
+    opened = open_packed(write_transforms(dataset))
+    assert opened.flagged_values == 7
+    for name in ("bad_bands_nm", "fwhm_nm", "typical_uncertainty"):
+        np.testing.assert_array_equal(getattr(opened, name), getattr(dataset, name))
+    for name in ("constant", "linear", "quadratic"):
+        np.testing.assert_array_equal(getattr(opened.uncertainty, name), getattr(dataset.uncertainty, name))
+    unknown = replace(dataset, fwhm_nm=None, uncertainty=None, typical_uncertainty=None, bad_bands_nm=np.zeros(0))
+    opened = open_packed(write_transforms(unknown))
+    assert (opened.fwhm_nm, opened.uncertainty, opened.typical_uncertainty) == (None, None, None)
+    assert opened.bad_bands_nm.shape == (0,)
+
+
+def test_flags(dataset):
+    flags = open_packed(write_transforms(dataset)).frames[0].flags()
+    assert flags.dtype == np.uint8
+    np.testing.assert_array_equal(flags == PixelFlag.SATURATED, np.eye(4, 5, dtype=bool))
+    dataset.frames[0].flags_path.write_bytes(b"")
+    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture of flags"):
+        dataset.frames[0].flags()
 
 
 def test_nerfstudio_keys(dataset):
@@ -123,8 +152,15 @@ def test_cubes_open_in_spy_as_reflectance(dataset):
     assert cube.metadata["interleave"] == "bip"
     assert header.with_suffix(".bip").is_file()
     assert float(cube.metadata["reflectance scale factor"]) == REFLECTANCE_SCALE
+    assert int(cube.metadata["data ignore value"]) == FLAGGED
+    assert "fwhm" not in cube.metadata
     expected = np.random.default_rng(0).random((4, 5, 3))
     np.testing.assert_allclose(np.asarray(cube.load()), expected, atol=1e-5)
+
+
+def test_widths_of_the_bands_are_in_the_header(tmp_path):
+    write_packed_cube(tmp_path / "c.hdr", pack(np.ones((2, 2, 3))), WAVELENGTHS_NM, np.array([7.0, 7.125, 8.0]))
+    assert spy.open(str(tmp_path / "c.hdr")).bands.bandwidths == [7.0, 7.125, 8.0]
 
 
 def test_packing_clips_and_flags(tmp_path):
@@ -151,8 +187,23 @@ def test_is_packed(tmp_path, dataset):
         (lambda c: c.pop("fl_x"), "lacks the key 'fl_x'"),
         (lambda c: c.pop("object_box_m"), "lacks the key 'object_box_m'"),
         (lambda c: c["frames"][0].pop("cube_path"), "lacks the key 'cube_path'"),
-        (lambda c: c.update(scene_box_m=[1, 2]), "cannot be read"),
-        (lambda c: c.update(background_reflectance=[1, 2]), "cannot be read"),
+        (lambda c: c.update(scene_box_m=[1, 2]), r"cannot be read \(scene_box_m is no list of 2 x 3 numbers\)"),
+        (
+            lambda c: c.update(background_reflectance=[1, 2]),
+            "cannot be read .background_reflectance is no list",
+        ),
+        (lambda c: c.pop("flagged_values"), "lacks the key 'flagged_values'"),
+        (lambda c: c.update(flagged_values=None), "cannot be read"),
+        (lambda c: c.pop("bad_bands_nm"), "lacks the key 'bad_bands_nm'"),
+        (lambda c: c.update(bad_bands_nm=["red"]), r"cannot be read \(bad_bands_nm is no list of numbers"),
+        (lambda c: c.pop("fwhm_nm"), "lacks the key 'fwhm_nm'"),
+        (lambda c: c.update(fwhm_nm=[7.0]), r"cannot be read \(fwhm_nm is no list of 3 numbers\)"),
+        (lambda c: c.pop("uncertainty"), "lacks the key 'uncertainty'"),
+        (lambda c: c["uncertainty"].pop("linear"), "lacks the key 'linear'"),
+        (lambda c: c["uncertainty"].update(linear=[1.0]), r"cannot be read \(linear is no list of 3 numbers\)"),
+        (lambda c: c.update(uncertainty=[1.0]), "cannot be read"),
+        (lambda c: c.update(typical_uncertainty=0.01), r"cannot be read \(typical_uncertainty is no list of 3"),
+        (lambda c: c["frames"][0].pop("flags_path"), "lacks the key 'flags_path'"),
         (lambda c: c.update(frames=[]), "lists no frames"),
         (lambda c: c["frames"][0].update(angle_deg=None), "cannot be read"),
     ],
@@ -168,9 +219,11 @@ def test_missing_files(tmp_path, dataset):
     with pytest.raises(InputError, match="no packed dataset here"):
         open_packed(tmp_path)
     write_transforms(dataset)
-    (tmp_path / "masks" / "b.png").unlink()
-    with pytest.raises(InputError, match=r"b\.png: is missing"):
-        open_packed(tmp_path)
+    for folder in ("masks", "flags"):
+        (tmp_path / folder / "b.png").rename(tmp_path / "elsewhere.png")
+        with pytest.raises(InputError, match=rf"{folder}.b\.png: is missing"):
+            open_packed(tmp_path)
+        (tmp_path / "elsewhere.png").rename(tmp_path / folder / "b.png")
 
 
 def test_border_spectrum_is_the_background(tmp_path):

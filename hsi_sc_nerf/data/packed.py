@@ -110,6 +110,7 @@ class PackedDataset:
         frames: in capture order.
         flagged_values: how many values of all cubes are ``FLAGGED``.
         bad_bands_nm: centres of the file's bands that were left out because they measure nothing.
+        fwhm_nm: full widths at half maximum of the bands; None where the session does not tell.
         uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
         typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
         fingerprint: of the session and the settings that this was made from.
@@ -128,6 +129,7 @@ class PackedDataset:
     frames: tuple[PackedFrame, ...]
     flagged_values: int = 0
     bad_bands_nm: Float[np.ndarray, "bad"] = field(default_factory=lambda: np.zeros(0))
+    fwhm_nm: Float[np.ndarray, "bands"] | None = None
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     fingerprint: str | None = None
@@ -197,10 +199,13 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "container": None if dataset.container is None else asdict(dataset.container),
         "fingerprint": dataset.fingerprint,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
+        "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
         "background_reflectance": dataset.background_reflectance.tolist(),
         "bad_bands_nm": dataset.bad_bands_nm.tolist(),
         "flagged_values": dataset.flagged_values,
-        "uncertainty": None if dataset.uncertainty is None else _as_lists(asdict(dataset.uncertainty)),
+        "uncertainty": None
+        if dataset.uncertainty is None
+        else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
         "typical_uncertainty": None if dataset.typical_uncertainty is None else dataset.typical_uncertainty.tolist(),
         "frames": [
             {
@@ -243,24 +248,22 @@ def write_packed_cube(
     header_path: Path,
     counts: UInt16[np.ndarray, "lines samples bands"],
     wavelengths_nm: Float[np.ndarray, "bands"],
+    fwhm_nm: Float[np.ndarray, "bands"] | None = None,
 ) -> None:
-    """Write packed reflectance (`pack`) as a 16-bit BIP ENVI cube.
+    """Write packed reflectance (`pack`) as a 16-bit BIP ENVI cube; the header gets the bands' widths, if known.
 
     Raises:
         InputError: the operating system refused to write.
     """
+    widths = {} if fwhm_nm is None else {"fwhm": [float(width) for width in fwhm_nm]}
     write_cube(
         header_path,
         counts,
         wavelengths_nm=wavelengths_nm,
         interleave="bip",
         data_suffix=".bip",
-        extra_header={"reflectance scale factor": REFLECTANCE_SCALE, "data ignore value": FLAGGED},
+        extra_header={"reflectance scale factor": REFLECTANCE_SCALE, "data ignore value": FLAGGED, **widths},
     )
-
-
-def _as_lists(arrays: dict[str, Any]) -> dict[str, Any]:
-    return {name: array.tolist() for name, array in arrays.items()}
 
 
 def _transforms_path(path: Path) -> Path:
@@ -268,30 +271,44 @@ def _transforms_path(path: Path) -> Path:
     return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
 
 
+def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
+    """The numbers under ``key``, in ``shape`` (-1: however many there are)."""
+    try:
+        return np.array(content[key], dtype=float).reshape(shape)
+    except (TypeError, ValueError) as error:
+        wanted = " x ".join(str(size) for size in shape if size >= 0)
+        raise ValueError(f"{key} is no list of {wanted} numbers".replace("  ", " ")) from error
+
+
+def _numbers_or_none(content: dict[str, Any], key: str, *shape: int) -> np.ndarray | None:
+    return None if content[key] is None else _numbers(content, key, *shape)
+
+
 def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
     intrinsics = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
     container, uncertainty = content["container"], content["uncertainty"]
-    typical = content["typical_uncertainty"]
-    wavelengths_nm = np.array(content["wavelengths_nm"], dtype=float)
+    wavelengths_nm = _numbers(content, "wavelengths_nm", -1)
+    bands = len(wavelengths_nm)
     return PackedDataset(
         root=root,
         intrinsics=PinholeIntrinsics(**intrinsics),
         distortion=np.array([content[key] for key in ("k1", "k2", "p1", "p2")], dtype=float),
         wavelengths_nm=wavelengths_nm,
-        pseudo_rgb_nm=np.array(content["pseudo_rgb_nm"], dtype=float).reshape(3),
+        pseudo_rgb_nm=_numbers(content, "pseudo_rgb_nm", 3),
         object_name=str(content["object"]),
-        scene_box_m=np.array(content["scene_box_m"], dtype=float).reshape(2, 3),
-        object_box_m=np.array(content["object_box_m"], dtype=float).reshape(2, 3),
-        background_reflectance=np.array(content["background_reflectance"], float).reshape(wavelengths_nm.shape),
+        scene_box_m=_numbers(content, "scene_box_m", 2, 3),
+        object_box_m=_numbers(content, "object_box_m", 2, 3),
+        background_reflectance=_numbers(content, "background_reflectance", bands),
         container=None if container is None else Container(container["diameter_m"], container["height_m"]),
         flagged_values=int(content["flagged_values"]),
-        bad_bands_nm=np.array(content["bad_bands_nm"], dtype=float),
+        bad_bands_nm=_numbers(content, "bad_bands_nm", -1),
+        fwhm_nm=_numbers_or_none(content, "fwhm_nm", bands),
         uncertainty=None
         if uncertainty is None
         else ReflectanceUncertainty(
-            **{field.name: np.array(uncertainty[field.name], float) for field in fields(ReflectanceUncertainty)}
+            **{field.name: _numbers(uncertainty, field.name, bands) for field in fields(ReflectanceUncertainty)}
         ),
-        typical_uncertainty=None if typical is None else np.array(typical, float).reshape(wavelengths_nm.shape),
+        typical_uncertainty=_numbers_or_none(content, "typical_uncertainty", bands),
         frames=tuple(
             PackedFrame(
                 capture=str(frame["capture"]),
@@ -301,7 +318,7 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
                 flags_path=root / frame["flags_path"],
                 angle_deg=float(frame["angle_deg"]),
                 reprojection_error_px=float(frame["reprojection_error_px"]),
-                camera_to_world=np.array(frame["transform_matrix"], dtype=float).reshape(4, 4),
+                camera_to_world=_numbers(frame, "transform_matrix", 4, 4),
             )
             for frame in content["frames"]
         ),
