@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,8 @@ TARP_MARGIN = 0.08
 """Share of the image's side that the tarp leaves free along each edge."""
 PERFECT_DARK_LINES, DARK_LINES = 1, 64
 """Lines of a dark cube: of a perfect sensor, whose lines are all the same, and of any other."""
+WHITE_EXPOSURE = 0
+"""Number of the white tarp's exposure; the frames follow."""
 LIGHT_STEP_M = 0.0025
 """Light that is computed at points of the surface runs straight between points that are no further apart."""
 LINES_AT_ONCE = 64
@@ -38,11 +41,13 @@ class Capture:
         counts: the cube.
         dark: its dark cube.
         light: the noise-free light on the sensor, as the counts lie in the file.
+        integration_time_ms: how long the sensor collected light.
     """
 
     counts: UInt16[np.ndarray, "lines samples bands"]
     dark: UInt16[np.ndarray, "dark_lines samples bands"]
     light: Light
+    integration_time_ms: float
 
 
 @dataclass(frozen=True)
@@ -96,10 +101,7 @@ class Simulation:
         for detector in of_stage(effects, stages.DetectorEffect):
             self._seen_nm = detector.wavelengths_nm(self._seen_nm, scene.camera.size_px)
         self._signal_of_white = sensor.white_signal(scene.sensor, self._seen_nm)
-        self.integration_time_ms = paper.INTEGRATION_TIME_MS
-        for exposure in of_stage(effects, stages.ExposureEffect):
-            self._signal_of_white = self._signal_of_white * exposure.factor()
-            self.integration_time_ms *= exposure.factor()
+        self._exposures = of_stage(effects, stages.ExposureEffect)
         self.detector_maps = {
             effect.name: effect.detector_maps(
                 scene.camera.size_px, scene.sensor.bands, effect_rng(scene.seed, effect)
@@ -108,6 +110,16 @@ class Simulation:
         }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
         self._seen_endmembers = self._seen_spectra(self.materials)
+
+    @property
+    def integration_time_ms(self) -> float:
+        """Integration time of the frames."""
+        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=False)
+
+    @property
+    def white_integration_time_ms(self) -> float:
+        """Integration time of the white tarp's capture."""
+        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=True)
 
     def frame(self, number: int) -> Frame:
         """The capture of one frame of the plan."""
@@ -140,13 +152,16 @@ class Simulation:
             light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._seen_nm))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
-        return Frame(counts, dark, light, weights, coverage, self.endmembers)
+        return Frame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
 
     def white(self) -> Capture:
         """The capture of the white tarp, before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
         light = self._on_sensor(Light(weights, self._seen_spectra(WHITE_MATERIALS)), elapsed=0.0)
-        return Capture(*self._expose(light, 0), light)
+        return Capture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
+
+    def _exposure_factor(self, of_white: bool) -> float:
+        return math.prod(exposure.factor(of_white) for exposure in self._exposures)
 
     def _seen_spectra(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
         """Spectra as the detector sees them: a table, or one a sample where its wavelengths differ."""
@@ -189,11 +204,12 @@ class Simulation:
         """Counts of an image, and of the shutter."""
         lines, samples = light.weights.shape[:2]
         bands = len(self.wavelengths_nm)
+        signal_of_white = self._signal_of_white * self._exposure_factor(of_white=exposure == WHITE_EXPOSURE)
         counts = np.empty((lines, samples, bands), np.uint16)
         random = [effect_rng(self.scene.seed, effect, exposure, 0) for effect in self._readout]
         for first in range(0, lines, LINES_AT_ONCE):
             rows = slice(first, first + LINES_AT_ONCE)
-            counts[rows] = self._digitise(light.radiance(rows, self._signal_of_white), random)
+            counts[rows] = self._digitise(light.radiance(rows, signal_of_white), random)
         random = [effect_rng(self.scene.seed, effect, exposure, 1) for effect in self._readout]
         dark_lines = DARK_LINES if self._readout else PERFECT_DARK_LINES
         dark = self._digitise(np.zeros((dark_lines, samples, bands), np.float32), random)

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
-from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile
+from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile, TarpExposure
 from hsi_sc_nerf.simulate.effects.gloss import Gloss
 from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
 from hsi_sc_nerf.simulate.effects.lamp import Lamp
@@ -54,6 +54,7 @@ _ORDER: tuple[type[Effect], ...] = (
     ImageRotation,
     SpectralSmile,
     Saturation,
+    TarpExposure,
     PhotonNoise,
     DarkPattern,
     ReadNoise,

@@ -36,18 +36,35 @@ class SpectralSmile(DetectorEffect):
 class Saturation(ExposureEffect):
     """The integration time is too long: what is too bright stops at the largest count.
 
-    A session has one integration time, as the paper's (10 ms): it was set for a dark object, and the white tarp is
-    taken with it as well. So calibration stays right wherever neither the object nor the tarp stops; a tarp at 0.82
-    of the largest count stops, in its brightest bands, from a factor of about 1.2 on.
+    It lengthens the integration time of the whole session, white tarp included, because the paper's session has one
+    (10 ms), here set for a dark object. So calibration stays right wherever neither the object nor the tarp stops; a
+    tarp at 0.82 of the largest count stops, in its brightest bands, from a factor of about 1.2 on. `tarp_exposure`
+    gives the tarp a time of its own.
     """
 
     name: ClassVar[str] = "saturation"
     exposure_factor: float = between(1.0, 100.0, default=1.5)
     """Integration time over the one at which the tarp counts the sensor's ``white_level``."""
 
-    def factor(self) -> float:
-        """`exposure_factor`."""
+    def factor(self, of_white: bool) -> float:
+        """`exposure_factor`, in all captures."""
         return self.exposure_factor
+
+
+@dataclass(frozen=True)
+class TarpExposure(ExposureEffect):
+    """The white tarp is taken with another integration time than the frames, as one sets it by hand for each.
+
+    The metadata of each capture states its own; reflectance is off by the factor for who does not read them.
+    """
+
+    name: ClassVar[str] = "tarp_exposure"
+    exposure_factor: float = between(0.01, 100.0, default=0.5)
+    """Integration time of the white tarp over that of the frames."""
+
+    def factor(self, of_white: bool) -> float:
+        """`exposure_factor` for the tarp; the frames keep theirs."""
+        return self.exposure_factor if of_white else 1.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +91,8 @@ class DarkPattern(ReadoutEffect):
 class BadPixels(ReadoutEffect):
     """Some detector pixels do not follow the light: dead ones stay at the dark level, hot ones at the largest count.
 
-    A detector pixel is one sample in one band, so each is a line across the image of its band.
+    A detector pixel is one sample in one band, so each is a line across the image of its band. Whole bands can be
+    dead, too.
     """
 
     name: ClassVar[str] = "bad_pixels"
@@ -82,16 +100,26 @@ class BadPixels(ReadoutEffect):
     """Share of the detector pixels that are dead."""
     hot_share: float = between(0.0, 0.5, default=0.0005)
     """Share of the detector pixels that are hot."""
+    dead_bands: int = between(0, 2048, default=0)
+    """Number of bands that are dead in all samples."""
 
     def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """``dead`` and ``hot``: which pixels are, never both; their numbers are the shares, rounded."""
+        """``dead`` and ``hot``: which pixels are, never both.
+
+        Their numbers are the shares, rounded; the pixels of dead bands come on top and are dead, not hot.
+        """
         pixels = samples * bands
         dead, hot = round(self.dead_share * pixels), round(self.hot_share * pixels)
         chosen = rng.permutation(pixels)
         maps = np.zeros((2, pixels), bool)
         maps[0, chosen[:dead]] = True
         maps[1, chosen[dead : dead + hot]] = True
-        return {"dead": maps[0].reshape(samples, bands), "hot": maps[1].reshape(samples, bands)}
+        of_dead, of_hot = maps.reshape(2, samples, bands)
+        # Drawn last, so that the other pixels are the same with and without dead bands.
+        dead_bands = rng.permutation(bands)[: self.dead_bands]
+        of_dead[:, dead_bands] = True
+        of_hot[:, dead_bands] = False
+        return {"dead": of_dead, "hot": of_hot}
 
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext

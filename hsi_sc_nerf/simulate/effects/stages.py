@@ -216,10 +216,13 @@ class DetectorEffect(Effect):
 
 
 class ExposureEffect(Effect):
-    """Changes how long the sensor collects light, in all captures of a session alike."""
+    """Changes how long the sensor collects light."""
 
-    def factor(self) -> float:
-        """The integration time over the one for which the sensor's ``white_level`` is right."""
+    def factor(self, of_white: bool) -> float:
+        """The integration time over the one for which the sensor's ``white_level`` is right.
+
+        ``of_white`` asks for that of the white tarp's capture, otherwise it is the one that all frames share.
+        """
         raise NotImplementedError
 
 
