@@ -10,6 +10,7 @@ from spectral.io import envi as spy
 
 from hsi_sc_nerf.data.atomic import write_png
 from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.data.frames import border_spectrum
 from hsi_sc_nerf.data.packed import (
     FLAGGED,
@@ -137,6 +138,15 @@ def test_pixels(dataset):
     np.testing.assert_array_equal(frame.mask(), np.eye(4, 5, dtype=bool))
     reread = np.random.default_rng(0).random((4, 5, 3))
     assert np.abs(frame.cube() / REFLECTANCE_SCALE - reread).max() <= 0.5 / REFLECTANCE_SCALE + 1e-12
+
+
+@pytest.mark.parametrize(("interleave", "dtype"), [("bil", np.uint16), ("bip", np.int16), ("bip", np.float32)])
+def test_another_cube_is_not_taken_for_a_packed_one(dataset, interleave, dtype):
+    frame = dataset.frames[0]
+    cube = np.ones((4, 5, 3), dtype)
+    write_cube(frame.cube_path, cube, wavelengths_nm=WAVELENGTHS_NM, interleave=interleave, data_suffix=".bip")
+    with pytest.raises(InputError, match=r"a\.hdr: is no BIP cube of 16-bit numbers"):
+        frame.cube()
 
 
 def test_pseudo_rgb_keeps_its_channels(tmp_path, dataset):

@@ -1,57 +1,145 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.pixels import PixelSampler, gather_spectra
+from hsi_sc_nerf.data.envi import open_cube
+from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
+from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.errors import InputError
+
+SHAPE = (5, 7, 4)
+INDICES = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
 
 
 @pytest.fixture
-def frames():
-    rng = np.random.default_rng(0)
-    cubes = [rng.integers(0, 65536, (5, 7, 4)).astype(np.uint16) for _ in range(3)]
-    masks = np.zeros((3, 5, 7), bool)
+def counts() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, FLAGGED, (3, *SHAPE)).astype(np.uint16)
+
+
+@pytest.fixture
+def masks() -> np.ndarray:
+    masks = np.zeros((3, *SHAPE[:2]), bool)
     masks[:, 2:4, 1:3] = True
-    return cubes, masks
+    masks[1, 0, 0] = masks[2, 4, 6] = True
+    return masks
 
 
-def test_gather_equals_indexing_one_by_one(frames):
-    cubes, _ = frames
-    indices = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
-    expected = [cubes[f][line, sample] / 65535 for f, line, sample in indices]
-    np.testing.assert_allclose(gather_spectra(cubes, indices, 65535.0), expected, rtol=1e-6)
+def reader_of(folder: Path, counts: np.ndarray) -> PixelReader:
+    for i, cube in enumerate(counts):
+        write_packed_cube(folder / f"{i}.hdr", cube, np.arange(400.0, 404.0))
+    return PixelReader([open_cube(folder / f"{i}.hdr").memmap() for i in range(len(counts))])
 
 
-def test_a_step_always_gives_the_same_batch_and_another_step_another(frames):
-    sampler = PixelSampler(*frames, 65535.0, num_rays_per_batch=64, seed=3)
-    first, again, other = sampler.sample(7), sampler.sample(7), sampler.sample(8)
+@pytest.fixture
+def sampler(tmp_path, counts, masks):
+    def make(num_rays: int, seed: int = 0, has_flagged: bool = False) -> PixelSampler:
+        return PixelSampler(reader_of(tmp_path, counts), masks, num_rays, seed, has_flagged=has_flagged)
+
+    return make
+
+
+@pytest.mark.parametrize("by_position", [True, False])
+def test_reading_equals_indexing_one_by_one(tmp_path, counts, monkeypatch, by_position):
+    if not by_position:  # as on Windows
+        monkeypatch.delattr("os.pread")
+    read = reader_of(tmp_path, counts).read(INDICES)
+    np.testing.assert_array_equal(read, [counts[f, line, sample] for f, line, sample in INDICES])
+
+
+def test_pixels_lie_behind_a_headers_offset(tmp_path, counts):
+    (tmp_path / "offset.bip").write_bytes(b"header" + counts[0].tobytes())
+    cube = np.memmap(tmp_path / "offset.bip", np.uint16, "r", offset=6, shape=SHAPE)
+    read = PixelReader([cube]).read(INDICES * [0, 1, 1])
+    np.testing.assert_array_equal(read, [counts[0, line, sample] for _, line, sample in INDICES])
+
+
+def test_a_cube_that_becomes_shorter_is_one_sentence(tmp_path, counts):
+    reader = reader_of(tmp_path, counts)
+    (tmp_path / "2.bip").write_bytes(b"")
+    with pytest.raises(InputError, match="a cube became shorter"):
+        reader.read(INDICES)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the process's memory from /proc")
+def test_memory_does_not_grow_with_the_pixels_that_were_read(tmp_path):
+    shape = (512, 512, 204)
+
+    def resident_mib() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+
+    cubes = []
+    for i in range(3):
+        with (tmp_path / f"{i}.bip").open("wb") as file:  # sparse: holes read as zeros
+            file.truncate(2 * 512 * 512 * 204)
+        cubes.append(np.memmap(tmp_path / f"{i}.bip", np.uint16, "r", shape=shape))
+    reader = PixelReader(cubes)
+    rng = np.random.default_rng(0)
+    reader.read(rng.integers(0, (3, 512, 512), (4096, 3)))
+    before = resident_mib()
+    for _ in range(10):
+        reader.read(rng.integers(0, (3, 512, 512), (4096, 3)))
+    # The pages of these pixels hold 200 MiB and more.
+    assert resident_mib() < before + 50
+
+
+def test_a_batch_holds_the_reflectance_of_its_pixels(sampler, counts, masks):
+    batch = sampler(64).sample(0)
+    frame, line, sample = batch["indices"].T
+    np.testing.assert_allclose(batch["spectral"], counts[frame, line, sample] / REFLECTANCE_SCALE, rtol=1e-6)
+    assert batch["spectral"].dtype == np.float32
+    np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
+
+
+def test_batches_tell_which_values_are_measurements_only_where_some_are_not(sampler, counts):
+    assert "valid" not in sampler(64).sample(0)
+    counts[:, ::2, :, 1] = FLAGGED
+    batch = sampler(64, has_flagged=True).sample(0)
+    frame, line, sample = batch["indices"].T
+    np.testing.assert_array_equal(batch["valid"], counts[frame, line, sample] != FLAGGED)
+    assert not batch["valid"].all()
+    assert not batch["spectral"][~batch["valid"]].any()
+    np.testing.assert_array_equal(batch["spectral"], unpack(counts[frame, line, sample])[0])
+
+
+def test_a_step_always_gives_the_same_batch_and_another_step_another(sampler):
+    pixels = sampler(64, seed=3)
+    first, again, other = pixels.sample(7), pixels.sample(7), pixels.sample(8)
     for key in first:
         np.testing.assert_array_equal(first[key], again[key])
     assert (first["indices"] != other["indices"]).any()
 
 
-def test_foreground_share_is_kept(frames):
-    sampler = PixelSampler(*frames, 65535.0, num_rays_per_batch=200, seed=0)
-    batch = sampler.sample(0, foreground_share=0.75)
+def test_foreground_share_is_kept(sampler, masks):
+    batch = sampler(200).sample(0, foreground_share=0.75)
     frame, line, sample = batch["indices"].T
-    np.testing.assert_array_equal(batch["mask"][:, 0], frames[1][frame, line, sample])
+    np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
     assert batch["mask"].sum() == 150
 
 
-def test_whole_frames_are_drawn_evenly(frames):
-    sampler = PixelSampler(*frames, 65535.0, num_rays_per_batch=20_000, seed=0)
-    batch = sampler.sample(0)
-    counts = np.zeros((3, 5, 7))
+@pytest.mark.parametrize("share", [None, 0.0, 0.5, 1.0])
+def test_pixels_are_drawn_evenly(sampler, masks, share):
+    drawn = 20_000
+    batch = sampler(drawn).sample(0, share)
+    counts = np.zeros(masks.shape)
     np.add.at(counts, tuple(batch["indices"].T), 1)
-    expected = 20_000 / counts.size
-    assert abs(counts - expected).max() < 6 * np.sqrt(expected)
+    if share is None:
+        expected = np.full(masks.shape, drawn / masks.size)
+    else:
+        expected = drawn * np.where(masks, share / masks.sum(), (1.0 - share) / (~masks).sum())
+    assert (abs(counts - expected) <= 6 * np.sqrt(expected)).all()
 
 
-def test_nothing_but_the_sampled_frames_is_touched(frames):
-    cubes, _ = frames
+def test_the_rest_is_found_without_a_list_of_it(sampler, masks):
+    rest = np.flatnonzero(~masks)
+    np.testing.assert_array_equal(sampler(1)._rest(np.arange(len(rest))), rest)
 
-    class Untouchable:
-        shape = cubes[1].shape
 
-        def __getitem__(self, key):
-            raise AssertionError("read a frame that was not sampled")
-
-    gather_spectra([cubes[0], Untouchable(), cubes[2]], np.array([[0, 1, 1], [2, 2, 2]]), 1.0)
+def test_nothing_but_the_sampled_frames_is_touched(tmp_path, counts):
+    reader = reader_of(tmp_path, counts)
+    (tmp_path / "1.bip").write_bytes(b"")
+    read = reader.read(np.array([[0, 1, 1], [2, 2, 2]]))
+    np.testing.assert_array_equal(read, [counts[0, 1, 1], counts[2, 2, 2]])

@@ -13,8 +13,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE
-from hsi_sc_nerf.data.pixels import PixelSampler
+from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
 
 
 @dataclass
@@ -32,7 +31,7 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
 
 
 class SpectralDataManager(VanillaDataManager[SpectralDataset]):
-    """Random pixels of memory-mapped cubes; nothing is cached but the masks.
+    """Random pixels of the cubes on disk; nothing is cached but the masks.
 
     Attributes:
         foreground_share: share of the training rays that hit the foreground; ``None`` for whole frames. The
@@ -46,20 +45,20 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
 
     def _pixels(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         return PixelSampler(
-            cubes=[frame.cube() for frame in dataset.frames],
-            masks=np.stack([frame.mask() for frame in dataset.frames]),
-            scale=REFLECTANCE_SCALE,
+            PixelReader([frame.cube() for frame in dataset.frames]),
+            np.stack([frame.mask() for frame in dataset.frames]),
             num_rays_per_batch=num_rays,
             seed=self.config.seed,
+            has_flagged=dataset.has_flagged,
         )
 
     def setup_train(self) -> None:
-        """Map the training cubes."""
+        """Open the training cubes."""
         self.train_pixel_sampler = self._pixels(self.train_dataset, self.config.train_num_rays_per_batch)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
 
     def setup_eval(self) -> None:
-        """Map the held-out cubes."""
+        """Open the held-out cubes."""
         self.eval_pixel_sampler = self._pixels(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(

@@ -96,6 +96,7 @@ class SpectralDataParser(DataParser):
             dataparser_scale=scale,
             metadata={
                 "frames": [dataset.frames[i] for i in chosen],
+                "flagged_values": dataset.flagged_values,
                 "wavelengths_nm": dataset.wavelengths_nm,
                 "rgb_bands": nearest_bands(dataset.wavelengths_nm, dataset.pseudo_rgb_nm).tolist(),
                 "background_reflectance": dataset.background_reflectance,

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, PackedFrame
+from hsi_sc_nerf.data.packed import PackedFrame, unpack, unpack_unflagged
 
 
 class SpectralDataset(InputDataset):
-    """Frames of a packed dataset; an item holds ``spectral`` (lines, samples, bands) beside ``image``, ``mask``."""
+    """Frames of a packed dataset.
+
+    An item holds ``spectral`` (lines, samples, bands) beside ``image`` and ``mask`` and, where the dataset has
+    flagged values, ``valid`` (likewise, bool): which of them were measured.
+    """
 
     @property
     def frames(self) -> list[PackedFrame]:
         """The frames, in the cameras' order."""
         return self._dataparser_outputs.metadata["frames"]
 
+    @property
+    def has_flagged(self) -> bool:
+        """Whether some of the dataset's values are no measurements."""
+        return self._dataparser_outputs.metadata["flagged_values"] > 0
+
     def get_metadata(self, data: dict) -> dict:
         """The reflectance cube of the item."""
         counts = self.frames[data["image_idx"]].cube()
-        return {"spectral": torch.from_numpy(counts.astype(np.float32)).div_(REFLECTANCE_SCALE)}
+        if not self.has_flagged:
+            return {"spectral": torch.from_numpy(unpack_unflagged(counts))}
+        reflectance, valid = unpack(counts)
+        return {"spectral": torch.from_numpy(reflectance), "valid": torch.from_numpy(valid)}

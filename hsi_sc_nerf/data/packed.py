@@ -66,9 +66,16 @@ class PackedFrame:
     reprojection_error_px: float
     camera_to_world: Float[np.ndarray, "4 4"]
 
-    def cube(self) -> UInt16[np.ndarray, "lines samples bands"]:
-        """Memory map of reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none (`unpack`)."""
-        return open_cube(self.cube_path).memmap()
+    def cube(self) -> UInt16[np.memmap, "lines samples bands"]:
+        """Memory map of reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none (`unpack`).
+
+        Raises:
+            InputError: the file is no packed cube.
+        """
+        counts = open_cube(self.cube_path).memmap()
+        if not (isinstance(counts, np.memmap) and counts.flags.c_contiguous and counts.dtype.str[1:] == "u2"):
+            raise InputError(f"{self.cube_path}: is no BIP cube of 16-bit numbers; process the session again.")
+        return counts
 
     def mask(self) -> Bool[np.ndarray, "lines samples"]:
         """True on the object."""
@@ -237,11 +244,17 @@ def unpack(
     counts: UInt16[np.ndarray, "*shape"],
 ) -> tuple[Float[np.ndarray, "*shape"], Bool[np.ndarray, "*shape"]]:
     """Reflectance (float32, 0 where flagged) of packed numbers, and which of them are measurements."""
-    valid = counts != FLAGGED
-    reflectance = counts.astype(np.float32)
-    reflectance /= REFLECTANCE_SCALE
+    valid = np.not_equal(counts, FLAGGED)
+    reflectance = unpack_unflagged(counts)
     reflectance *= valid
     return reflectance, valid
+
+
+def unpack_unflagged(counts: UInt16[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Reflectance (float32) of packed numbers that are all measurements."""
+    reflectance = np.array(counts, dtype=np.float32)
+    reflectance /= REFLECTANCE_SCALE
+    return reflectance
 
 
 def write_packed_cube(

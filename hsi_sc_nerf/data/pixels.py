@@ -1,24 +1,72 @@
-"""Random pixels of memory-mapped cubes: a training batch reads those pixels and nothing else."""
+"""Random pixels of packed cubes on disk: a training batch reads those pixels and nothing else."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int, UInt16
+
+from hsi_sc_nerf.data.packed import unpack, unpack_unflagged
+from hsi_sc_nerf.errors import InputError
 
 
-def gather_spectra(
-    cubes: Sequence[np.ndarray], indices: Int[np.ndarray, "count 3"], scale: float
-) -> Float[np.ndarray, "count bands"]:
-    """Read the spectra at (frame, line, sample) ``indices`` from integer ``cubes`` and divide them by ``scale``."""
-    spectra = np.empty((len(indices), cubes[0].shape[2]), np.float32)
-    order = np.argsort(indices[:, 0], kind="stable")
-    frames, starts = np.unique(indices[order, 0], return_index=True)
-    for frame, rows in zip(frames, np.split(order, starts[1:]), strict=True):
-        spectra[rows] = cubes[frame][indices[rows, 1], indices[rows, 2]]
-    spectra /= scale
-    return spectra
+class PixelReader:
+    """The spectra of single pixels, read from their places in the files.
+
+    Memory stays what one batch needs. Reading through the memory maps would count every page that was ever touched as
+    this process's own (a whole session after some hundred batches), and to give the pages back between batches
+    costs three times as much as to read by position. Before a batch is read, the system is told of all its places:
+    a disk then serves many at once (benchmarks/pixel_fetch.py).
+
+    Args:
+        cubes: memory maps of BIP cubes of one shape, one a frame. Only where the system cannot read by position
+            (Windows) are they read through.
+    """
+
+    def __init__(self, cubes: Sequence[np.memmap]) -> None:
+        self.shape: tuple[int, int, int] = cubes[0].shape
+        self.dtype = cubes[0].dtype
+        self._paths = [Path(str(cube.filename)) for cube in cubes]
+        if hasattr(os, "pread"):
+            self._files = [path.open("rb", buffering=0) for path in self._paths]
+            self._starts = np.array([cube.offset for cube in cubes])
+            self._read = self._read_by_position
+        else:
+            self._cubes = cubes
+            self._read = self._read_through_maps
+
+    def read(self, indices: Int[np.ndarray, "count 3"]) -> UInt16[np.ndarray, "count bands"]:
+        """Packed spectra at (frame, line, sample).
+
+        Raises:
+            InputError: a file became shorter since it was opened.
+        """
+        return self._read(indices)
+
+    def _read_by_position(self, indices: np.ndarray) -> np.ndarray:
+        _, samples, bands = self.shape
+        size = bands * self.dtype.itemsize
+        frames, pixels = indices[:, 0], indices[:, 1] * samples + indices[:, 2]
+        offsets = (self._starts[frames] + pixels * size).tolist()
+        files = [self._files[frame].fileno() for frame in frames.tolist()]
+        sizes = [size] * len(files)
+        if hasattr(os, "posix_fadvise"):
+            for file, offset in zip(files, offsets, strict=True):
+                os.posix_fadvise(file, offset, size, os.POSIX_FADV_WILLNEED)
+        spectra = b"".join(map(os.pread, files, sizes, offsets))
+        if len(spectra) != size * len(files):
+            raise InputError(f"{self._paths[0].parent}: a cube became shorter while it was in use; process again.")
+        return np.frombuffer(spectra, self.dtype).reshape(len(files), bands)
+
+    def _read_through_maps(self, indices: np.ndarray) -> np.ndarray:
+        spectra = np.empty((len(indices), self.shape[2]), self.dtype)
+        for frame in np.unique(indices[:, 0]):
+            rows = np.flatnonzero(indices[:, 0] == frame)
+            spectra[rows] = self._cubes[frame][indices[rows, 1], indices[rows, 2]]
+        return spectra
 
 
 class PixelSampler:
@@ -27,28 +75,30 @@ class PixelSampler:
     A resumed run therefore sees the batches that an uninterrupted one would have seen.
 
     Args:
-        cubes: memory-mapped integer cubes (lines, samples, bands), one a frame.
+        reader: of the frames' packed cubes.
         masks: foreground of each frame.
-        scale: integer value of reflectance 1.
         num_rays_per_batch: pixels a batch.
         seed: part of every batch's seed.
+        has_flagged: whether the cubes hold values that are no measurements.
     """
 
     def __init__(
         self,
-        cubes: Sequence[np.ndarray],
+        reader: PixelReader,
         masks: Bool[np.ndarray, "frames lines samples"],
-        scale: float,
         num_rays_per_batch: int,
         seed: int,
+        *,
+        has_flagged: bool,
     ) -> None:
-        self.cubes = cubes
+        self.reader = reader
         self.masks = masks
-        self.scale = scale
         self.num_rays_per_batch = num_rays_per_batch
         self.seed = seed
         self._foreground = np.flatnonzero(masks)
-        self._rest = np.flatnonzero(~masks)
+        # How many pixels of the rest lie before each pixel of the foreground.
+        self._rest_before = self._foreground - np.arange(len(self._foreground))
+        self._values = _measured_values if has_flagged else _values
 
     def sample(self, step: int, foreground_share: float | None = None) -> dict[str, np.ndarray]:
         """One batch.
@@ -60,7 +110,8 @@ class PixelSampler:
 
         Returns:
             ``indices`` (count, 3) int64: frame, line, sample; ``spectral`` (count, bands) float32 reflectance;
-            ``mask`` (count, 1) bool: foreground.
+            ``mask`` (count, 1) bool: foreground; where the cubes have flagged values also ``valid`` (count, bands)
+            bool: which of ``spectral`` were measured (0 otherwise).
         """
         rng = np.random.default_rng((self.seed, step))
         count = self.num_rays_per_batch
@@ -68,15 +119,33 @@ class PixelSampler:
             flat = rng.integers(0, self.masks.size, count)
         else:
             in_foreground = round(count * foreground_share)
+            num_rest = self.masks.size - len(self._foreground)
             flat = np.concatenate(
                 [
                     self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
-                    self._rest[rng.integers(0, len(self._rest), count - in_foreground)],
+                    self._rest(rng.integers(0, num_rest, count - in_foreground)),
                 ]
             )
         indices = np.stack(np.unravel_index(flat, self.masks.shape), axis=1)
         return {
             "indices": indices,
-            "spectral": gather_spectra(self.cubes, indices, self.scale),
             "mask": self.masks.reshape(-1)[flat, None],
+            **self._values(self.reader.read(indices)),
         }
+
+    def _rest(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
+        """The pixels with these places among all that are not foreground.
+
+        A list of the rest would be a session's largest: a pixel has as many of the foreground before it as have no
+        more of the rest before them than it has.
+        """
+        return ranks + np.searchsorted(self._rest_before, ranks, side="right")
+
+
+def _values(counts: UInt16[np.ndarray, "count bands"]) -> dict[str, np.ndarray]:
+    return {"spectral": unpack_unflagged(counts)}
+
+
+def _measured_values(counts: UInt16[np.ndarray, "count bands"]) -> dict[str, np.ndarray]:
+    spectra, valid = unpack(counts)
+    return {"spectral": spectra, "valid": valid}
