@@ -120,9 +120,9 @@ def test_data_of_another_length(header, change, word):
     ("old", "new", "message"),
     [
         ("wavelength = {", "not wavelength = {", "no wavelengths"),
-        ("wavelength = { 450.25 ,", "wavelength = {", "3 wavelengths for 4 bands"),
-        ("450.25", "blue", "not a number"),
-        ("450.25", "-450.25", "not positive"),
+        ("wavelength = { 450.25 ,", "wavelength = {", "wavelength lists 3 numbers for 4 bands"),
+        ("450.25", "blue", "what is not a number"),
+        ("450.25", "-450.25", "negative"),
         ("interleave = bil", "interleave = bix", "none of bil, bip, bsq"),
         ("lines = 3\n", "", "does not give lines"),
         ("lines = 3", "lines = three", "cannot be read"),

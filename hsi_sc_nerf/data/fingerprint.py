@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from hsi_sc_nerf import __version__
-from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Capture, Session
+from hsi_sc_nerf.data.session import Capture, Session
 
 
 def fingerprint(content: Any) -> str:
@@ -20,16 +21,26 @@ def fingerprint(content: Any) -> str:
 
 
 def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, int]]:
-    """Name, size and time of last change of each file that a capture's reflectance depends on."""
-    cubes = [cube for cube in (capture.cube, capture.dark) if cube is not None]
-    return _stamps(session.path, (path for cube in cubes for path in (cube.header_path, cube.data_path)))
+    """Name, size and time of last change of each file that a capture's reflectance depends on.
+
+    What all captures depend on is not among them (``shared_files``).
+    """
+    paths = [path for cube in capture.cubes for path in (cube.header_path, cube.data_path)]
+    if capture.metadata is not None:
+        paths.append(capture.metadata.path)
+    return _stamps(session.path, paths)
+
+
+def shared_files(session: Session) -> list[tuple[str, int, int]]:
+    """The same of the files that every frame's reflectance depends on: session.json, what it names, and the tarp."""
+    named = (session.info_path, session.band_centres_path, session.panel_reflectance_path)
+    stamps = _stamps(session.path, [path for path in named if path is not None and path.is_file()])
+    return stamps if session.white is None else stamps + capture_files(session, session.white)
 
 
 def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
-    """The same for all captures of a session and its ``session.json``."""
-    info = session.path / SESSION_INFO_NAME
-    captures = [capture_files(session, capture) for capture in (session.white, *session.frames)]
-    return [*captures, _stamps(session.path, [info] if info.is_file() else [])]
+    """The same of all files of a session."""
+    return [shared_files(session), *(capture_files(session, frame) for frame in session.frames)]
 
 
 def session_fingerprint(session: Session, config: Any) -> str:
@@ -38,4 +49,4 @@ def session_fingerprint(session: Session, config: Any) -> str:
 
 
 def _stamps(root: Path, paths: Iterable[Path]) -> list[tuple[str, int, int]]:
-    return [(p.relative_to(root).as_posix(), p.stat().st_size, p.stat().st_mtime_ns) for p in paths]
+    return [(os.path.relpath(p, root), p.stat().st_size, p.stat().st_mtime_ns) for p in paths]

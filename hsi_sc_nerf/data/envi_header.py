@@ -1,0 +1,234 @@
+"""ENVI headers: parsed by SPy, mended where SPy refuses what a user expects to open, checked where SPy is silent.
+
+All that this package knows about the header format is here; the data file is ``envi.py``'s.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from spectral.io import envi
+from spectral.io.spyfile import InvalidFileError
+
+from hsi_sc_nerf.errors import InputError
+
+INTERLEAVES = ("bil", "bip", "bsq")
+_REQUIRED = ("lines", "samples", "bands", "data type", "interleave")
+_NM_PER_UNIT = {
+    "nm": 1.0,
+    "nanometer": 1.0,
+    "nanometre": 1.0,
+    "um": 1000.0,
+    "\N{MICRO SIGN}m": 1000.0,
+    "\N{GREEK SMALL LETTER MU}m": 1000.0,
+    "micrometer": 1000.0,
+    "micrometre": 1000.0,
+    "micron": 1000.0,
+    "mm": 1e6,
+    "millimeter": 1e6,
+    "millimetre": 1e6,
+    "angstrom": 0.1,
+}
+# ENVI's other units, whose numbers would be taken for something else; without wavelengths at all, ENVI counts bands.
+_NO_LENGTHS = ("wavenumber", "ghz", "mhz", "index")
+# No imaging spectrometer measures below 100 nm or beyond 100 µm: smaller numbers without a unit are micrometres.
+_SENSIBLE_NM = (100.0, 100_000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class EnviHeader:
+    """What a header says about its cube.
+
+    Attributes:
+        path: the header file.
+        shape: (lines, samples, bands).
+        interleave: "bil", "bip" or "bsq".
+        dtype: the stored numbers, with their byte order.
+        offset: bytes before the first number.
+        wavelengths_nm: band centres; None where the header lists none.
+        fwhm_nm: full width of each band at half its maximum; None where the header lists none.
+        good_bands: which bands the bad-band list ``bbl`` keeps; all without such a list.
+        reflectance_scale: ``reflectance scale factor`` (1 where it has none).
+        ignore_value: ``data ignore value``: the number that stands for "no data".
+        integration_time_ms: Specim's ``tint``.
+        fields: all fields as SPy parses them, after mending.
+    """
+
+    path: Path
+    shape: tuple[int, int, int]
+    interleave: str
+    dtype: np.dtype
+    offset: int
+    wavelengths_nm: Float[np.ndarray, "bands"] | None
+    fwhm_nm: Float[np.ndarray, "bands"] | None
+    good_bands: Bool[np.ndarray, "bands"]
+    reflectance_scale: float
+    ignore_value: float | None
+    integration_time_ms: float | None
+    fields: dict[str, Any]
+
+    @property
+    def data_bytes(self) -> int:
+        """Size of the data file: the offset and every number."""
+        return self.offset + math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_header(path: Path) -> EnviHeader:
+    """Parse, mend and check a header; the data file is not looked at.
+
+    Mended: a missing ``byte order`` (ENVI's default, little endian) or ``header offset``, an upper-case interleave,
+    "envi" in other letters, a byte order mark or Latin-1 letters, comments that are indented, a comma after a list's
+    last number.
+
+    Raises:
+        InputError: no such file, no ENVI header, a field that is missing or unreadable, a list with another count
+            than bands, or a feature that would give wrong pixels (complex numbers, frame offsets, compression,
+            a spectral library).
+    """
+    fields = _mended_fields(path)
+    try:
+        shape = (int(fields["lines"]), int(fields["samples"]), int(fields["bands"]))
+        parameters = envi.gen_params(fields)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
+    dtype = np.dtype(parameters.dtype)
+    _check_layout(path, fields, shape, dtype, parameters.offset)
+    scale = _number(path, fields, "reflectance scale factor")
+    if scale is not None and not scale > 0.0:
+        raise InputError(f"{path}: reflectance scale factor {scale:g} is not positive; correct it.")
+    tint = _number(path, fields, "tint")
+    nm_per_unit, wavelengths_nm = _wavelengths_nm(path, fields, shape[2])
+    fwhm = _numbers(path, fields, "fwhm", shape[2])
+    bad_band_list = _numbers(path, fields, "bbl", shape[2])
+    return EnviHeader(
+        path=path,
+        shape=shape,
+        interleave=fields["interleave"],
+        dtype=dtype,
+        offset=parameters.offset,
+        wavelengths_nm=wavelengths_nm,
+        fwhm_nm=None if fwhm is None else fwhm * nm_per_unit,
+        good_bands=np.ones(shape[2], bool) if bad_band_list is None else bad_band_list != 0.0,
+        reflectance_scale=1.0 if scale is None else scale,
+        ignore_value=_number(path, fields, "data ignore value"),
+        integration_time_ms=tint if tint and tint > 0.0 else None,
+        fields=fields,
+    )
+
+
+def _mended_fields(path: Path) -> dict[str, Any]:
+    """SPy's dictionary of the header, with what ENVI itself takes for granted filled in."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such ENVI header; check the path.")
+    try:
+        fields = _parse(path)
+    except (InvalidFileError, OSError) as error:
+        raise InputError(f"{path}: is no readable ENVI header; export the cube again.") from error
+    fields.setdefault("byte order", "0")
+    missing = [key for key in _REQUIRED if not fields.get(key)]
+    if missing:
+        raise InputError(f"{path}: the header does not give {', '.join(missing)}; add it.")
+    fields["interleave"] = str(fields["interleave"]).lower()
+    # Some writers set a comma behind the last number of a list, too.
+    return {
+        key: value[:-1] if isinstance(value, list) and value[-1] == "" else value for key, value in fields.items()
+    }
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    """SPy's dictionary of the header; what SPy stumbles over is put right in a copy that it reads instead."""
+    with open(path, "rb") as file:
+        start = file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+        if not start.upper().startswith(b"ENVI") or b"\0" in start:
+            raise InvalidFileError(f"{path} does not begin with ENVI")
+        file.seek(0)
+        content = file.read()
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    fields = [line for line in text.lstrip().splitlines()[1:] if not line.lstrip().startswith(";")]
+    mended = "\n".join(["ENVI", *fields, ""])
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")  # field names are case-insensitive; SPy warns that it lowers them
+        copy = Path(folder) / "mended.hdr"
+        copy.write_text(mended, errors="replace")  # in the encoding that SPy reads with
+        return envi.read_envi_header(str(copy))
+
+
+def _check_layout(
+    path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int
+) -> None:
+    """Refuse what would be read as wrong pixels."""
+    if fields["interleave"] not in INTERLEAVES:
+        raise InputError(f"{path}: interleave {fields['interleave']} is none of bil, bip, bsq; correct it.")
+    if min(shape) < 1 or offset < 0:
+        raise InputError(
+            f"{path}: {shape[0]} lines, {shape[1]} samples, {shape[2]} bands after {offset} bytes are no spectral "
+            "image; correct the header."
+        )
+    if dtype.kind == "c":
+        raise InputError(f"{path}: holds complex numbers, which are no spectral image; export real numbers.")
+    if str(fields["byte order"]) not in ("0", "1"):
+        raise InputError(f"{path}: byte order {fields['byte order']} is neither 0 (little) nor 1 (big); correct it.")
+    if "library" in str(fields.get("file type", "")).lower():
+        raise InputError(f"{path}: describes a spectral library, not an image; give the cube's header.")
+    for key in ("major frame offsets", "minor frame offsets", "file compression"):
+        values = np.atleast_1d(fields.get(key, "0"))
+        if any(str(value).strip() not in ("", "0") for value in values):
+            raise InputError(f"{path}: has {key}, which are not supported; export the cube without them.")
+
+
+def _number(path: Path, fields: dict[str, Any], key: str) -> float | None:
+    """A field's number; None where the field is missing or empty."""
+    value = fields.get(key, "")
+    if not value:
+        return None
+    try:
+        return float(value[0] if isinstance(value, list) else value)
+    except ValueError as error:
+        raise InputError(f"{path}: {key} is no number ({error}); correct it.") from error
+
+
+def _numbers(path: Path, fields: dict[str, Any], key: str, bands: int) -> Float[np.ndarray, "bands"] | None:
+    """A field's list of one number a band; None where the field is missing or empty."""
+    listed = fields.get(key, "")
+    if not listed:
+        return None
+    try:
+        numbers = np.array([float(value) for value in np.atleast_1d(listed)])
+    except ValueError as error:
+        raise InputError(f"{path}: {key} holds what is not a number ({error}); correct the list.") from error
+    if len(numbers) != bands:
+        raise InputError(f"{path}: {key} lists {len(numbers)} numbers for {bands} bands; correct the list.")
+    if not np.isfinite(numbers).all() or numbers.min() < 0.0:
+        raise InputError(f"{path}: {key} holds numbers that are negative or not finite; correct the list.")
+    return numbers
+
+
+def _wavelengths_nm(
+    path: Path, fields: dict[str, Any], bands: int
+) -> tuple[float, Float[np.ndarray, "bands"] | None]:
+    """The factor from the header's unit to nm, and the band centres, or None where it lists none."""
+    unit = str(fields.get("wavelength units", "")).strip().lower().removesuffix("s")
+    listed = _numbers(path, fields, "wavelength", bands)
+    if listed is None or unit == "index":
+        return _NM_PER_UNIT.get(unit, 1.0), None
+    if unit in _NO_LENGTHS:
+        raise InputError(f"{path}: gives its bands in {unit}, not as wavelengths; convert the list to nm.")
+    implied = 1.0 if listed.max() >= _SENSIBLE_NM[0] else 1000.0
+    nm_per_unit = _NM_PER_UNIT.get(unit, implied)
+    wavelengths_nm = listed * nm_per_unit
+    if wavelengths_nm.min() < _SENSIBLE_NM[0] or wavelengths_nm.max() > _SENSIBLE_NM[1]:
+        raise InputError(
+            f"{path}: wavelengths from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm are none of an "
+            "imaging spectrometer; correct the list or its unit."
+        )
+    return nm_per_unit, wavelengths_nm

@@ -1,0 +1,112 @@
+"""``session.json``: what a user tells about a session, because the instrument cannot."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.errors import InputError
+
+SESSION_INFO_NAME = "session.json"
+_TEXTS = ("object", "marker_dictionary", "white_reference")
+_FILES = ("band_centres", "panel_reflectance")
+
+
+@dataclass(frozen=True)
+class SessionInfo:
+    """The content of ``session.json``.
+
+    Attributes:
+        object: what is on the turntable.
+        nominal_step_deg: the turntable's step between frames, degrees, positive.
+        direction: the turntable's turn seen from above, counter-clockwise or clockwise.
+        marker_dictionary: OpenCV's name, for example ``DICT_5X5_50``.
+        marker_side_m: side of a marker's black square, metres.
+        container_diameter_m: of the upright cylinder that the object stands on.
+        container_height_m: of its lid above the disc.
+        white_reference: name of the capture of the white tarp.
+        band_centres: a CSV beside ``session.json`` with the band centres in nm, for cubes whose headers list none.
+        panel_reflectance: a CSV beside ``session.json`` with the white's own reflectance by wavelength.
+        image_rotation_deg: how far the files' images are turned from upright, counter-clockwise: 0, 90, 180 or 270.
+            None leaves it to the instrument's metadata.
+    """
+
+    object: str | None = None
+    nominal_step_deg: float | None = None
+    direction: Literal["ccw", "cw"] | None = None
+    marker_dictionary: str | None = None
+    marker_side_m: float | None = None
+    container_diameter_m: float | None = None
+    container_height_m: float | None = None
+    white_reference: str = "white_reference"
+    band_centres: str | None = None
+    panel_reflectance: str | None = None
+    image_rotation_deg: int | None = None
+
+
+def read_session_info(path: Path) -> SessionInfo:
+    """Read ``session.json``; without one, everything is unknown.
+
+    Raises:
+        InputError: no JSON object, an unknown key, a value of the wrong kind, or a file that is not beside it.
+    """
+    if not path.is_file():
+        return SessionInfo()
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: is no JSON ({error}); correct it.") from error
+    known = [field.name for field in fields(SessionInfo)]
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: is no JSON object; write {{...}} with any of the keys {', '.join(known)}.")
+    unknown = sorted(set(content) - set(known))
+    if unknown:
+        raise InputError(f"{path}: does not know the key {unknown[0]}; the keys are {', '.join(known)}.")
+    values = {key: value for key, value in content.items() if value is not None}
+    for key, value in values.items():
+        _check_value(path, key, value)
+    if ("container_diameter_m" in values) != ("container_height_m" in values):
+        raise InputError(
+            f"{path}: gives one dimension of the container; give its diameter and its height, or neither."
+        )
+    return SessionInfo(**values)
+
+
+def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
+    """Band centres in nm: the first column of a CSV with a line of names.
+
+    Raises:
+        InputError: the file cannot be read, holds no numbers, or numbers that are no wavelengths in nm.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")[1:]
+        centres_nm = np.array([float(line.split(",")[0]) for line in lines if line.strip()])
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: is no list of band centres ({error}); write a line of names and one wavelength in nm a line."
+        ) from error
+    if len(centres_nm) == 0 or not (np.isfinite(centres_nm).all() and centres_nm.min() >= 100.0):
+        raise InputError(f"{path}: its band centres are no wavelengths in nm; write one number a line, 100 at least.")
+    return centres_nm
+
+
+def _check_value(path: Path, key: str, value: Any) -> None:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if key == "direction":
+        valid, wanted = value in ("ccw", "cw"), "ccw or cw (seen from above)"
+    elif key in _FILES:
+        valid = isinstance(value, str) and (path.parent / value).is_file()
+        wanted = f"the name of a CSV file beside {path.name}"
+    elif key in _TEXTS:
+        valid, wanted = isinstance(value, str) and value != "", "a text"
+    elif key == "image_rotation_deg":
+        valid, wanted = is_number and value in (0, 90, 180, 270), "0, 90, 180 or 270 degrees"
+    else:
+        valid, wanted = is_number and 0.0 < value < float("inf"), "a positive number"
+    if not valid:
+        raise InputError(f"{path}: {key} is {value!r}, but must be {wanted}; correct it.")
