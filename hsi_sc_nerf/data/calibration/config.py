@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 from hsi_sc_nerf import paper
 
@@ -11,9 +13,15 @@ from hsi_sc_nerf import paper
 class CalibrationConfig:
     """Settings of the white-reference calibration; the defaults are the paper's."""
 
+    white_source: Literal["tarp", "capture", "target"] = "tarp"
+    """Where the white is: in a capture of its own in the session (tarp), in the WHITEREF cube that each capture
+    brings along (capture), or inside every frame, in the region given as --calibration.roi (target)."""
     roi: tuple[int, int, int, int] | None = None
-    """Where the white tarp is in its image: x0 y0 x1 y1 in pixels, x1 and y1 excluded. Found by itself if not
-    given."""
+    """Where the white is, in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. A tarp is
+    found by itself if this is not given; a white target inside the frames needs it."""
+    panel: Path | None = None
+    """CSV file of the white's own reflectance by wavelength (wavelength in nm, reflectance as fraction or percent),
+    for a white that is not a perfect one. Without it the white counts as reflectance 1."""
     percentile: float = paper.WHITE_PERCENTILE
     """How much of the tarp is kept: the share (in percent) of its pixels that deviate least from its mean."""
     morphology_min_px: int = paper.WHITE_MORPHOLOGY_MIN_PX
@@ -31,3 +39,12 @@ class CalibrationConfig:
     """The tarp is looked for where the image is brighter than this share of its brightest part."""
     max_deviation: float = 0.5
     """A tarp whose kept pixels deviate from their mean by more than this (relative) is refused."""
+    min_light: float = 0.001
+    """A band in which the white counts less than this share of what it counts in its brightest band measures
+    nothing and is left out."""
+    max_saturated: float = 0.01
+    """A band in which more than this share of the white is saturated cannot be calibrated and is left out."""
+    flat_field: bool = False
+    """Divide out that the light falls off over the image, as the tarp shows it (only with the tarp)."""
+    flat_field_order: int = 4
+    """Order of the polynomial over the image by which the light falls off."""
