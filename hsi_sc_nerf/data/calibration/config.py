@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from hsi_sc_nerf import paper
+
+
+@dataclass(frozen=True)
+class LampDriftConfig:
+    """Settings of the lamps' drift over the session, which is measured on what stands still in the image."""
+
+    correct: Literal["auto", "always", "never"] = "auto"
+    """Whether the drift is divided out of the frames: where it is larger than its own uncertainty (auto), wherever it
+    can be measured (always), or never. It is measured and reported in any case."""
+    survey_share: float = 0.06
+    """Share of each frame's lines that is read to measure the drift."""
+    smallest_static_share: float = 0.05
+    """Share of the surveyed pixels that must stand still for the drift to be measured."""
+    degree: int = 2
+    """Degree of the curve over the wavelength that takes the noise off the drift. A change of the lamps' output and
+    of their colour temperature is a straight line in its terms."""
+    floor: float = 0.001
+    """Relative change of the light that is not taken for drift, whatever the noise: what neighbours reflect and
+    instruments do changes by as much."""
+    significance: float = 0.001
+    """How often a session without drift may be corrected by chance."""
 
 
 @dataclass(frozen=True)
@@ -48,3 +69,5 @@ class CalibrationConfig:
     """Divide out that the light falls off over the image, as the tarp shows it (only with the tarp)."""
     flat_field_order: int = 4
     """Order of the polynomial over the image by which the light falls off."""
+    lamp_drift: LampDriftConfig = field(default_factory=LampDriftConfig)
+    """Drift of the lamps over the session."""
