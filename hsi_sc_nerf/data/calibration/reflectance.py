@@ -1,15 +1,32 @@
-"""Steps 6 and 7 of the paper's Algorithm 1: counts over the white spectrum, within bounds."""
+"""Steps 6 and 7 of the paper's Algorithm 1, at the speed of the disk: raw counts to packed reflectance in one pass.
+
+A frame is worked on line by line, as ``(bands, samples)``, so that all of a line happens while the processor has it
+at hand. What a session does not have (no saturation level, no flat field, ...) is not computed.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.data.session import Capture
+
+# Lines that are stored at a time: an upright copy of single lines would write 400 bytes here and 400 there.
+_BLOCK_LINES = 8
+# How many times a uint8 can be counted up.
+_COUNTABLE = 255
+# What `cv2.transpose` moves in place of numbers of the same size.
+_MOVED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
+_HALF = np.float32(0.5)
+_LEAST = np.finfo(np.float32).min
+_Test = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +58,281 @@ class FrameCalibration:
     dead: Bool[np.ndarray, "samples bands"] | None = None
     ignore_value: float | None = None
     quarter_turns: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """How many of a frame's values were clipped or flagged, in each of the kept bands (those of the packed cube).
+
+    Each value is counted once: a dead element is nothing else, no data is not saturated, and what is flagged is not
+    clipped. A value is clipped where that changes it by half a packed unit or more.
+
+    Attributes:
+        clipped_low: raised to the lower bound.
+        clipped_high: lowered to the upper bound.
+        saturated: flagged because the reading is saturated.
+        dead: flagged because the detector's element is dead.
+        no_data: flagged because the file says that there is no data, or because a float is not finite.
+    """
+
+    clipped_low: Int[np.ndarray, "kept"]
+    clipped_high: Int[np.ndarray, "kept"]
+    saturated: Int[np.ndarray, "kept"]
+    dead: Int[np.ndarray, "kept"]
+    no_data: Int[np.ndarray, "kept"]
+
+    @property
+    def flagged(self) -> Int[np.ndarray, "kept"]:
+        """Values that are no measurement."""
+        return self.saturated + self.dead + self.no_data
+
+    @staticmethod
+    def total(tallies: Iterable[Tally]) -> Tally:
+        """The sum over frames (at least one)."""
+        listed = list(tallies)
+        return Tally(**{f.name: np.sum([getattr(t, f.name) for t in listed], axis=0) for f in fields(Tally)})
+
+
+@dataclass(frozen=True, eq=False)
+class PictureBands:
+    """Which of the kept bands (by index) the pictures of a frame are made of.
+
+    Attributes:
+        rgb: shown as red, green and blue.
+        gray: averaged for finding markers.
+        bin_width: neighbouring bands that are averaged into a bin; the last bin may have fewer.
+    """
+
+    rgb: Int[np.ndarray, "3"]
+    gray: Int[np.ndarray, "gray"]
+    bin_width: int
+
+
+@dataclass(frozen=True, eq=False)
+class PackedReflectance:
+    """A frame's reflectance and what was seen on the way, in the orientation of the file.
+
+    In the pictures a dead element has the value of the pixel's nearest good band, a saturated one its clipped value
+    and no data the lower bound: nothing of `FLAGGED` is in them.
+
+    Attributes:
+        packed: reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none. Its memory lies upright:
+            ``np.rot90(packed, quarter_turns)`` is contiguous.
+        flags: `PixelFlag`s.
+        tally: of clipped and flagged values.
+        rgb: reflectance in three bands.
+        gray: mean reflectance in the gray bands.
+        binned: mean reflectance in the bins.
+    """
+
+    packed: UInt16[np.ndarray, "lines samples kept"]
+    flags: UInt8[np.ndarray, "lines samples"]
+    tally: Tally
+    rgb: Float[np.ndarray, "3 lines samples"]
+    gray: Float[np.ndarray, "lines samples"]
+    binned: Float[np.ndarray, "bins lines samples"]
+
+
+def pack_counts(
+    counts: Num[np.ndarray, "lines samples bands"], calibration: FrameCalibration, pictures: PictureBands
+) -> PackedReflectance:
+    """Reflectance of a frame's raw counts, clipped, packed and flagged, and pictures of it.
+
+    Fastest for the memory map of a BIL file; takes memory for the result and little more.
+
+    Raises:
+        ValueError: the calibration is not finite where it is needed, or the illumination not positive.
+    """
+    lines, samples, bands = counts.shape
+    kept = len(calibration.bands)
+    every_band = np.array_equal(calibration.bands, np.arange(bands))
+    dead = _DeadElements.of(calibration, samples)
+    scale, offset = _line_constants(calibration, samples)
+    per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
+    tests = _tests_of_counts(calibration, counts.dtype)
+    # Bounds as packed numbers. Values have half a unit added, so that cutting off their decimals rounds them.
+    low, high = (round(float(np.clip(b * REFLECTANCE_SCALE, 0, FLAGGED - 1))) for b in calibration.bounds)
+
+    turns = calibration.quarter_turns
+    upright_shape = (samples, lines) if turns % 2 else (lines, samples)
+    packed = np.rot90(np.empty((*upright_shape, kept), np.uint16), -turns)
+    flags = np.zeros((lines, samples), np.uint8)
+    flags |= dead.pixel_flags
+    draw = _Pictures(pictures, kept, lines, samples)
+    counters = {name: _Counter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
+
+    values = np.empty((kept, samples), np.float32)
+    numbers = np.empty((kept, samples), np.uint16)
+    block = np.empty((_BLOCK_LINES, samples, kept), np.uint16)
+    for line in range(lines):
+        raw = _band_major(counts[line])
+        with np.errstate(over="ignore"):  # a double that no float32 holds is no count
+            np.copyto(values, raw if every_band else raw[calibration.bands], casting="unsafe")
+        flagged = None
+        for name, flag, test in tests:
+            found = test(values)
+            if not found.any():
+                continue
+            if flag == PixelFlag.NO_DATA:
+                values[found] = _LEAST
+            found.reshape(-1)[dead.at] = False
+            if flagged is not None:
+                found &= ~flagged
+            counters[name].add(found)
+            flags[line][found.any(axis=0)] |= np.uint8(flag)
+            flagged = found if flagged is None else flagged | found
+
+        cv2.multiply(values, scale, dst=values)
+        cv2.add(values, offset, dst=values)
+        if per_flat is not None:
+            values *= per_flat[line]
+            values += _HALF
+        least, most, _, _ = cv2.minMaxLoc(values)
+        if least < low or most >= high + 1:
+            for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
+                counters[name].add(clipped if flagged is None else clipped & ~flagged)
+            np.clip(values, low, high + _HALF, out=values)
+        values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
+        draw.line(line, values)
+
+        np.copyto(numbers, values, casting="unsafe")
+        if flagged is not None:
+            numbers[flagged] = FLAGGED
+        numbers.reshape(-1)[dead.at] = FLAGGED
+        in_block = line % _BLOCK_LINES
+        cv2.transpose(numbers, dst=block[in_block])
+        if in_block == _BLOCK_LINES - 1 or line == lines - 1:
+            packed[line - in_block : line + 1] = block[: in_block + 1]
+
+    tally = Tally(
+        dead=dead.per_band * lines, **{name: counter.by_band(dead.at) for name, counter in counters.items()}
+    )
+    return PackedReflectance(packed, flags, tally, draw.rgb, draw.gray, draw.binned)
+
+
+@dataclass(frozen=True, eq=False)
+class _DeadElements:
+    """Dead elements of a line ``(kept, samples)``: where they are (flat), what takes their place, how many a band."""
+
+    at: Int[np.ndarray, "dead"]
+    replaced_by: Int[np.ndarray, "dead"]
+    per_band: Int[np.ndarray, "kept"]
+    pixel_flags: UInt8[np.ndarray, "samples"]
+
+    @staticmethod
+    def of(calibration: FrameCalibration, samples: int) -> _DeadElements:
+        """The nearest good band of the same sample takes a dead element's place; without any good band, itself."""
+        kept = len(calibration.bands)
+        dead = np.zeros((kept, samples), bool) if calibration.dead is None else calibration.dead.T[calibration.bands]
+        band, sample = np.nonzero(dead)
+        index = np.arange(kept)[:, None]
+        before = np.maximum.accumulate(np.where(dead, -kept, index), axis=0)[band, sample]
+        after = np.minimum.accumulate(np.where(dead, 2 * kept, index)[::-1], axis=0)[::-1][band, sample]
+        nearest = np.where(band - before <= after - band, before, after)
+        replaced_by = np.where((nearest < 0) | (nearest >= kept), band, nearest) * samples + sample
+        flags = np.where(dead.any(axis=0), np.uint8(PixelFlag.DEAD), np.uint8(0))
+        return _DeadElements(band * samples + sample, replaced_by, dead.sum(axis=1), flags)
+
+
+class _Counter:
+    """Counts, for each element of a line, in how many lines it was marked; without widening every mark."""
+
+    def __init__(self, bands: int, samples: int) -> None:
+        self._total = np.zeros((bands, samples), np.int64)
+        self._recent = np.zeros((bands, samples), np.uint8)
+        self._lines = 0
+
+    def add(self, marked: Bool[np.ndarray, "bands samples"]) -> None:
+        """Count one line."""
+        np.add(self._recent, marked.view(np.uint8), out=self._recent)
+        self._lines += 1
+        if self._lines == _COUNTABLE:
+            self._flush()
+
+    def by_band(self, without: Int[np.ndarray, "elements"]) -> Int[np.ndarray, "bands"]:
+        """Sum over the samples, some (flat) elements left out."""
+        self._flush()
+        self._total.reshape(-1)[without] = 0
+        return self._total.sum(axis=1)
+
+    def _flush(self) -> None:
+        self._total += self._recent
+        self._recent[:] = 0
+        self._lines = 0
+
+
+class _Pictures:
+    """Collects the pictures line by line, from values that are packed numbers and a half."""
+
+    def __init__(self, bands: PictureBands, kept: int, lines: int, samples: int) -> None:
+        self.rgb = np.empty((3, lines, samples), np.float32)
+        self.gray = np.empty((lines, samples), np.float32)
+        self.binned = np.empty((-(-kept // bands.bin_width), lines, samples), np.float32)
+        self._bands = bands
+        self._whole_bins = kept // bands.bin_width
+        self._in_whole_bins = self._whole_bins * bands.bin_width
+
+    def line(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
+        """Take what the pictures need of a line."""
+        bands = self._bands
+        self.rgb[:, line] = _reflectance(values[bands.rgb])
+        self.gray[line] = _reflectance(np.mean(values[bands.gray], axis=0))
+        binnable = values[: self._in_whole_bins].reshape(self._whole_bins, bands.bin_width, -1)
+        self.binned[: self._whole_bins, line] = _reflectance(binnable.mean(axis=1))
+        if len(self.binned) > self._whole_bins:
+            self.binned[-1, line] = _reflectance(values[self._in_whole_bins :].mean(axis=0))
+
+
+def _reflectance(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    return (values - _HALF) * np.float32(1.0 / REFLECTANCE_SCALE)
+
+
+def _line_constants(
+    calibration: FrameCalibration, samples: int
+) -> tuple[Float[np.ndarray, "kept samples"], Float[np.ndarray, "kept samples"]]:
+    """``scale`` and ``offset`` that turn a line's counts into packed numbers (and a half, where there is no flat)."""
+    shape = (len(calibration.bands), samples)
+    dark, gain = (
+        np.broadcast_to(array.T[calibration.bands], shape) for array in (calibration.dark, calibration.gain)
+    )
+    scale = gain * float(REFLECTANCE_SCALE)
+    offset = -dark * scale + (0.5 if calibration.flat is None else 0.0)
+    if calibration.dead is not None:
+        dead = calibration.dead.T[calibration.bands]
+        scale[dead] = 0.0
+        offset[dead] = 0.0
+    if not (np.isfinite(scale).all() and np.isfinite(offset).all()):
+        raise ValueError("dark or gain is not finite at an element that is neither dead nor in a band left out")
+    return scale.astype(np.float32), offset.astype(np.float32)
+
+
+def _reciprocal(flat: Float[np.ndarray, "lines samples"]) -> Float[np.ndarray, "lines samples"]:
+    if not (np.isfinite(flat).all() and (flat > 0.0).all()):
+        raise ValueError("the illumination is not positive everywhere")
+    return np.reciprocal(flat, dtype=np.float32)
+
+
+def _tests_of_counts(calibration: FrameCalibration, dtype: np.dtype) -> list[tuple[str, PixelFlag, _Test]]:
+    """What this frame's counts (as float32) have to be tested for; the first that holds counts."""
+    tests: list[tuple[str, PixelFlag, _Test]] = []
+    if dtype.kind == "f":
+        tests.append(("no_data", PixelFlag.NO_DATA, lambda values: ~np.isfinite(values)))
+    if calibration.ignore_value is not None:
+        with np.errstate(over="ignore"):
+            ignored = np.float32(calibration.ignore_value)
+        tests.append(("no_data", PixelFlag.NO_DATA, lambda values: values == ignored))
+    if calibration.saturation_counts is not None:
+        level = np.float32(calibration.saturation_counts)
+        tests.append(("saturated", PixelFlag.SATURATED, lambda values: values >= level))
+    return tests
+
+
+def _band_major(line: Num[np.ndarray, "samples bands"]) -> Num[np.ndarray, "bands samples"]:
+    """The line with neighbouring samples beside each other, as they are in BIL and BSQ files."""
+    if line.strides[1] != line.itemsize:
+        return line.T
+    moved = cv2.transpose(np.ascontiguousarray(line).view(_MOVED_AS[line.itemsize]))
+    return moved.view(line.dtype)
 
 
 def dark_counts(
