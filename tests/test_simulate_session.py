@@ -11,6 +11,7 @@ import tyro
 
 from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.data.envi import open_cube
+from hsi_sc_nerf.data.specim_iq import read_metadata
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
@@ -43,7 +44,9 @@ def test_folder_is_as_the_instrument_leaves_it(small_session):
     assert cube.shape == (48, 48, 12)
     assert cube.interleave == "bil"
     assert cube.dtype == np.uint16
-    assert (small_session / "apple_001" / "metadata" / "apple_001.xml").is_file()
+    metadata = read_metadata(small_session / "apple_001" / "metadata" / "apple_001.xml")
+    assert metadata.integration_time_ms == cube.integration_time_ms == 10.0
+    assert not metadata.is_specim_iq
     assert json.loads((small_session / "session.json").read_text()) == {
         "object": "apple",
         "nominal_step_deg": 120.0,
@@ -53,6 +56,7 @@ def test_folder_is_as_the_instrument_leaves_it(small_session):
         "container_diameter_m": 0.09,
         "container_height_m": 0.07,
         "white_reference": "white_reference",
+        "image_rotation_deg": 0,
     }
 
 

@@ -16,6 +16,8 @@ from hsi_sc_nerf.errors import InputError
 
 IMAGE_ROTATION_DEG = 90
 """The slit stands upright and scans sideways: counts and REFLECTANCE lie turned by this, counter-clockwise."""
+# Fields that no other camera's metadata have, spelt as ``_plain`` leaves them: WR_mode and datacube_angle.
+_FIELDS_OF_ITS_OWN = ("wrmode", "datacubeangle")
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,8 @@ def read_metadata(path: Path) -> SpecimMetadata:
     A field's name may be an attribute ``field`` or ``name`` or the element's own, in any letters, with blanks,
     hyphens or underscores.
 
-    A real instrument is known by its name anywhere in the file, or by the field ``WR_mode``, which no other camera
-    has; a file that says "simulated" is none.
+    A real instrument is known by its name anywhere in the file or by the fields ``WR_mode`` and ``datacube_angle``,
+    which no other camera has; a file that says "simulated" is none.
 
     Raises:
         InputError: no XML, or an integration time that is not a positive number.
@@ -61,7 +63,7 @@ def read_metadata(path: Path) -> SpecimMetadata:
             values.setdefault(_plain(name), text)
         words += [text, *element.attrib.values()]
     everything = _plain(" ".join(words))
-    named = "specimiq" in everything or "wrmode" in values
+    named = "specimiq" in everything or any(field in values for field in _FIELDS_OF_ITS_OWN)
     return SpecimMetadata(
         path=path,
         integration_time_ms=_integration_time_ms(path, values.get("integrationtime") or values.get("tint")),

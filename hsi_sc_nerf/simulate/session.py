@@ -17,19 +17,20 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
-from hsi_sc_nerf.simulate.effects.stages import FramePlan
+from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
 from hsi_sc_nerf.simulate.frames import Capture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_REFERENCE = "white_reference"
 WORKERS = 2
 """Frames that are made at the same time."""
+SENSOR = "simulated SPECIM IQ"
 METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
 <properties xmlns="http://www.specim.fi/iq">
   <dataset>
     <key field="name">{name}</key>
-    <key field="sensor">simulated SPECIM IQ</key>
-    <key field="integration time" unit="ms">{integration_time_ms:g}</key>
+    <key field="sensor">{sensor}</key>
+    <key field="integration_time" unit="ms">{integration_time_ms}</key>
   </dataset>
 </properties>
 """
@@ -103,7 +104,7 @@ def _move_into_place(building: Path, session_dir: Path) -> None:
 def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     scene = simulation.scene
     truth.write_truth(session_dir, simulation)
-    values = _session_values(scene, simulation.plan)
+    values = _session_values(simulation)
     (session_dir / "session.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     _write_capture(session_dir, WHITE_REFERENCE, simulation.white(), simulation)
 
@@ -127,8 +128,10 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
             raise
 
 
-def _session_values(scene: Scene, plan: FramePlan) -> dict[str, object]:
+def _session_values(simulation: Simulation) -> dict[str, object]:
     """What the instrument can't tell, as a user would write it down."""
+    scene, plan = simulation.scene, simulation.plan
+    quarter_turns = sum(effect.quarter_turns for effect in scene.effects if isinstance(effect, ImageRotation))
     return {
         "object": scene.name,
         "nominal_step_deg": plan.nominal_step_deg,
@@ -138,15 +141,23 @@ def _session_values(scene: Scene, plan: FramePlan) -> dict[str, object]:
         "container_diameter_m": scene.container.diameter_m,
         "container_height_m": scene.container.height_m,
         "white_reference": WHITE_REFERENCE,
+        "image_rotation_deg": 90 * quarter_turns % 360,
     }
 
 
 def _write_capture(session_dir: Path, name: str, capture: Capture, simulation: Simulation) -> None:
-    folder, wavelengths_nm = session_dir / name / "capture", simulation.wavelengths_nm
-    write_cube(folder / f"{name}.hdr", capture.counts, wavelengths_nm=wavelengths_nm, interleave="bil")
-    write_cube(folder / f"DARKREF_{name}.hdr", capture.dark, wavelengths_nm=wavelengths_nm, interleave="bil")
+    folder = session_dir / name / "capture"
+    for prefix, cube in (("", capture.counts), ("DARKREF_", capture.dark)):
+        write_cube(
+            folder / f"{prefix}{name}.hdr",
+            cube,
+            wavelengths_nm=simulation.wavelengths_nm,
+            interleave="bil",
+            extra_header={"sensor type": SENSOR, "tint": capture.integration_time_ms},
+        )
     metadata = session_dir / name / "metadata"
     metadata.mkdir(exist_ok=True)
     (metadata / f"{name}.xml").write_text(
-        METADATA_XML.format(name=name, integration_time_ms=simulation.integration_time_ms), encoding="utf-8"
+        METADATA_XML.format(name=name, sensor=SENSOR, integration_time_ms=capture.integration_time_ms),
+        encoding="utf-8",
     )
