@@ -196,11 +196,16 @@ class SpectralModel(NerfactoModel):
         outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
         return outputs
 
+    def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
+        """Reflectance, and which values of it are measurements where not all are."""
+        valid = batch.get("valid")
+        return batch["spectral"].to(self.device), None if valid is None else valid.to(self.device)
+
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
         """PSNR of the batch over all bands, distortion, size of the pose corrections."""
         with torch.no_grad():
-            squared_error = (outputs["spectral"] - batch["spectral"].to(self.device)).square().mean()
-            metrics = {"psnr": -10.0 * safe_log10(squared_error)}
+            target, valid = self._measured(batch)
+            metrics = {"psnr": -10.0 * safe_log10(hsi_loss(outputs["spectral"], target, valid=valid))}
         if self.training:
             metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
         self.camera_optimizer.get_metrics_dict(metrics)
@@ -208,12 +213,13 @@ class SpectralModel(NerfactoModel):
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's composite loss (section "Loss Function"); a term of weight zero is not computed."""
-        config, target = self.config, batch["spectral"].to(self.device)
+        config = self.config
+        target, valid = self._measured(batch)
         losses = {}
         if config.hsi_loss_mult > 0:
-            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target)
+            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target, valid=valid)
         if config.angular_loss_mult > 0:
-            losses["angular_loss"] = config.angular_loss_mult * angular_loss(outputs["spectral"], target)
+            losses["angular_loss"] = config.angular_loss_mult * angular_loss(outputs["spectral"], target, valid=valid)
         if not self.training:
             return losses
         assert metrics_dict is not None
@@ -229,12 +235,13 @@ class SpectralModel(NerfactoModel):
 
     def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""
-        truth, rendered = batch["spectral"].to(self.device), outputs["spectral"].to(self.device)
+        truth, valid = self._measured(batch)
+        rendered = outputs["spectral"].to(self.device)
         mask = batch["mask"].to(self.device)[..., 0].bool()
-        metrics = spectral_metrics(rendered, truth, mask)
-        metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth).items()}
+        metrics = spectral_metrics(rendered, truth, mask, valid)
+        metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth, None, valid).items()}
 
-        angle = spectral_angle_map(rendered, truth)[..., None] / ANGLE_PICTURE_MAX_RAD
+        angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_PICTURE_MAX_RAD
         images = {
             "img": torch.cat([truth[..., self.rgb_bands], rendered[..., self.rgb_bands]], dim=1).clamp(0.0, 1.0),
             "spectral_angle": colormaps.apply_colormap(angle.clamp(0.0, 1.0)),
