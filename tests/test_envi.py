@@ -5,16 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from spectral.io import envi as spy
 
 from hsi_sc_nerf.data.envi import open_cube, write_cube
+from hsi_sc_nerf.data.envi_header import read_header
 from hsi_sc_nerf.errors import InputError
 
 MAIZE = Path(__file__).parent / "data" / "maize_kernel"
 WAVELENGTHS_NM = np.array([450.25, 550.5, 650.75, 851.0])
-DTYPES = ["uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 
 
 def some_cube(dtype="uint16", shape=(3, 5, 4)) -> np.ndarray:
@@ -28,35 +26,19 @@ def header(tmp_path) -> Path:
     return path
 
 
+def add(header: Path, *fields: str) -> None:
+    header.write_text("\n".join([header.read_text(), *fields, ""]))
+
+
+def list_wavelengths(header: Path, wavelengths: np.ndarray) -> None:
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")] + f"wavelength = {{{', '.join(map(str, wavelengths))}}}\n")
+
+
 def edit(header: Path, old: str, new: str) -> None:
     text = header.read_text()
     assert old in text
     header.write_text(text.replace(old, new))
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.sampled_from(["bil", "bip", "bsq"]),
-    st.sampled_from(DTYPES),
-    st.sampled_from(["little", "big"]),
-    st.sampled_from([".raw", ".dat", ".img", ".bip", ""]),
-    st.tuples(st.integers(1, 4), st.integers(1, 4), st.integers(1, 4)),
-)
-def test_round_trip(tmp_path_factory, interleave, dtype, byte_order, suffix, shape):
-    path = tmp_path_factory.mktemp("cube") / "a.b.hdr"
-    cube = some_cube(dtype, shape)
-    wavelengths = 400.0 + np.arange(shape[2])
-    write_cube(
-        path, cube, wavelengths_nm=wavelengths, interleave=interleave, data_suffix=suffix, byte_order=byte_order
-    )
-    opened = open_cube(path)
-    assert opened.shape == shape
-    assert opened.interleave == interleave
-    assert opened.read().dtype == np.dtype(dtype)
-    np.testing.assert_array_equal(opened.read(), cube)
-    np.testing.assert_array_equal(opened.memmap(), cube)
-    np.testing.assert_array_equal(opened.wavelengths_nm, wavelengths)
-    assert sorted(p.name for p in path.parent.iterdir()) == sorted([path.name, f"a.b{suffix}"])
 
 
 def test_spy_reads_what_we_write_and_the_map_loads_nothing(header):
@@ -71,26 +53,78 @@ def test_reflectance_scale(tmp_path):
     np.testing.assert_allclose(open_cube(path).reflectance(), some_cube() / 200.0, rtol=1e-6)
 
 
-def test_header_offset_comment_and_case(header):
-    data = header.with_suffix(".raw")
-    data.write_bytes(b"12345678" + data.read_bytes())
-    edit(header, "header offset = 0", "; a comment = 3\nHeader Offset = 8")
-    edit(header, "interleave = bil", "interleave = BIL")
+def test_ignored_values_are_no_reflectance(tmp_path):
+    path, cube = tmp_path / "r.hdr", some_cube()
+    write_cube(path, cube, wavelengths_nm=WAVELENGTHS_NM, extra_header={"data ignore value": 7})
+    opened = open_cube(path)
+    assert opened.ignore_value == 7.0
+    np.testing.assert_array_equal(np.isnan(opened.reflectance()), cube == 7)
+
+
+def test_bands_that_are_bad_and_how_wide_they_are(header):
+    add(header, "bbl = {1, 1.0, 0, 1,}", "fwhm = { 2, 2.5, 3, 3.5 }", "tint = 12.500000")
+    cube = open_cube(header)
+    assert cube.good_bands.tolist() == [True, True, False, True]
+    assert cube.fwhm_nm.tolist() == [2.0, 2.5, 3.0, 3.5]
+    assert cube.integration_time_ms == 12.5
+
+
+def test_fwhm_is_in_the_wavelengths_unit(header):
+    edit(header, "wavelength units = nm", "wavelength units = Micrometers\nfwhm = {0.002, 0.002, 0.002, 0.003}")
+    list_wavelengths(header, WAVELENGTHS_NM / 1000.0)
+    np.testing.assert_allclose(open_cube(header).fwhm_nm, [2.0, 2.0, 2.0, 3.0])
+
+
+def test_a_bare_header_tells_nothing(header):
+    cube = open_cube(header)
+    assert cube.good_bands.all()
+    assert (cube.fwhm_nm, cube.ignore_value, cube.integration_time_ms) == (None, None, None)
+
+
+@pytest.mark.parametrize("empty", ["tint = ", "tint = 0", "bbl = {}", "fwhm = { }", "data ignore value ="])
+def test_empty_fields_are_missing_fields(header, empty):
+    add(header, empty)
+    cube = open_cube(header)
+    assert cube.good_bands.all()
+    assert (cube.fwhm_nm, cube.ignore_value, cube.integration_time_ms) == (None, None, None)
+
+
+@pytest.mark.parametrize("listed", [None, "wavelength = {}", "wavelength units = Index\nwavelength = {1, 2, 3, 4}"])
+def test_wavelengths_from_elsewhere(header, listed):
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")] + (listed or ""))
+    assert read_header(header).wavelengths_nm is None
+    np.testing.assert_array_equal(open_cube(header, WAVELENGTHS_NM).wavelengths_nm, WAVELENGTHS_NM)
+    with pytest.raises(InputError, match=r"cube\.hdr: gives no wavelengths; .*band_centres"):
+        open_cube(header)
+    with pytest.raises(InputError, match=r"no wavelengths, and the list of 3 band centres .* its 4 bands"):
+        open_cube(header, WAVELENGTHS_NM[:3])
+
+
+def test_the_headers_wavelengths_go_before_those_from_elsewhere(header):
+    np.testing.assert_array_equal(open_cube(header, WAVELENGTHS_NM + 1.0).wavelengths_nm, WAVELENGTHS_NM)
+
+
+def test_of_two_data_files_the_one_that_fits(header):
+    header.with_suffix("").write_bytes(b"a note")
+    assert open_cube(header).data_path == header.with_suffix(".raw")
+
+
+def test_a_letter_that_only_latin_1_has(header):
+    header.write_bytes(header.read_text().replace("ENVI\n", "ENVI\nremark = Wei\xdfreferenz\n").encode("latin-1"))
     np.testing.assert_array_equal(open_cube(header).read(), some_cube())
 
 
-def test_missing_byte_order_is_little_endian(header):
-    edit(header, "byte order = 0\n", "")
-    np.testing.assert_array_equal(open_cube(header).read(), some_cube())
-
-
-@pytest.mark.parametrize("unit", ["micrometers", "um", "µm", "", "Unknown"])
+@pytest.mark.parametrize("unit", ["micrometers", "um", "\N{GREEK SMALL LETTER MU}m", "", "Unknown"])
 def test_micrometres_become_nm(header, unit):
     edit(header, "wavelength units = nm", f"wavelength units = {unit}")
-    listed = ", ".join(str(w / 1000.0) for w in WAVELENGTHS_NM)
-    text = header.read_text()
-    header.write_text(text[: text.index("wavelength = {")] + f"wavelength = {{{listed}}}\n")
+    list_wavelengths(header, WAVELENGTHS_NM / 1000.0)
     np.testing.assert_allclose(open_cube(header).wavelengths_nm, WAVELENGTHS_NM)
+
+
+@pytest.mark.parametrize("name", ["white_reference_crop", "dark_reference_crop"])
+def test_real_references_open(name):
+    assert open_cube(MAIZE / f"{name}.hdr").wavelengths_nm[[0, -1]].tolist() == [366.551, 1048.421]
 
 
 def test_real_maize_kernel_opens():
@@ -127,14 +161,58 @@ def test_data_of_another_length(header, change, word):
         ("lines = 3\n", "", "does not give lines"),
         ("lines = 3", "lines = three", "cannot be read"),
         ("lines = 3", "lines = 0", "no spectral image"),
+        ("header offset = 0", "header offset = -8", "no spectral image"),
+        ("header offset = 0", "header offset = 0\nmajor frame offsets = {0, 4}", "major frame offsets"),
+        ("header offset = 0", "header offset = 0\nminor frame offsets = 2", "minor frame offsets"),
+        ("header offset = 0", "header offset = 0\nfile compression = 1", "file compression"),
+        ("header offset = 0", "header offset = 0\nreflectance scale factor = 0", "scale factor 0 is not positive"),
+        ("header offset = 0", "header offset = 0\nreflectance scale factor = many", "no number"),
+        ("header offset = 0", "header offset = 0\ndata ignore value = none", "data ignore value is no number"),
+        ("header offset = 0", "header offset = 0\ntint = long", "tint is no number"),
+        ("header offset = 0", "header offset = 0\nbbl = {1, 1, 0}", "bbl lists 3 numbers for 4 bands"),
+        ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, 2, 2}", "fwhm lists 5 numbers for 4 bands"),
+        ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, nan}", "fwhm .* not finite"),
+        ("}", "", "no readable ENVI header"),
+        ("byte order = 0", "byte order = 2", "byte order 2"),
+        ("file type = ENVI Standard", "file type = ENVI Spectral Library", "spectral library"),
+        ("units = nm", "units = Wavenumber", "wavenumber, not as wavelengths"),
+        ("units = nm", "units = Micrometers", "none of an imaging spectrometer"),
+        ("450.25", "0.45", "none of an imaging spectrometer"),
         ("data type = 12", "data type = 77", "cannot be read"),
-        ("data type = 12", "data type = 6", "no spectral image"),
+        ("data type = 12", "data type = 6", "complex numbers"),
+        ("data type = 12\n", "data type =\n", "does not give data type"),
         ("ENVI\n", "ENVY\n", "no readable ENVI header"),
     ],
 )
 def test_headers_that_cannot_be_used(header, old, new, message):
     edit(header, old, new)
     with pytest.raises(InputError, match=rf"cube\.hdr.*{message}"):
+        open_cube(header)
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n", b"\x00\x01\xff" * 50, b"ENVI\x00\x00", bytes(range(256)) * 9])
+def test_a_header_that_is_none(header, content):
+    header.write_bytes(content)
+    with pytest.raises(InputError, match=r"cube\.hdr: is no readable ENVI header"):
+        open_cube(header)
+
+
+def test_a_header_without_fields(header):
+    header.write_text("ENVI\n")
+    with pytest.raises(InputError, match="does not give lines, samples, bands, data type, interleave"):
+        open_cube(header)
+
+
+def test_an_empty_data_file(header):
+    header.with_suffix(".raw").write_bytes(b"")
+    with pytest.raises(InputError, match=r"cube\.raw: has 0 bytes, fewer than the 120"):
+        open_cube(header)
+
+
+def test_a_header_with_another_band_count(header):
+    edit(header, "bands = 4", "bands = 3")
+    list_wavelengths(header, WAVELENGTHS_NM[:3])
+    with pytest.raises(InputError, match=r"cube\.raw: has 120 bytes, more than the 90"):
         open_cube(header)
 
 

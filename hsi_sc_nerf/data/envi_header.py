@@ -5,7 +5,9 @@ All that this package knows about the header format is here; the data file is ``
 
 from __future__ import annotations
 
+import codecs
 import math
+import re
 import tempfile
 import warnings
 from dataclasses import dataclass
@@ -20,6 +22,7 @@ from spectral.io.spyfile import InvalidFileError
 from hsi_sc_nerf.errors import InputError
 
 INTERLEAVES = ("bil", "bip", "bsq")
+_INDENTED_COMMENT = re.compile(rb"^[ \t]+;", re.MULTILINE)
 _REQUIRED = ("lines", "samples", "bands", "data type", "interleave")
 _NM_PER_UNIT = {
     "nm": 1.0,
@@ -145,22 +148,28 @@ def _mended_fields(path: Path) -> dict[str, Any]:
 def _parse(path: Path) -> dict[str, Any]:
     """SPy's dictionary of the header; what SPy stumbles over is put right in a copy that it reads instead."""
     with open(path, "rb") as file:
-        start = file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+        start = file.read(64).removeprefix(codecs.BOM_UTF8).lstrip()
         if not start.upper().startswith(b"ENVI") or b"\0" in start:
             raise InvalidFileError(f"{path} does not begin with ENVI")
         file.seek(0)
         content = file.read()
+    if content.isascii() and content.startswith(b"ENVI") and not _INDENTED_COMMENT.search(content):
+        return _parse_plain(path)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     fields = [line for line in text.lstrip().splitlines()[1:] if not line.lstrip().startswith(";")]
-    mended = "\n".join(["ENVI", *fields, ""])
-    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
-        warnings.simplefilter("ignore")  # field names are case-insensitive; SPy warns that it lowers them
+    with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "mended.hdr"
-        copy.write_text(mended, errors="replace")  # in the encoding that SPy reads with
-        return envi.read_envi_header(str(copy))
+        copy.write_text("\n".join(["ENVI", *fields, ""]), errors="replace")  # in the encoding that SPy reads with
+        return _parse_plain(copy)
+
+
+def _parse_plain(path: Path) -> dict[str, Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # field names are case-insensitive; SPy warns that it lowers them
+        return envi.read_envi_header(str(path))
 
 
 def _check_layout(
