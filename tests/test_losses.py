@@ -107,3 +107,106 @@ def test_non_finite_predictions_are_not_hidden() -> None:
         predicted[0, 0, 0] = bad
         assert not torch.isfinite(hsi_loss(predicted, target))
         assert not torch.isfinite(angular_loss(predicted, target))
+
+
+def some_valid() -> torch.Tensor:
+    """A third flagged; pixel (0, 0) has one valid band, pixel (0, 1) two, pixel (0, 2) none."""
+    valid = torch.rand(5, 6, 31, generator=torch.Generator().manual_seed(1)) > 1 / 3
+    valid[0, :3] = False
+    valid[0, 0, 7] = valid[0, 1, 3] = valid[0, 1, 30] = True
+    return valid
+
+
+@pytest.mark.parametrize("mask", [None, half_mask()], ids=["all", "masked"])
+def test_only_valid_values_count(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    squares, angles = [], []
+    for row in range(5):
+        for column in range(6):
+            if mask is not None and not mask[row, column]:
+                continue
+            bands = [band for band in range(31) if valid[row, column, band]]
+            p, t = predicted[row, column, bands].double().numpy(), target[row, column, bands].double().numpy()
+            squares.extend((p - t) ** 2)
+            if len(bands) >= 2:
+                angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
+    assert hsi_loss(predicted, target, mask, valid).item() == pytest.approx(np.mean(squares), rel=1e-6)
+    assert angular_loss(predicted, target, mask, valid).item() == pytest.approx(np.mean(angles), rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_everything_valid_changes_nothing(loss) -> None:
+    predicted, target = (values.requires_grad_() for values in pair())
+    everything = torch.ones_like(predicted, dtype=torch.bool)
+    gradients = []
+    for valid in (None, everything):
+        predicted.grad = None
+        value = loss(predicted, target, half_mask(), valid)
+        value.backward()
+        gradients.append((value.detach(), predicted.grad))
+    for with_none, with_valid in zip(*gradients, strict=True):
+        torch.testing.assert_close(with_valid, with_none, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("anything", [0.0, 1e30, float("nan"), float("inf")])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: float) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    expected = loss(predicted, target, None, valid)
+    target[~valid] = predicted[~valid] = anything
+    predicted.requires_grad_()
+    value = loss(predicted, target, None, valid)
+    value.backward()
+    assert value.item() == expected.item()
+    assert not predicted.grad[~valid].any()
+    assert predicted.grad[valid].abs().sum() > 0
+    assert torch.isfinite(predicted.grad).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_batch_without_measurements_costs_nothing(loss) -> None:
+    predicted, target = pair()
+    predicted.requires_grad_()
+    value = loss(predicted, target * float("nan"), None, torch.zeros(5, 6, 31, dtype=torch.bool))
+    value.backward()
+    assert value.item() == 0
+    assert not predicted.grad.any()
+
+
+def test_the_direction_floor_is_a_root_mean_square_of_the_valid_bands() -> None:
+    """What a few valid bands of a dark spectrum cost is what a spectrum of these bands alone would cost."""
+    predicted, target = (1e-4 * spectra[0] for spectra in pair())
+    valid = torch.zeros(6, 31, dtype=torch.bool)
+    valid[:, ::4] = True
+    alone = angular_loss(predicted[:, ::4], target[:, ::4])
+    assert angular_loss(predicted, target, valid=valid).item() == pytest.approx(alone.item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_over_valid_values_match_finite_differences(loss) -> None:
+    predicted, target = (values.double() for values in pair((2, 3, 5)))
+    valid = some_valid()[1:3, :3, :5]
+    assert torch.autograd.gradcheck(lambda values: loss(values, target, valid=valid), (predicted.requires_grad_(),))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-38, 1.0, 6e4, 3e38])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_of_valid_values_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
+    predicted, target = pair()
+    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
+    value = loss(predicted, target.to(dtype), None, some_valid())
+    value.backward()
+    assert value.dtype == torch.float32
+    assert torch.isfinite(value)
+    assert torch.isfinite(predicted.grad).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_validity_that_does_not_fit_is_refused(loss) -> None:
+    predicted, target = pair()
+    for valid in (half_mask(), torch.ones(5, 6, 31), torch.ones(5, 6, 30, dtype=torch.bool)):
+        with pytest.raises(ValueError, match="the validity of values of shape"):
+            loss(predicted, target, None, valid)

@@ -197,3 +197,124 @@ def test_pixels_outside_the_mask_may_be_anything(metric) -> None:
     expected = metric(predicted, target, blob())
     predicted[~blob()] = float("nan")
     torch.testing.assert_close(metric(predicted, target, blob()), expected)
+
+
+def some_valid() -> torch.Tensor:
+    """A fifth flagged; band 4 wholly, pixel (3, 9) but for one band, pixel (3, 10) wholly."""
+    valid = torch.rand(H, W, BANDS, generator=torch.Generator().manual_seed(5)) > 0.2
+    valid[..., 4] = False
+    valid[3, 9:11] = False
+    valid[3, 9, 2] = True
+    return valid
+
+
+def score_of_windows(
+    x: np.ndarray, y: np.ndarray, valid: np.ndarray, centres: list[tuple[int, int]], reach: int
+) -> float:
+    """Mean SSIM of one band over Gaussian windows of the valid values around each centre."""
+    scores = []
+    for row, column in centres:
+        rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
+        weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
+        weights[(abs(rows - row) > reach) | (abs(columns - column) > reach)] = 0
+        w, a, b = weights[valid], x[valid], y[valid]
+        mean_a, mean_b = np.average(a, weights=w), np.average(b, weights=w)
+        variances = np.average((a - mean_a) ** 2, weights=w) + np.average((b - mean_b) ** 2, weights=w)
+        covariance = np.average((a - mean_a) * (b - mean_b), weights=w)
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        scores.append(luminance * (2 * covariance + 9e-4) / (variances + 9e-4))
+    return float(np.mean(scores))
+
+
+@MASKS
+def test_only_valid_values_are_judged(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
+    p, t, v = (image.numpy()[chosen] for image in (predicted.double(), target.double(), valid))
+    angles, squares, roots = [], [], []
+    for pixel in range(len(p)):
+        a, b = p[pixel][v[pixel]], t[pixel][v[pixel]]
+        squares.extend((a - b) ** 2)
+        if len(a) >= 1:
+            roots.append(math.sqrt(np.mean((a - b) ** 2)))
+        if len(a) >= 2:
+            angles.append(math.acos(min(1.0, a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))))
+    similarity, ratio, windowed = [], [], []
+    for band in range(BANDS - 1):  # nothing is valid in the last one
+        a, b = p[v[:, band], band], t[v[:, band], band]
+        covariance = np.mean((a - a.mean()) * (b - b.mean()))
+        luminance = (2 * a.mean() * b.mean() + 1e-4) / (a.mean() ** 2 + b.mean() ** 2 + 1e-4)
+        similarity.append(luminance * (2 * covariance + 9e-4) / (a.var() + b.var() + 9e-4))
+        ratio.append(-10 * math.log10(np.mean((a - b) ** 2) + 1e-10))
+        in_band = valid[..., band].numpy()
+        centres = list(zip(*np.nonzero(chosen & in_band), strict=True))
+        images = (image[..., band].double().numpy() for image in (predicted, target))
+        windowed.append(score_of_windows(*images, in_band, centres, reach=5))
+    found = metrics.spectral_metrics(predicted, target, mask, valid)
+    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
+    assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
+    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
+    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
+    assert found["ssim_windowed"] == pytest.approx(np.mean(windowed), rel=1e-5)
+    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
+
+
+@MASKS
+def test_everything_valid_changes_nothing(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    found = metrics.spectral_metrics(predicted, target, mask, torch.ones(H, W, BANDS, dtype=torch.bool))
+    assert found == pytest.approx(metrics.spectral_metrics(predicted, target, mask), rel=1e-6)
+
+
+@pytest.mark.parametrize("anything", [0.0, -7.0, 1e30, float("nan")])
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_flagged_values_may_be_anything(metric, anything: float) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    expected = metric(predicted, target, blob(), valid)
+    target[~valid] = predicted[~valid] = anything
+    assert metric(predicted, target, blob(), valid).item() == expected.item()
+
+
+@MASKS
+def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool)
+    assert metrics.spectral_metrics(predicted, target, mask, nothing) == pytest.approx(
+        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
+    )
+
+
+def test_maps_are_nan_where_nothing_can_be_told() -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    angles = metrics.spectral_angle_map(predicted, target, valid)
+    np.testing.assert_array_equal(angles.isnan(), valid.sum(-1) < 2)
+    errors = metrics.squared_error_map(predicted, target, valid)
+    np.testing.assert_array_equal(errors.isnan(), valid.sum(-1) < 1)
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_errors_of_valid_values_are_not_hidden(metric) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    row, column, band = ((valid & blob()[..., None]) & (valid.sum(-1, keepdim=True) > 2)).nonzero()[0]
+    predicted[row, column, band] = float("nan")
+    assert math.isnan(metric(predicted, target, blob(), valid).item())
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_blocks_of_valid_values_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted, target = pair()
+    whole = metric(predicted, target, blob(), some_valid())
+    monkeypatch.setattr(metrics, "_BLOCK_VALUES", 2 * H * W)
+    torch.testing.assert_close(metric(predicted, target, blob(), some_valid()), whole, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_a_validity_that_does_not_fit_is_refused(metric) -> None:
+    predicted, target = pair()
+    for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
+        with pytest.raises(ValueError, match="the validity of values of shape"):
+            metric(predicted, target, blob(), valid)

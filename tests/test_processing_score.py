@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.packed import open_packed
+from hsi_sc_nerf.data.packed import open_packed, pack, unpack, write_packed_cube
 from hsi_sc_nerf.evaluation.processing import score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -63,3 +63,55 @@ def test_reflectance_and_masks_of_another_frame_are_seen(dataset_and_truth):
     mixed = score_processing(replace(dataset, frames=tuple(frames)), truth)
     assert mixed.reflectance_rmse > 3 * honest.reflectance_rmse
     assert mixed.mask_iou < honest.mask_iou
+
+
+def with_cubes(dataset, folder, change):
+    """The dataset with its cubes' reflectance and validity changed, in another folder."""
+    frames = []
+    for frame in dataset.frames:
+        reflectance, valid = unpack(frame.cube())
+        change(reflectance, valid)
+        path = folder / frame.cube_path.name
+        write_packed_cube(path, pack(np.where(valid, reflectance, np.nan)), dataset.wavelengths_nm)
+        frames.append(replace(frame, cube_path=path))
+    return replace(dataset, frames=tuple(frames))
+
+
+def test_flagged_values_are_counted_and_not_judged(dataset_and_truth, tmp_path):
+    dataset, truth = dataset_and_truth
+    honest = score_processing(dataset, truth)
+    assert honest.flagged_share == 0.0
+
+    def flag(reflectance, valid):
+        valid[:28, :, ::2] = False  # a quarter of 112 lines, half of the bands
+
+    score = score_processing(with_cubes(dataset, tmp_path, flag), truth)
+    assert score.flagged_share == pytest.approx(1 / 8)
+    assert score.reflectance_rmse == pytest.approx(honest.reflectance_rmse, rel=0.2)
+
+    def flag_all(reflectance, valid):
+        valid[:] = False
+
+    assert np.isnan(score_processing(with_cubes(dataset, tmp_path, flag_all), truth).reflectance_rmse)
+
+
+def test_reflectance_is_compared_with_the_truth_of_its_bands_clipped_likewise(dataset_and_truth, tmp_path):
+    dataset, truth = dataset_and_truth
+    bright = replace(truth, endmembers=4.0 * truth.endmembers)
+
+    def lit(reflectance, valid):
+        reflectance[:] = np.clip(4.0 * reflectance, 0.0, 1.0)
+
+    honest, clipped = score_processing(dataset, truth), with_cubes(dataset, tmp_path, lit)
+    assert score_processing(clipped, bright).reflectance_rmse < 4.0 * honest.reflectance_rmse
+    assert score_processing(clipped, bright, (0.0, 4.0)).reflectance_rmse > 8.0 * honest.reflectance_rmse
+
+    kept = [1, 4, 5]
+    frames = []
+    for frame in dataset.frames:
+        write_packed_cube(
+            tmp_path / f"kept_{frame.capture}.hdr", frame.cube()[..., kept], dataset.wavelengths_nm[kept]
+        )
+        frames.append(replace(frame, cube_path=tmp_path / f"kept_{frame.capture}.hdr"))
+    fewer = replace(dataset, frames=tuple(frames), wavelengths_nm=dataset.wavelengths_nm[kept])
+    assert score_processing(fewer, truth).reflectance_rmse < 2.0 * honest.reflectance_rmse

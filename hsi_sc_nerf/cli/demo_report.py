@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.cli.steps import StepCost
 from hsi_sc_nerf.data.atomic import write_json
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, PackedDataset, open_packed
+from hsi_sc_nerf.data.packed import PackedDataset, open_packed, unpack
 from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
 from hsi_sc_nerf.evaluation.processing import ProcessingScore, score_processing
 from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface
@@ -91,6 +91,7 @@ def show_table(
         ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
         ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
         ("reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"),
+        ("values flagged, %", f"{100 * processing.flagged_share:.2f}", "-"),
         ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
     ):
         steps_table.add_row(title, reached, target)
@@ -130,7 +131,8 @@ def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray,
         front = behind[depth[behind] < depth[behind].min() + FRONT_LAYER_M]
         seen.append(spectra[front].mean(axis=0))
     columns, lines = np.floor(pixels).astype(int).T
-    measured = frame.cube()[lines, columns] / REFLECTANCE_SCALE
+    measured, valid = unpack(frame.cube()[lines, columns])
+    measured[~valid] = np.nan  # a gap in the curve
     labels = [chr(ord("A") + i) for i in range(len(pixels))]
     draw_spectra(path, dataset.wavelengths_nm, measured, np.array(seen), labels, frame.pseudo_rgb(), pixels)
 

@@ -129,7 +129,7 @@ def draw_spectra(
     Args:
         path: The PNG file.
         wavelengths_nm: Band centres.
-        truth: Measured reflectance of each point (solid).
+        truth: Measured reflectance of each point (solid); NaN, where it was not measured, is a gap.
         reconstructed: Reflectance of each point in the reconstruction (dashed).
         labels: A name for each point.
         image: Pseudo-RGB, float in [0, 1] or 8 bit.

@@ -118,7 +118,7 @@ def spectral_angle_mapper(
 def spectral_rmse(
     predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
 ) -> Float[Tensor, ""]:
-    """Root of the squared error's mean over pixels and bands (paper, spectral RMSE): every valid value counts alike."""
+    """Root of the squared error's mean over pixels and bands (paper, spectral RMSE); valid values count alike."""
     squares = squared_error_map(predicted, target, valid)
     return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else valid.sum(-1))), predicted)
 
