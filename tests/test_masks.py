@@ -15,6 +15,7 @@ from capture_factory import (
 from hsi_sc_nerf.data.masks import (
     MaskConfig,
     above_lid,
+    bin_width,
     choose_threshold,
     foreground_mask,
     foreground_score,
@@ -31,18 +32,22 @@ CONTAINER = Container(diameter_m=0.09, height_m=0.07)
 
 
 def test_score_is_the_spread_over_bins():
-    spectrum = np.array([0.1, 0.1, 0.1, 0.7, 0.7, 0.7], np.float32)
-    cube = np.broadcast_to(spectrum, (4, 4, 6)).copy()
-    np.testing.assert_allclose(foreground_score(cube, spectral_bins=2), 0.3, atol=1e-6)
-    np.testing.assert_allclose(foreground_score(cube, spectral_bins=24), cube.std(-1), atol=1e-6)
-    assert foreground_score(np.full((4, 4, 6), 0.4, np.float32)).max() < 1e-6
+    bins = np.random.default_rng(1).random((6, 5, 4), dtype=np.float32)
+    np.testing.assert_allclose(foreground_score(bins, smoothing_px=0.0), bins.std(axis=0), atol=1e-6)
+    assert (foreground_score(bins) < foreground_score(bins, smoothing_px=0.0)).mean() > 0.9
+    assert foreground_score(np.full((6, 4, 4), 0.4, np.float32)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("bands", "spectral_bins", "width"), [(204, 24, 9), (12, 24, 1), (24, 24, 1), (25, 24, 2)])
+def test_bins_of_one_width(bands, spectral_bins, width):
+    assert bin_width(bands, spectral_bins) == width
 
 
 def test_score_is_linear_in_the_share_of_a_pixel():
     plant = np.linspace(0.1, 0.6, 12)
     shares = np.array([0.0, 0.25, 0.5, 1.0])
     cube = (shares[:, None] * plant + (1 - shares[:, None]) * 0.8)[None].astype(np.float32)
-    score = foreground_score(cube, smoothing_px=0.0)[0]
+    score = foreground_score(np.moveaxis(cube, -1, 0), smoothing_px=0.0)[0]
     np.testing.assert_allclose(score, shares * score[-1], atol=1e-6)
 
 
@@ -95,7 +100,7 @@ def test_mask_is_one_whole_region_with_its_stem():
 
 @pytest.mark.parametrize("angle_deg", [0.0, 77.0])
 def test_mask_of_a_sphere(angle_deg):
-    score = foreground_score(frame_reflectance(angle_deg).astype(np.float32))
+    score = foreground_score(np.moveaxis(frame_reflectance(angle_deg), -1, 0).astype(np.float32))
     truth = sphere_mask(true_pose(angle_deg))
     mask = foreground_mask(score, choose_threshold([score], MaskConfig()))
     assert (mask & truth).sum() / (mask | truth).sum() > 0.97

@@ -50,9 +50,9 @@ def calls(monkeypatch) -> list[str]:
     seen = []
     real = process_module.process_frame
 
-    def counting(capture, *arguments, **options):
-        seen.append(capture.name)
-        return real(capture, *arguments, **options)
+    def counting(cube, *arguments, **options):
+        seen.append(cube.header_path.stem)
+        return real(cube, *arguments, **options)
 
     monkeypatch.setattr(process_module, "process_frame", counting)
     return seen
@@ -155,12 +155,13 @@ def test_a_stopped_run_goes_on(session, tmp_path, monkeypatch):
     done = []
     real = process_module.process_frame
 
-    def stops_at_the_third(capture, *arguments, **options):
-        if capture.name == "ball_3" and "stopped" not in done:
+    def stops_at_the_third(cube, *arguments, **options):
+        name = cube.header_path.stem
+        if name == "ball_3" and "stopped" not in done:
             done.append("stopped")
             raise KeyboardInterrupt
-        done.append(capture.name)
-        return real(capture, *arguments, **options)
+        done.append(name)
+        return real(cube, *arguments, **options)
 
     monkeypatch.setattr(process_module, "process_frame", stops_at_the_third)
     one_by_one = ProcessConfig(workers=1)

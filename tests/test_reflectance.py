@@ -34,7 +34,7 @@ def reference(counts, calibration):
 
 
 def shown(reflectance, why, bounds):
-    """What the pictures show: clipped, no data at the lower bound, dead elements replaced by a good neighbour."""
+    """What the pictures show: clipped, no data as the lower bound, dead elements replaced by a good neighbour."""
     values = np.clip(np.where(why == PixelFlag.NO_DATA, -np.inf, reflectance), *bounds)
     dead = (why == PixelFlag.DEAD).all(axis=0)
     for sample, band in np.argwhere(dead):
@@ -43,7 +43,7 @@ def shown(reflectance, why, bounds):
             nearest = good[np.abs(good - band).argmin()]
             values[:, sample, band] = values[:, sample, nearest]
         else:
-            values[:, sample, band] = 0.0
+            values[:, sample, band] = bounds[0]
     return values
 
 

@@ -6,21 +6,18 @@ A frame's cube and picture are written first and its notes last: a frame whose n
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Num, UInt8
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
-from hsi_sc_nerf.data.calibration.config import CalibrationConfig
-from hsi_sc_nerf.data.calibration.reflectance import calibrate
-from hsi_sc_nerf.data.calibration.white_reference import WhiteReference
-from hsi_sc_nerf.data.envi import open_cube
-from hsi_sc_nerf.data.masks import MaskConfig, foreground_score
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, pack, write_packed_cube
-from hsi_sc_nerf.data.pseudo_rgb import gray_image, pseudo_rgb
-from hsi_sc_nerf.data.session import Capture
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, PictureBands, Tally, pack_counts
+from hsi_sc_nerf.data.envi import Cube, open_cube
+from hsi_sc_nerf.data.masks import MaskConfig, bin_width, foreground_score
+from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, write_packed_cube
+from hsi_sc_nerf.data.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 
 
@@ -48,58 +45,73 @@ class FramePaths:
 
 @dataclass(frozen=True, eq=False)
 class FrameNotes:
-    """What finding poses and masks needs of a frame.
+    """What finding poses and masks, and the report, need of a frame; pictures are upright.
 
     Attributes:
         fingerprint: of the files and settings that the frame was made from.
         gray: in which markers are looked for.
         score: foreground score (``masks.foreground_score``).
+        tally: how many values were clipped and flagged, by kept band.
     """
 
     fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
     score: Float[np.ndarray, "lines samples"]
+    tally: Tally
 
 
 def finished_notes(paths: FramePaths, fingerprint: str) -> FrameNotes | None:
     """The notes of a frame that was finished from the same files with the same settings, or None."""
     try:
         with np.load(paths.notes) as stored:
-            notes = FrameNotes(str(stored["fingerprint"]), stored["gray"], stored["score"])
+            tally = Tally(**{f.name: stored[f.name] for f in fields(Tally)})
+            notes = FrameNotes(str(stored["fingerprint"]), stored["gray"], stored["score"], tally)
         open_cube(paths.cube)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
         return None
-    return notes if notes.fingerprint == fingerprint and paths.image.is_file() else None
+    complete = paths.image.is_file() and paths.flags.is_file()
+    return notes if complete and notes.fingerprint == fingerprint else None
 
 
 def process_frame(
-    capture: Capture,
+    cube: Cube,
+    calibration: FrameCalibration,
     paths: FramePaths,
     fingerprint: str,
-    white: WhiteReference,
-    calibration: CalibrationConfig,
     masks: MaskConfig,
     *,
     pseudo_rgb_nm: tuple[float, float, float],
     marker_range_nm: tuple[float, float],
 ) -> FrameNotes:
-    """Calibrate a frame; write its cube, its pseudo-RGB picture and its notes.
+    """Calibrate a frame's raw cube; write its packed cube, flags, pseudo-RGB picture and notes, all upright.
 
     Raises:
         InputError: the raw cube cannot be read or the disk is full.
     """
-    wavelengths_nm = capture.cube.wavelengths_nm
-    reflectance = calibrate(capture, white.spectrum, calibration)
-    write_packed_cube(paths.cube, pack(reflectance), wavelengths_nm)
-    write_png(paths.flags, np.zeros(reflectance.shape[:2], np.uint8))
-    write_png(paths.image, pseudo_rgb(reflectance, wavelengths_nm, pseudo_rgb_nm))
+    wavelengths_nm = cube.wavelengths_nm[calibration.bands]
+    widths_nm = None if cube.fwhm_nm is None else cube.fwhm_nm[calibration.bands]
+    pictures = PictureBands(
+        rgb=nearest_bands(wavelengths_nm, pseudo_rgb_nm),
+        gray=bands_within(wavelengths_nm, marker_range_nm),
+        bin_width=bin_width(len(wavelengths_nm), masks.spectral_bins),
+    )
+    frame = pack_counts(cube.memmap(), calibration, pictures)
+
+    def upright(image: Num[np.ndarray, "lines samples *channels"]) -> Num[np.ndarray, "h w *channels"]:
+        return np.rot90(image, calibration.quarter_turns)
+
+    write_packed_cube(paths.cube, upright(frame.packed), wavelengths_nm, widths_nm)
+    write_png(paths.flags, upright(frame.flags))
+    write_png(paths.image, upright(to_8_bit(np.moveaxis(frame.rgb, 0, -1))))
     notes = FrameNotes(
         fingerprint,
-        gray_image(reflectance, wavelengths_nm, marker_range_nm),
-        foreground_score(reflectance, spectral_bins=masks.spectral_bins, smoothing_px=masks.smoothing_px),
+        upright(to_8_bit(frame.gray)),
+        upright(foreground_score(frame.binned, masks.smoothing_px)),
+        frame.tally,
     )
     with atomic_write(paths.notes) as (temporary,):
-        np.savez(temporary, fingerprint=notes.fingerprint, gray=notes.gray, score=notes.score)
+        tally = {f.name: getattr(notes.tally, f.name) for f in fields(Tally)}
+        np.savez(temporary, fingerprint=notes.fingerprint, gray=notes.gray, score=notes.score, **tally)
     return notes
 
 
@@ -108,14 +120,18 @@ def border_spectrum(
 ) -> Float[np.ndarray, "bands"]:
     """Median reflectance spectrum of a packed frame along the image's border, the object left out.
 
-    The border is ``width_fraction`` of the image's shorter side wide, and one pixel at least. An object that fills
-    it all leaves nan.
+    The border is ``width_fraction`` of the image's shorter side wide, and one pixel at least. Flagged values do not
+    count; a band without any value there (an object that fills the border) is nan.
     """
     lines, samples = foreground.shape
     width = max(1, round(width_fraction * min(lines, samples)))
     border = ~foreground
     border[width : lines - width, width : samples - width] = False
-    pixels = open_cube(cube_path).memmap()[border]
-    if len(pixels) == 0:
-        return np.full(pixels.shape[-1], np.nan)
-    return np.median(pixels, axis=0) / REFLECTANCE_SCALE
+    # In ascending order the flagged values, which are the largest numbers, come last.
+    ordered = np.sort(open_cube(cube_path).memmap()[border], axis=0)
+    measured = (ordered != FLAGGED).sum(axis=0)
+    median = np.full(ordered.shape[1], np.nan)
+    some = np.flatnonzero(measured)
+    middle = [ordered[(measured[some] - odd) // 2, some] for odd in (0, 1)]
+    median[some] = np.mean(middle, axis=0) / REFLECTANCE_SCALE
+    return median

@@ -27,7 +27,8 @@ class MaskConfig:
     """Settings of the foreground masks."""
 
     spectral_bins: int = 24
-    """Neighbouring bands are averaged into this many bins before their spread is taken, which quiets noise."""
+    """Neighbouring bands are averaged into so many bins of equal width (or a few less) before their spread is taken,
+    which quiets noise."""
     smoothing_px: float = 0.5
     """Standard deviation of the Gaussian that smooths the bins over neighbouring pixels, pixels; 0 for none."""
     threshold: float | None = None
@@ -42,20 +43,24 @@ class MaskConfig:
     """The object may reach beyond the container's lid up to this many times its radius."""
 
 
+def bin_width(bands: int, spectral_bins: int) -> int:
+    """How many neighbouring bands a bin averages, so that there are ``spectral_bins`` or fewer bins of one width."""
+    return -(-bands // spectral_bins)
+
+
 def foreground_score(
-    reflectance: Float[np.ndarray, "lines samples bands"], *, spectral_bins: int = 24, smoothing_px: float = 0.5
+    binned: Float[np.ndarray, "bins lines samples"], smoothing_px: float = 0.5
 ) -> Float[np.ndarray, "lines samples"]:
     """Standard deviation over spectral bins of the (slightly smoothed) reflectance: 0 for a flat spectrum.
 
     Where a pixel is part object and part flat background the score is nearly its share times the object's score.
     """
-    bands = reflectance.shape[-1]
-    edges = np.unique(np.linspace(0, bands, min(spectral_bins, bands) + 1).astype(int))
-    widths = np.diff(edges).astype(np.float32)
-    binned = np.add.reduceat(reflectance, edges[:-1], axis=-1) / widths
-    if smoothing_px > 0.0:
-        binned = np.stack([cv2.GaussianBlur(b, (0, 0), smoothing_px) for b in np.moveaxis(binned, -1, 0)], axis=-1)
-    return binned.std(axis=-1)
+    smooth = [cv2.GaussianBlur(image, (0, 0), smoothing_px) for image in binned] if smoothing_px > 0.0 else binned
+    mean = np.mean(smooth, axis=0)
+    squares = np.zeros_like(mean)
+    for image in smooth:
+        cv2.accumulateSquare(image - mean, squares)
+    return np.sqrt(squares / len(binned))
 
 
 def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tuple[float, float]:

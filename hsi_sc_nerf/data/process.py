@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import write_json, write_png
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, dark_counts
 from hsi_sc_nerf.data.calibration.white_reference import WhiteReference, white_reference
 from hsi_sc_nerf.data.fingerprint import capture_files, fingerprint, session_fingerprint
 from hsi_sc_nerf.data.frames import FrameNotes, FramePaths, border_spectrum, finished_notes, process_frame
@@ -32,7 +33,7 @@ from hsi_sc_nerf.data.packed import (
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.data.report import mask_picture, white_reference_picture
 from hsi_sc_nerf.data.scene_box import object_box, scene_box
-from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Session, open_session
+from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Capture, Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.estimate import TurntablePoses, estimate_turntable_poses
 from hsi_sc_nerf.poses.picture import draw_poses
@@ -199,11 +200,10 @@ def _process_frames(
         paths = FramePaths.of(output_dir, capture.name)
         stamp = fingerprint([common, capture_files(session, capture)])
         return finished_notes(paths, stamp) or process_frame(
-            capture,
+            capture.cube,
+            _frame_calibration(capture, white, config.calibration),
             paths,
             stamp,
-            white,
-            config.calibration,
             config.masks,
             pseudo_rgb_nm=config.pseudo_rgb_nm,
             marker_range_nm=config.marker_range_nm,
@@ -224,6 +224,17 @@ def _process_frames(
             pool.shutdown(cancel_futures=True)
             raise
     return [future.result() for future in futures]
+
+
+def _frame_calibration(capture: Capture, white: WhiteReference, config: CalibrationConfig) -> FrameCalibration:
+    _, samples, bands = capture.cube.shape
+    dark = dark_counts(None if capture.dark is None else capture.dark.read(), samples)
+    return FrameCalibration(
+        dark=np.zeros((1, bands)) if dark is None else dark[0],
+        gain=1.0 / np.atleast_2d(white.spectrum),
+        bands=np.arange(bands),
+        bounds=config.bounds,
+    )
 
 
 def _container(session: Session) -> Container | None:
@@ -279,7 +290,6 @@ def _make_masks(
 
 
 def _background(frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]) -> Float[np.ndarray, "bands"]:
-    """Median over frames of the spectra along the image's border; nan-free, 0 where no frame shows background."""
+    """Median over frames of the spectra along the image's border; nan-free, 0 in bands that no frame shows there."""
     spectra = np.stack([border_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
-    shown = spectra[np.isfinite(spectra).all(axis=1)]
-    return np.median(shown, axis=0) if len(shown) else np.zeros(spectra.shape[1])
+    return np.ma.median(np.ma.masked_invalid(spectra), axis=0).filled(0.0)

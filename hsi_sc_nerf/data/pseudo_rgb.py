@@ -25,14 +25,21 @@ def pseudo_rgb(
     return to_8_bit(reflectance[..., nearest_bands(wavelengths_nm, rgb_nm)])
 
 
+def bands_within(
+    wavelengths_nm: Float[np.ndarray, "bands"], range_nm: tuple[float, float]
+) -> Int[np.ndarray, "inside"]:
+    """Indices of the bands in ``range_nm``; of all bands where the instrument has none there."""
+    inside = (wavelengths_nm >= range_nm[0]) & (wavelengths_nm <= range_nm[1])
+    return np.flatnonzero(inside if inside.any() else np.ones_like(inside))
+
+
 def gray_image(
     reflectance: Float[np.ndarray, "lines samples bands"],
     wavelengths_nm: Float[np.ndarray, "bands"],
     range_nm: tuple[float, float],
 ) -> UInt8[np.ndarray, "lines samples"]:
     """Mean over the bands in ``range_nm`` (over all bands where the instrument has none there)."""
-    inside = (wavelengths_nm >= range_nm[0]) & (wavelengths_nm <= range_nm[1])
-    return to_8_bit(reflectance[..., inside if inside.any() else slice(None)].mean(axis=-1))
+    return to_8_bit(reflectance[..., bands_within(wavelengths_nm, range_nm)].mean(axis=-1))
 
 
 def to_8_bit(reflectance: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

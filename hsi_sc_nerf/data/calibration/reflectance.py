@@ -113,7 +113,7 @@ class PackedReflectance:
     """A frame's reflectance and what was seen on the way, in the orientation of the file.
 
     In the pictures a dead element has the value of the pixel's nearest good band, a saturated one its clipped value
-    and no data the lower bound: nothing of `FLAGGED` is in them.
+    and what remains (no data, a pixel without any good band) the lower bound: nothing of `FLAGGED` is in them.
 
     Attributes:
         packed: reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none. Its memory lies upright:
@@ -191,7 +191,7 @@ def pack_counts(
         if least < low or most >= high + 1:
             for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
                 counters[name].add(clipped if flagged is None else clipped & ~flagged)
-            np.clip(values, low, high + _HALF, out=values)
+            np.clip(values, low + _HALF, high + _HALF, out=values)
         values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
         draw.line(line, values)
 
