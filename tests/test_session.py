@@ -1,13 +1,17 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_factory import BANDS, INFO, SIZE_PX, WAVELENGTHS_NM, write_capture, write_session
+from spectral.io import envi as spy
 
 from hsi_sc_nerf.data.envi import write_cube
-from hsi_sc_nerf.data.session import is_session, open_session, read_session_info
+from hsi_sc_nerf.data.session import is_session, open_session
+from hsi_sc_nerf.data.session_info import read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
 
 COUNTS = np.full((SIZE_PX, SIZE_PX, BANDS), 500, np.uint16)
@@ -114,6 +118,74 @@ def test_two_shared_dark_cubes(tmp_path):
         open_session(tmp_path)
 
 
+def without_wavelengths(header: Path) -> None:
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")])
+
+
+def test_wavelengths_of_another_cube(tmp_path):
+    write_session(tmp_path)
+    for name in ("ball_1", "DARKREF_ball_1", "ball_3"):
+        without_wavelengths(tmp_path / name.removeprefix("DARKREF_") / "capture" / f"{name}.hdr")
+    session = open_session(tmp_path)
+    for frame in session.frames:
+        np.testing.assert_array_equal(frame.cube.wavelengths_nm, WAVELENGTHS_NM)
+
+
+def test_wavelengths_of_a_list_beside_session_json(tmp_path):
+    write_session(tmp_path, info={**INFO, "band_centres": "bands.csv", "panel_reflectance": "panel.csv"})
+    (tmp_path / "bands.csv").write_text("wavelength_nm\n" + "".join(f"{w:.3f}\n" for w in WAVELENGTHS_NM))
+    (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.98\n")
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    session = open_session(tmp_path)
+    np.testing.assert_allclose(session.wavelengths_nm, WAVELENGTHS_NM, atol=1e-3)
+    assert session.panel_reflectance_path == tmp_path / "panel.csv"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("wavelength_nm\n400\n500\n", "the list of 2 band centres does not fit its 12 bands"),
+        ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
+        ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+        ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+    ],
+)
+def test_band_centres_that_cannot_be_used(tmp_path, content, message):
+    write_session(tmp_path, info={**INFO, "band_centres": "bands.csv"})
+    (tmp_path / "bands.csv").write_text(content)
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    with pytest.raises(InputError, match=message):
+        open_session(tmp_path)
+
+
+def test_the_instruments_own_list_of_band_centres():
+    path = resources.files("hsi_sc_nerf.simulate") / "specim_iq_band_centres_nm.csv"
+    centres_nm = read_band_centres(Path(str(path)))
+    assert (len(centres_nm), centres_nm[0], centres_nm[-1]) == (204, 397.32, 1003.58)
+
+
+def test_no_wavelengths_anywhere(tmp_path):
+    write_session(tmp_path)
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    with pytest.raises(InputError, match=r"\.hdr: gives no wavelengths; .*'band_centres' in session\.json"):
+        open_session(tmp_path)
+
+
+def test_opening_reads_each_header_once_and_no_data(tmp_path, monkeypatch):
+    write_session(tmp_path)
+    read = []
+    monkeypatch.setattr(
+        spy, "read_envi_header", lambda file, real=spy.read_envi_header: read.append(file) or real(file)
+    )
+    monkeypatch.setattr(np, "memmap", None)
+    open_session(tmp_path)
+    assert sorted(read) == sorted(str(path) for path in tmp_path.rglob("*.hdr"))
+
+
 def test_session_info_round_trip(tmp_path):
     path = tmp_path / "session.json"
     path.write_text(json.dumps({**INFO, "nominal_step_deg": 10, "direction": "cw", "marker_dictionary": None}))
@@ -133,6 +205,11 @@ def test_session_info_round_trip(tmp_path):
         ('{"marker_side_m": true}', "positive number"),
         ('{"direction": "left"}', "ccw or cw"),
         ('{"object": 3}', "must be a text"),
+        ('{"image_rotation_deg": 45}', "0, 90, 180 or 270 degrees"),
+        ('{"image_rotation_deg": false}', "0, 90, 180 or 270 degrees"),
+        ('{"band_centres": "absent.csv"}', "band_centres is 'absent.csv', but must be the name of a CSV file beside"),
+        ('{"panel_reflectance": "."}', "panel_reflectance is '.', but must be the name of a CSV file beside"),
+        ('{"panel_reflectance": 0.98}', "panel_reflectance is 0.98, but must be the name of a CSV file beside"),
         ('{"container_height_m": 0.07}', "one dimension of the container"),
     ],
 )

@@ -11,6 +11,7 @@ import tyro
 
 from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.data.envi import open_cube
+from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.data.specim_iq import read_metadata
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
@@ -58,6 +59,17 @@ def test_folder_is_as_the_instrument_leaves_it(small_session):
         "white_reference": "white_reference",
         "image_rotation_deg": 0,
     }
+
+
+def test_metadata_state_each_captures_exposure_and_how_images_lie(tmp_path):
+    effects = ["{image_rotation: {quarter_turns: 3}}", "{tarp_exposure: {exposure_factor: 0.3}}"]
+    scene = override(load_scene("apple"), frames=2, size_px=32, bands=4, effects=effects)
+    session = open_session(simulate_session(scene, tmp_path / "s", False))
+    assert (session.image_rotation_deg, session.quarter_turns) == (270, 1)
+    assert [frame.integration_time_ms for frame in session.frames] == [10.0, 10.0]
+    assert session.white.integration_time_ms == pytest.approx(3.0)
+    metadata = read_metadata(tmp_path / "s" / "white_reference" / "metadata" / "white_reference.xml")
+    assert metadata.integration_time_ms == session.white.integration_time_ms
 
 
 def test_calibrated_counts_are_the_true_reflectance_within_rounding(small_session):

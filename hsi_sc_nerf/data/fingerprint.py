@@ -32,9 +32,14 @@ def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, in
 
 
 def shared_files(session: Session) -> list[tuple[str, int, int]]:
-    """The same of the files that every frame's reflectance depends on: session.json, what it names, and the tarp."""
-    named = (session.info_path, session.band_centres_path, session.panel_reflectance_path)
-    stamps = _stamps(session.path, [path for path in named if path is not None and path.is_file()])
+    """The same of the files that every frame's reflectance depends on.
+
+    These are ``session.json``, what it names, the tarp, and the metadata that tell how all images lie.
+    """
+    metadata = session.frames[0].metadata
+    told = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
+    told.append(None if metadata is None else metadata.path)
+    stamps = _stamps(session.path, [path for path in told if path is not None and path.is_file()])
     return stamps if session.white is None else stamps + capture_files(session, session.white)
 
 

@@ -209,14 +209,15 @@ def _check_whites(path: Path, info: SessionInfo, tarp: CaptureFiles | None, fram
 def _open_cubes(headers: Iterable[Path], info: SessionInfo, root: Path) -> dict[Path, Cube]:
     """Open cubes, each header once; what lists no wavelengths takes session.json's or those of another cube."""
     read = {path: read_header(path) for path in headers}
-    known: dict[int, Float[np.ndarray, "bands"]] = {}
-    if info.band_centres is not None:
-        centres_nm = read_band_centres(root / info.band_centres)
-        known[len(centres_nm)] = centres_nm
+    listed = None if info.band_centres is None else read_band_centres(root / info.band_centres)
+    of_others: dict[int, Float[np.ndarray, "bands"]] = {}
     for header in read.values():
         if header.wavelengths_nm is not None:
-            known.setdefault(header.shape[2], header.wavelengths_nm)
-    return {path: cube_of(header, known.get(header.shape[2])) for path, header in read.items()}
+            of_others.setdefault(header.shape[2], header.wavelengths_nm)
+    return {
+        path: cube_of(header, of_others.get(header.shape[2]) if listed is None else listed)
+        for path, header in read.items()
+    }
 
 
 def _capture(files: CaptureFiles, cubes: dict[Path, Cube], needs_instrument: bool = False) -> Capture:
