@@ -228,7 +228,7 @@ def test_full_disk_leaves_the_old_cube(header, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     before = sorted(header.parent.iterdir())
-    monkeypatch.setattr(spy, "save_image", fill_the_disk)
+    monkeypatch.setattr(spy, "write_envi_header", fill_the_disk)
     with pytest.raises(InputError, match=r"cube\.raw: cannot be written \(No space left on device\)"):
         write_cube(header, some_cube() + 1, wavelengths_nm=WAVELENGTHS_NM)
     assert sorted(header.parent.iterdir()) == before

@@ -1,7 +1,7 @@
 """ENVI cubes through SPy: opened, not loaded; written whole or not at all.
 
-SPy maps the data files and writes; headers are ``envi_header.py``'s. A data file that is shorter or longer than its
-header says is refused here.
+SPy maps the data files and writes headers; reading headers is ``envi_header.py``'s. A data file that is shorter or
+longer than its header says is refused here.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from hsi_sc_nerf.data.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.errors import InputError
 
 _SPY_FILES = {"bil": BilFile, "bip": BipFile, "bsq": BsqFile}
+# Where lines, samples and bands of a cube go in a data file.
+_AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
 DATA_SUFFIXES = ("", ".raw", ".dat", ".img", ".bil", ".bip", ".bsq", ".bin", ".hyspex")
 """Endings of ENVI data files; "" for ``NAME`` beside ``NAME.hdr`` (and ``NAME.raw`` beside ``NAME.raw.hdr``)."""
 
@@ -156,21 +158,23 @@ def write_cube(
     header_path = Path(header_path)
     if len(wavelengths_nm) != cube.shape[2]:
         raise ValueError(f"{len(wavelengths_nm)} wavelengths for {cube.shape[2]} bands")
-    metadata = {
+    stored = np.ascontiguousarray(cube.transpose(_AXES[interleave]))
+    stored = stored.astype(stored.dtype.newbyteorder(">" if byte_order == "big" else "<"), copy=False)
+    header = {
+        **dict(zip(("lines", "samples", "bands"), cube.shape, strict=True)),
+        "header offset": 0,
+        "data type": envi.dtype_to_envi[cube.dtype.char],
+        "interleave": interleave,
+        "byte order": 1 if byte_order == "big" else 0,
         "wavelength units": "nm",
         "wavelength": [float(w) for w in wavelengths_nm],
         **(extra_header or {}),
     }
-    with atomic_write(header_path.with_suffix(data_suffix), header_path) as (_, temporary_header):
-        envi.save_image(
-            str(temporary_header),
-            cube,
-            interleave=interleave,
-            ext=data_suffix,
-            byteorder=byte_order,
-            metadata=metadata,
-            force=True,
-        )
+    with atomic_write(header_path.with_suffix(data_suffix), header_path) as (temporary_data, temporary_header):
+        # SPy's `save_image` would first copy all of it in memory.
+        with temporary_data.open("wb") as file:
+            file.write(stored.data)
+        envi.write_envi_header(str(temporary_header), header)
 
 
 def _find_data_file(header: EnviHeader) -> Path:

@@ -25,6 +25,7 @@ _COUNTABLE = 255
 # What `cv2.transpose` moves in place of numbers of the same size.
 _MOVED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
 _HALF = np.float32(0.5)
+_HALF_UNIT = np.float32(0.5 / REFLECTANCE_SCALE)
 _LEAST = np.finfo(np.float32).min
 _Test = Callable[[np.ndarray], np.ndarray]
 
@@ -143,9 +144,10 @@ def pack_counts(
     Raises:
         ValueError: the calibration is not finite where it is needed, or the illumination not positive.
     """
-    lines, samples, bands = counts.shape
+    lines, samples, _ = counts.shape
     kept = len(calibration.bands)
-    every_band = np.array_equal(calibration.bands, np.arange(bands))
+    counts = np.asarray(counts)  # lines of a memory map would be memory maps, which are slower to make
+    file_bands = _as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
     scale, offset = _line_constants(calibration, samples)
     per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
@@ -167,7 +169,7 @@ def pack_counts(
     for line in range(lines):
         raw = _band_major(counts[line])
         with np.errstate(over="ignore"):  # a double that no float32 holds is no count
-            np.copyto(values, raw if every_band else raw[calibration.bands], casting="unsafe")
+            np.copyto(values, raw[file_bands], casting="unsafe")
         flagged = None
         for name, flag, test in tests:
             found = test(values)
@@ -265,26 +267,40 @@ class _Pictures:
     """Collects the pictures line by line, from values that are packed numbers and a half."""
 
     def __init__(self, bands: PictureBands, kept: int, lines: int, samples: int) -> None:
+        whole_bins, rest = divmod(kept, bands.bin_width)
         self.rgb = np.empty((3, lines, samples), np.float32)
         self.gray = np.empty((lines, samples), np.float32)
-        self.binned = np.empty((-(-kept // bands.bin_width), lines, samples), np.float32)
-        self._bands = bands
-        self._whole_bins = kept // bands.bin_width
-        self._in_whole_bins = self._whole_bins * bands.bin_width
+        self.binned = np.empty((whole_bins + (rest > 0), lines, samples), np.float32)
+        self._rgb_bands = bands.rgb
+        self._gray_bands = _as_slice(bands.gray)
+        self._bin_shape = (whole_bins, bands.bin_width, samples)
+        self._in_whole_bins = kept - rest
+        self._sums = np.empty((len(self.binned), samples), np.float32)
+        widths = np.full((len(self.binned), 1), bands.bin_width)
+        widths[whole_bins:] = rest
+        self._per_width = (1.0 / (widths * REFLECTANCE_SCALE)).astype(np.float32)
 
     def line(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
         """Take what the pictures need of a line."""
-        bands = self._bands
-        self.rgb[:, line] = _reflectance(values[bands.rgb])
-        self.gray[line] = _reflectance(np.mean(values[bands.gray], axis=0))
-        binnable = values[: self._in_whole_bins].reshape(self._whole_bins, bands.bin_width, -1)
-        self.binned[: self._whole_bins, line] = _reflectance(binnable.mean(axis=1))
-        if len(self.binned) > self._whole_bins:
-            self.binned[-1, line] = _reflectance(values[self._in_whole_bins :].mean(axis=0))
+        self.rgb[:, line] = _reflectance(values[self._rgb_bands])
+        self.gray[line] = _reflectance(values[self._gray_bands].mean(axis=0))
+        whole_bins = self._bin_shape[0]
+        binnable = values[: self._in_whole_bins].reshape(self._bin_shape)
+        np.add.reduce(binnable, axis=1, out=self._sums[:whole_bins])
+        if len(self._sums) > whole_bins:
+            np.add.reduce(values[self._in_whole_bins :], axis=0, out=self._sums[-1])
+        self._sums *= self._per_width
+        np.subtract(self._sums, _HALF_UNIT, out=self.binned[:, line])
+
+
+def _as_slice(indices: Int[np.ndarray, "count"]) -> slice | Int[np.ndarray, "count"]:
+    """Neighbouring indices as a slice, which takes a view in place of a copy."""
+    neighbours = len(indices) > 0 and np.array_equal(indices, np.arange(indices[0], indices[0] + len(indices)))
+    return slice(int(indices[0]), int(indices[0]) + len(indices)) if neighbours else indices
 
 
 def _reflectance(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    return (values - _HALF) * np.float32(1.0 / REFLECTANCE_SCALE)
+    return values * np.float32(1.0 / REFLECTANCE_SCALE) - _HALF_UNIT
 
 
 def _line_constants(
