@@ -64,16 +64,13 @@ class NotMeasurable:
 
 
 def survey_lines(lines: int, count: int) -> Int[np.ndarray, "survey"]:
-    """Which lines of a frame a survey reads, ascending: the first, the last and others evenly between them.
+    """Which lines of a frame a survey reads, ascending: at most ``count``, the first and the last among them.
 
-    Half of them lie in the outermost tenths of the image, where the chamber is most likely to be free.
+    Towards the edges of the image, where the chamber is most likely to be free, they lie twice as close.
     """
-    count = min(max(count, 2), lines)
-    evenly = np.linspace(0, lines - 1, count - count // 2)
-    edge = max(1.0, lines / 10.0) - 1.0
-    outermost = np.linspace(0.0, 2.0 * edge, count // 2)
-    outermost = np.where(outermost <= edge, outermost, lines - 1 - (outermost - edge))
-    return np.unique(np.concatenate([evenly, outermost]).round().astype(int))
+    even = np.linspace(0.0, 1.0, min(max(count, 2), lines))
+    closer = even - np.sin(2.0 * np.pi * even) / (4.0 * np.pi)
+    return np.unique((closer * (lines - 1)).round().astype(int))
 
 
 def survey_count(lines: int, config: LampDriftConfig) -> int:
@@ -115,13 +112,13 @@ def measure_lamp_drift(
     if frames < 2:
         return NotMeasurable("there is a single frame")
     survey = _Survey(read_lines, frames, dark, noise, saturation_counts, dead)
-    static, readable = survey.find_static(_bins(wavelengths_nm))
+    static, unusable = survey.find_static(_bins(wavelengths_nm))
     share = float(static.mean())
     if static.sum() < FEWEST_PIXELS or share < config.smallest_static_share:
         return NotMeasurable(
             f"only {100.0 * share:.1f} % of the surveyed pixels follow one course, so nothing is sure to stand still"
         )
-    total, variance = survey.sum_over(static, readable)
+    total, variance = survey.sum_over(static, unusable)
     lit = (total > SMALLEST_SIGNAL * np.sqrt(variance)).all(axis=0)
     if lit.sum() <= config.degree:
         return NotMeasurable("what stands still in the image is too dark")
@@ -197,7 +194,7 @@ def _bins(wavelengths_nm: Float[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands
 
 @dataclass(frozen=True, eq=False)
 class _Survey:
-    """The surveyed lines of all frames, read one frame at a time."""
+    """The surveyed lines of all frames, read one frame at a time and summed up in the order in which they lie."""
 
     read_lines: ReadLines
     frames: int
@@ -209,48 +206,47 @@ class _Survey:
     def find_static(
         self, bins: Bool[np.ndarray, "bands bins"]
     ) -> tuple[Bool[np.ndarray, "survey samples"], Bool[np.ndarray, "survey samples bands"]]:
-        """Pixels that stand still, and which readings are neither of dead elements nor saturated in any frame."""
+        """Pixels that stand still, and which readings cannot be used: of dead elements or saturated in some frame."""
         first = self.read_lines(0)
-        readable = np.ones(first.shape, bool)
-        if self.dead is not None:
-            readable &= ~self.dead
-        alive = readable[:1].astype(np.float32)
+        samples, bands = first.shape[1:]
         summed = bins.astype(np.float32)
-        binned = np.empty((first.shape[0] * first.shape[1], self.frames, bins.shape[1]), np.float32)
-        saturated = np.zeros(first.shape, bool)
+        binned = np.empty((*first.shape[:2], self.frames, bins.shape[1]), np.float32)
+        saturated = np.zeros_like(first, dtype=bool)
+        dead = np.nonzero(np.zeros((samples, bands), bool) if self.dead is None else self.dead)
         for frame in range(self.frames):
-            counts = self.read_lines(frame)
-            if self.saturation_counts is not None:
+            counts, dark = self.read_lines(frame), self._dark(frame, samples)
+            if self.saturation_counts is not None and counts.max() >= self.saturation_counts:
                 saturated |= counts >= self.saturation_counts
-            above = self._above_dark(counts, frame)
-            above *= alive
-            binned[:, frame] = above.reshape(-1, len(bins)) @ summed
-        readable &= ~saturated
-        variance = self.noise.counts_per_electron * np.maximum(binned.mean(axis=1), 0.0) + (
-            self.noise.read_noise**2 @ bins
-        )
-        spoilt = saturated.reshape(-1, len(bins)) @ summed > 0.0
-        if self.dead is not None:
-            # A dead element that saturates as well spoils nothing: it is not in the sum.
-            spoilt = (saturated & ~self.dead).reshape(-1, len(bins)) @ summed > 0.0
-        static = static_pixels(binned, np.where(spoilt, np.inf, variance))
-        return static.reshape(first.shape[:2]), readable
+            light = counts.astype(np.float32)
+            light[:, dead[0], dead[1]] = dark[dead]
+            binned[:, :, frame] = light @ summed - dark @ summed
+        # A dead element is in no sum, and spoils none if it is stuck at the largest count.
+        saturated[:, dead[0], dead[1]] = False
+        spoilt = np.stack([saturated[..., members].any(axis=-1) for members in bins.T], axis=-1)
+        saturated[:, dead[0], dead[1]] = True
+        binned = binned.reshape(-1, *binned.shape[2:])
+        of_light = self.noise.counts_per_electron * np.maximum(binned.mean(axis=1), 0.0)
+        variance = of_light + self.noise.read_noise**2 @ bins
+        static = static_pixels(binned, np.where(spoilt.reshape(variance.shape), np.inf, variance))
+        return static.reshape(first.shape[:2]), saturated
 
     def sum_over(
-        self, static: Bool[np.ndarray, "survey samples"], readable: Bool[np.ndarray, "survey samples bands"]
+        self, static: Bool[np.ndarray, "survey samples"], unusable: Bool[np.ndarray, "survey samples bands"]
     ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-        """Counts above dark of the static pixels' readable bands, and the variance of this sum."""
-        weight = readable[static].astype(np.float32)
-        total = np.stack(
-            [
-                np.einsum("pb,pb->b", self._above_dark(self.read_lines(frame), frame)[static], weight)
-                for frame in range(self.frames)
-            ]
-        ).astype(np.float64)
-        readings = weight.sum(axis=0, dtype=np.float64)
+        """Counts above dark of the static pixels' usable readings in each band, and the variance of this sum."""
+        samples, bands = unusable.shape[1:]
+        weight = static.astype(np.float32)[:, None]
+        left_out = np.nonzero(unusable & static[..., None])
+        of_element = static.sum(axis=0)[:, None] - (unusable & static[..., None]).sum(axis=0)
+        total = np.empty((self.frames, bands))
+        for frame in range(self.frames):
+            counts = self.read_lines(frame)
+            total[frame] = np.matmul(weight, counts.astype(np.float32)).sum(axis=(0, 1), dtype=np.float64)
+            total[frame] -= np.bincount(left_out[2], counts[left_out], minlength=bands)
+            total[frame] -= (of_element * self._dark(frame, samples)).sum(axis=0)
+        readings = of_element.sum(axis=0)
         return total, self.noise.counts_per_electron * np.maximum(total, 0.0) + readings * self.noise.read_noise**2
 
-    def _above_dark(
-        self, counts: Num[np.ndarray, "survey samples bands"], frame: int
-    ) -> Float[np.ndarray, "survey samples bands"]:
-        return counts.astype(np.float32, order="C") - self.dark[frame if len(self.dark) > 1 else 0]
+    def _dark(self, frame: int, samples: int) -> Float[np.ndarray, "samples bands"]:
+        dark = self.dark[frame if len(self.dark) > 1 else 0].astype(np.float32)
+        return np.broadcast_to(dark, (samples, dark.shape[1]))

@@ -13,6 +13,8 @@ NOISE_MARGIN = 1.5
 """Variances may be larger than the noise model's by this factor."""
 FALSE_ALARM = 1e-3
 """Share of static pixels that noise alone may exclude."""
+SMALLEST_COUNT = 1e-3
+"""Stands for counts that have no logarithm, and are not used."""
 SMALLEST_SIGNAL = 10.0
 """Signal over noise from which a pixel's counts in a bin are looked at: below, their logarithm is not normal."""
 BLOCK_PX = 16
@@ -38,15 +40,14 @@ def static_pixels(
         variance: of one of these (mean over the frames); infinite where the counts cannot be used.
     """
     frames = counts.shape[1]
+    bins_needed = max(1, counts.shape[2] // 2)
     mean = counts.mean(axis=1)
     usable = (mean > SMALLEST_SIGNAL * np.sqrt(variance)) & (counts.min(axis=1) > 0.0)
     relative = np.where(usable, variance, 0.0) / np.where(usable, mean, 1.0) ** 2
     weight = (usable / (relative + TOLERANCE**2)).astype(np.float32)
-    course = counts
-    course[~usable[:, None].repeat(frames, axis=1)] = 1.0
-    np.log(course, out=course)
+    course = np.log(np.maximum(counts, SMALLEST_COUNT, out=counts), out=counts)
     course -= course.mean(axis=1, keepdims=True)
-    judged = usable.sum(axis=1) >= max(1, usable.shape[1] // 2)
+    judged = usable.sum(axis=1) >= bins_needed
     degrees = np.maximum((frames - 1) * usable.sum(axis=1), 1)
     over_frames = NOISE_MARGIN * stats.chi2.isf(FALSE_ALARM, degrees)
 
@@ -54,16 +55,20 @@ def static_pixels(
     voters = voters[:: max(1, len(voters) // MOST_VOTERS)]
     if not len(voters):
         return judged
-    votes = _chi_square(course[voters], weight[voters], _candidates(course)) <= over_frames[voters, None]
-    common = _candidates(course)[int(votes.sum(axis=0).argmax())]
+    candidates = _candidates(course)
+    votes = _chi_square(course[voters], weight[voters], candidates) <= over_frames[voters, None]
+    common = candidates[int(votes.sum(axis=0).argmax())]
     in_a_frame = NOISE_MARGIN * stats.chi2.isf(FALSE_ALARM / frames, np.maximum(usable.sum(axis=1), 1))
     static = np.zeros(len(course), bool)
     for _ in range(ROUNDS):
         residual = course - common
         np.square(residual, out=residual)
         by_frame = np.matmul(residual, weight[..., None])[..., 0]
-        static = judged & (by_frame.sum(axis=1) <= over_frames) & (by_frame.max(axis=1) <= in_a_frame)
-        if not static.any():
+        before, static = (
+            static,
+            judged & (by_frame.sum(axis=1) <= over_frames) & (by_frame.max(axis=1) <= in_a_frame),
+        )
+        if not static.any() or (static == before).all():
             break
         total = weight[static].sum(axis=0)
         common = np.einsum("pfk,pk->fk", course[static], weight[static]) / np.where(total > 0.0, total, 1.0)
