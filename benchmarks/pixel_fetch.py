@@ -70,12 +70,14 @@ class PixelFetch:
                 "packed BIP, memory map given back": (packed, lambda: _maps(packed, give_back=True)),
                 "packed BIP, by position (this package)": (packed, lambda: _by_position(packed)),
             }
-            rows = {name: [self._cold(*way), *self._warm(*way)] for name, way in track(ways.items(), "from the disk")}
+            rows: dict[str, tuple[float | None, float, float]] = {
+                name: (self._cold(*way), *self._warm(*way)) for name, way in track(ways.items(), "from the disk")
+            }
             in_ram = min(self.frames, int(RAM_SHARE * _free_memory() / (4 * self.size**2 * self.bands)))
             name = "float32 in RAM" + ("" if in_ram == self.frames else f" ({in_ram} frames: no memory for more)")
             ram_ms, taken = self._timed(_ram(packed[:in_ram]), in_ram)
             rows[name] = (None, ram_ms, taken)
-        self._show([_cells(name, *row, ram_ms) for name, row in rows.items()])
+        self._show([_cells(name, cold, warm, taken, ram_ms) for name, (cold, warm, taken) in rows.items()])
 
     def _make_files(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Headers of a raw and a packed session: copies of one frame, which reading cannot tell from frames."""

@@ -17,3 +17,27 @@ def tiny_dataset(tmp_path_factory):
     scene = override(load_scene("pear"), frames=10, size_px=112, bands=12, seed=None)
     session = simulate_session(scene, folder / "session", progress=False)
     return process_session(session, folder / "data", progress=False), session
+
+
+@pytest.fixture(scope="session")
+def flagged_dataset(tiny_dataset, tmp_path_factory):
+    """A copy of the tiny dataset with flagged values: a fifth of two bands, and all bands of some whole lines."""
+    import shutil
+    from dataclasses import replace
+
+    import numpy as np
+
+    from hsi_sc_nerf.data.packed import FLAGGED, open_packed, write_packed_cube, write_transforms
+
+    data = tmp_path_factory.mktemp("flagged") / "data"
+    shutil.copytree(tiny_dataset[0], data)
+    dataset = open_packed(data)
+    rng = np.random.default_rng(0)
+    for frame in dataset.frames:
+        counts = np.array(frame.cube())
+        counts[..., 3:5][rng.random((*counts.shape[:2], 2)) < 0.2] = FLAGGED
+        counts[50:53] = FLAGGED
+        write_packed_cube(frame.cube_path, counts, dataset.wavelengths_nm)
+    flagged = sum(int((frame.cube() == FLAGGED).sum()) for frame in dataset.frames)
+    write_transforms(replace(dataset, flagged_values=flagged))
+    return data

@@ -1,9 +1,14 @@
-"""How frames are divided between training and evaluation, and where the scene lies for the model."""
+"""How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-from hsi_sc_nerf.data.dataparser import scene_scaling, split_frames
+from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.errors import InputError
 
 
@@ -29,3 +34,27 @@ def test_the_scene_fills_the_models_cube():
     box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.1]])
     centre, scale = scene_scaling(box)
     np.testing.assert_allclose((box - centre) * scale, [[-1, -1, -0.25], [1, 1, 0.25]])
+
+
+def held_out(data) -> SpectralDataset:
+    return SpectralDataset(SpectralDataParserConfig(data=data).setup().get_dataparser_outputs("test"))
+
+
+def test_a_held_out_view_holds_its_reflectance(tiny_dataset):
+    dataset = held_out(tiny_dataset[0])
+    item = dataset[0]
+    assert not dataset.has_flagged
+    assert "valid" not in item
+    counts = dataset.frames[0].cube()
+    torch.testing.assert_close(item["spectral"], torch.from_numpy(counts / np.float32(REFLECTANCE_SCALE)))
+    np.testing.assert_array_equal(item["mask"][..., 0], dataset.frames[0].mask())
+
+
+def test_a_held_out_view_tells_what_was_not_measured(flagged_dataset):
+    dataset = held_out(flagged_dataset)
+    item = dataset[0]
+    counts = np.asarray(dataset.frames[0].cube())
+    np.testing.assert_array_equal(item["valid"], counts != FLAGGED)
+    assert not item["valid"].all()
+    expected = np.where(counts == FLAGGED, 0, counts) / np.float32(REFLECTANCE_SCALE)
+    torch.testing.assert_close(item["spectral"], torch.from_numpy(expected))

@@ -1,10 +1,17 @@
-"""The spread of the metrics over held-out views."""
+"""The spread of the metrics over held-out views, and what becomes of values that are no measurements."""
 
+from __future__ import annotations
+
+import copy
 import math
 
+import numpy as np
 import pytest
+import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
+from hsi_sc_nerf.config import hsi_sc_nerf
+from hsi_sc_nerf.data.packed import FLAGGED
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 
 
@@ -17,3 +24,56 @@ def test_spread_of_one_view_is_zero_and_nothing_else_is_touched(monkeypatch, vie
     )
     assert metrics["sam"] == 0.1
     assert metrics["sam_std"] == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.fixture
+def pipeline(flagged_dataset) -> SpectralPipeline:
+    config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
+    config.datamanager.data = flagged_dataset
+    config.datamanager.train_num_rays_per_batch = 256
+    config.model.num_levels, config.model.log2_hashmap_size, config.model.max_res = 4, 10, 32
+    config.model.num_proposal_samples_per_ray, config.model.num_nerf_samples_per_ray = (16, 8), 8
+    return config.setup(device="cpu")
+
+
+def test_training_does_not_see_flagged_values(pipeline):
+    rays, batch = pipeline.datamanager.next_train(0)
+    frame, line, sample = batch["indices"].T
+    cubes = [frame.cube() for frame in pipeline.datamanager.train_dataset.frames]
+    flagged = np.array([cubes[f][y, x] == FLAGGED for f, y, x in zip(frame, line, sample, strict=True)])
+    np.testing.assert_array_equal(batch["valid"], ~flagged)
+    assert flagged.any(axis=0).sum() > 1
+
+    torch.manual_seed(0)
+    outputs = pipeline.model(rays)
+    outputs["spectral"].retain_grad()
+    found = []
+    for anything in (0.0, 7.0, float("nan")):
+        batch["spectral"][~batch["valid"]] = anything
+        metrics = pipeline.model.get_metrics_dict(outputs, batch)
+        losses = pipeline.model.get_loss_dict(outputs, batch, metrics)
+        found.append([losses["hsi_loss"].item(), losses["angular_loss"].item(), metrics["psnr"].item()])
+    assert found[0] == found[1] == found[2]
+    (losses["hsi_loss"] + losses["angular_loss"]).backward()
+    assert not outputs["spectral"].grad[~batch["valid"]].any()
+    assert outputs["spectral"].grad[batch["valid"]].any()
+
+
+def test_held_out_views_are_judged_by_their_measurements(pipeline):
+    _, batch = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    height, width, _ = batch["spectral"].shape
+    generator = torch.Generator().manual_seed(0)
+    outputs = {
+        "spectral": torch.rand(batch["spectral"].shape, generator=generator),
+        "accumulation": torch.ones(height, width, 1),
+        "depth": torch.ones(height, width, 1),
+    }
+    found = []
+    for anything in (0.0, 7.0):
+        batch["spectral"][~batch["valid"]] = anything
+        metrics, images = pipeline.model.get_image_metrics_and_images(outputs, batch)
+        assert all(image.isfinite().all() for image in images.values())
+        found.append(metrics)
+    assert found[0] == found[1]
+    del batch["valid"]
+    assert pipeline.model.get_image_metrics_and_images(outputs, batch)[0]["rmse"] > 1.5 * found[0]["rmse"]
