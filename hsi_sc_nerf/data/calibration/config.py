@@ -8,6 +8,8 @@ from typing import Literal
 
 from hsi_sc_nerf import paper
 
+WhiteSource = Literal["auto", "tarp", "capture", "target", "product"]
+
 
 @dataclass(frozen=True)
 class LampDriftConfig:
@@ -34,9 +36,11 @@ class LampDriftConfig:
 class CalibrationConfig:
     """Settings of the white-reference calibration; the defaults are the paper's."""
 
-    white_source: Literal["tarp", "capture", "target"] = "tarp"
+    white_source: WhiteSource = "auto"
     """Where the white is: in a capture of its own in the session (tarp), in the WHITEREF cube that each capture
-    brings along (capture), or inside every frame, in the region given as --calibration.roi (target)."""
+    brings along (capture), or inside every frame, in the region given as --calibration.roi (target); or nowhere, and
+    the instrument's own finished REFLECTANCE is taken (product). Auto takes the first of tarp, capture and product
+    that the session has."""
     roi: tuple[int, int, int, int] | None = None
     """Where the white is, in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. A tarp is
     found by itself if this is not given; a white target inside the frames needs it."""
