@@ -129,7 +129,7 @@ def elements_without_response(
             continue
         # How much brighter a sample is than others, in all bands: an edge of the white, or of a thing in the frames.
         brightness = np.maximum(np.median(light[:, lit] / usual[lit], axis=1), LEAST_BRIGHTNESS)[:, None]
-        neighbours = ndimage.median_filter(light / brightness, size=(NEIGHBOURS, 1), mode="nearest")
+        neighbours = ndimage.median_filter(light / brightness, size=(NEIGHBOURS, 1), mode="mirror")
         expected = neighbours * brightness
         spread = 1.4826 * np.median(np.abs(light - expected), axis=0)
         spread = np.hypot(spread, step / np.sqrt(12.0))
