@@ -8,11 +8,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsi_sc_nerf.data.envi import DATA_SUFFIXES, open_cube, write_cube
+from hsi_sc_nerf.data.envi import open_cube, write_cube
 
 TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 # Where (lines, samples, bands) are in the file, outermost first.
 ORDER = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
+SUFFIXES = ["", ".raw", ".dat", ".img", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".RAW", ".DAT"]
 UNITS = {"nm": 1.0, "Nanometers": 1.0, "Micrometers": 1e-3, "um": 1e-3, "µm": 1e-3, "Unknown": 1e-3, None: 1.0}
 
 
@@ -38,7 +39,7 @@ shapes = st.tuples(st.integers(1, 4), st.integers(1, 4), st.integers(1, 5))
     interleave=st.sampled_from(["bil", "bip", "bsq", "BIL", "Bsq"]),
     byte_order=st.sampled_from([0, 1, None]),
     offset=st.sampled_from([0, 1, 7, 64, None]),
-    suffix=st.sampled_from([*DATA_SUFFIXES, ".RAW", ".DAT"]),
+    suffix=st.sampled_from(SUFFIXES),
     header_name=st.sampled_from(["{data}.hdr", "{stem}.hdr", "{stem}.HDR"]),
     unit=st.sampled_from(list(UNITS)),
     encoding=st.sampled_from(["utf-8", "utf-8-sig", "latin-1"]),
