@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, PictureBands, Tally, pack_counts
+from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, Tally, pack_counts
 from hsi_sc_nerf.data.packed import FLAGGED, LARGEST_REFLECTANCE, REFLECTANCE_SCALE, PixelFlag
 
 LINES, SAMPLES, BANDS = 11, 6, 10

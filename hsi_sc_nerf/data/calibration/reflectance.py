@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.line_pictures import LinePictures, PictureBands, as_slice
 from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.data.session import Capture
 
@@ -25,7 +26,6 @@ _COUNTABLE = 255
 # What `cv2.transpose` moves in place of numbers of the same size.
 _MOVED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
 _HALF = np.float32(0.5)
-_HALF_UNIT = np.float32(0.5 / REFLECTANCE_SCALE)
 _LEAST = np.finfo(np.float32).min
 _Test = Callable[[np.ndarray], np.ndarray]
 
@@ -95,21 +95,6 @@ class Tally:
 
 
 @dataclass(frozen=True, eq=False)
-class PictureBands:
-    """Which of the kept bands (by index) the pictures of a frame are made of.
-
-    Attributes:
-        rgb: shown as red, green and blue.
-        gray: averaged for finding markers.
-        bin_width: neighbouring bands that are averaged into a bin; the last bin may have fewer.
-    """
-
-    rgb: Int[np.ndarray, "3"]
-    gray: Int[np.ndarray, "gray"]
-    bin_width: int
-
-
-@dataclass(frozen=True, eq=False)
 class PackedReflectance:
     """A frame's reflectance and what was seen on the way, in the orientation of the file.
 
@@ -147,7 +132,7 @@ def pack_counts(
     lines, samples, _ = counts.shape
     kept = len(calibration.bands)
     counts = np.asarray(counts)  # lines of a memory map would be memory maps, which are slower to make
-    file_bands = _as_slice(calibration.bands)
+    file_bands = as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
     scale, offset = _line_constants(calibration, samples)
     per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
@@ -160,7 +145,7 @@ def pack_counts(
     packed = np.rot90(np.empty((*upright_shape, kept), np.uint16), -turns)
     flags = np.zeros((lines, samples), np.uint8)
     flags |= dead.pixel_flags
-    draw = _Pictures(pictures, kept, lines, samples)
+    draw = LinePictures(pictures, kept, lines, samples)
     counters = {name: _Counter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
 
     values = np.empty((kept, samples), np.float32)
@@ -261,46 +246,6 @@ class _Counter:
         self._total += self._recent
         self._recent[:] = 0
         self._lines = 0
-
-
-class _Pictures:
-    """Collects the pictures line by line, from values that are packed numbers and a half."""
-
-    def __init__(self, bands: PictureBands, kept: int, lines: int, samples: int) -> None:
-        whole_bins, rest = divmod(kept, bands.bin_width)
-        self.rgb = np.empty((3, lines, samples), np.float32)
-        self.gray = np.empty((lines, samples), np.float32)
-        self.binned = np.empty((whole_bins + (rest > 0), lines, samples), np.float32)
-        self._rgb_bands = bands.rgb
-        self._gray_bands = _as_slice(bands.gray)
-        self._bin_shape = (whole_bins, bands.bin_width, samples)
-        self._in_whole_bins = kept - rest
-        self._sums = np.empty((len(self.binned), samples), np.float32)
-        widths = np.full((len(self.binned), 1), bands.bin_width)
-        widths[whole_bins:] = rest
-        self._per_width = (1.0 / (widths * REFLECTANCE_SCALE)).astype(np.float32)
-
-    def line(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
-        """Take what the pictures need of a line."""
-        self.rgb[:, line] = _reflectance(values[self._rgb_bands])
-        self.gray[line] = _reflectance(values[self._gray_bands].mean(axis=0))
-        whole_bins = self._bin_shape[0]
-        binnable = values[: self._in_whole_bins].reshape(self._bin_shape)
-        np.add.reduce(binnable, axis=1, out=self._sums[:whole_bins])
-        if len(self._sums) > whole_bins:
-            np.add.reduce(values[self._in_whole_bins :], axis=0, out=self._sums[-1])
-        self._sums *= self._per_width
-        np.subtract(self._sums, _HALF_UNIT, out=self.binned[:, line])
-
-
-def _as_slice(indices: Int[np.ndarray, "count"]) -> slice | Int[np.ndarray, "count"]:
-    """Neighbouring indices as a slice, which takes a view in place of a copy."""
-    neighbours = len(indices) > 0 and np.array_equal(indices, np.arange(indices[0], indices[0] + len(indices)))
-    return slice(int(indices[0]), int(indices[0]) + len(indices)) if neighbours else indices
-
-
-def _reflectance(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    return values * np.float32(1.0 / REFLECTANCE_SCALE) - _HALF_UNIT
 
 
 def _line_constants(
