@@ -26,8 +26,9 @@ class LampDriftConfig:
     """Degree of the curve over the wavelength that takes the noise off the drift. A change of the lamps' output and
     of their colour temperature is a straight line in its terms."""
     floor: float = 0.001
-    """Relative change of the light that is not taken for drift, whatever the noise: what neighbours reflect and
-    instruments do changes by as much."""
+    """Relative change of the light, root mean square over frames and wavelengths, that is not taken for drift however
+    well it was measured: the chamber's wall also changes by what the turning object reflects on to it. It is a tenth
+    of a pixel's own noise."""
     significance: float = 0.001
     """How often a session without drift may be corrected by chance."""
 

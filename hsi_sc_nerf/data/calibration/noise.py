@@ -136,10 +136,9 @@ def photon_transfer_slope(
         if saturation_counts is not None:
             saturated |= (np.maximum(np.maximum(above, here), below) >= saturation_counts) & inside[n][:, None]
     columns = inside.any(axis=0)
-    readable = columns[:, None] & ~saturated
-    if dead is not None:
-        readable &= ~dead
-    readable &= saturated[columns].mean(axis=0) <= MOST_SATURATED
+    alive = np.broadcast_to(columns[:, None], saturated.shape) & (True if dead is None else ~dead)
+    saturated &= alive
+    readable = alive & ~saturated & (saturated.sum(axis=0) <= MOST_SATURATED * alive.sum(axis=0))
     signal = np.where(readable, total / np.maximum(inside.sum(axis=0), 1)[:, None] - dark, 0.0).clip(min=0.0)
     of_pixel = signal.sum(axis=1, keepdims=True)
     if not of_pixel.any():
@@ -158,6 +157,9 @@ def photon_transfer_slope(
     used = readings > 0
     x, offset = ((kept.sum(axis=0) @ (part * readable))[used] / readings[used] for part in (per_slope, of_read))
     y = np.einsum("nsb,ns->b", squared, kept.astype(np.float32))[used] / readings[used]
+    if not x.any():
+        # A single band has nothing left after the projection.
+        return None
     slope = 0.0
     for _ in range(5):
         # Variances are known to a share of themselves.

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.data.calibration.lamp_drift import LampDrift
@@ -17,6 +18,7 @@ from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 
 DRIFT_NM = (450.0, 600.0, 750.0, 900.0)
+SMALLEST_P = 1e-6
 REFLECTANCES = (0.1, 0.5, 0.9)
 
 
@@ -41,7 +43,8 @@ def lamp_drift_picture(
     by_frame, by_band = figure.subplots(1, 2)
     frames = np.arange(len(change))
     bands = list(dict.fromkeys(nearest_bands(wavelengths_nm, shown_nm)))
-    colours = colormaps["turbo"](np.clip((wavelengths_nm[bands] - 380.0) / 640.0, 0.0, 1.0))
+    colours = colormaps["plasma"](np.linspace(0.0, 0.8, len(bands)))
+    p_value = f"p = {drift.p_value:.1g}" if drift.p_value > SMALLEST_P else f"p < {SMALLEST_P:g}"
     for band, colour in zip(bands, colours, strict=True):
         by_frame.errorbar(
             frames,
@@ -53,10 +56,11 @@ def lamp_drift_picture(
             label=f"{wavelengths_nm[band]:.0f} nm",
         )
     by_frame.legend(title="with 2 standard errors")
+    by_frame.xaxis.set_major_locator(MaxNLocator(integer=True))
     by_frame.set(xlabel="frame", ylabel="change since the first frame (%)")
     by_frame.set_title(
         f"Light of the lamps: {'corrected' if corrected else 'not corrected'} "
-        f"({'significant' if drift.significant else 'not significant'}, p = {drift.p_value:.1g})"
+        f"({'significant' if drift.significant else 'not significant'}, {p_value})"
     )
     by_band.plot(wavelengths_nm, measured[-1], ".", color="tab:gray", markersize=3, label="measured")
     by_band.plot(wavelengths_nm, change[-1], color="tab:blue", label="smooth, with 2 standard errors")
