@@ -87,7 +87,10 @@ def white_reference(capture: Capture, config: CalibrationConfig, defects: Defect
     header = capture.cube.header_path
     roi = config.roi
     if roi is None:
-        roi = find_coarse_roi(capture.cube.read().mean(axis=-1, dtype=np.float64), config.roi_brightness)
+        live = ~_dead(defects, *capture.cube.shape[1:])
+        # A sample whose elements are all dead is dark.
+        brightness = [line.sum(axis=-1, dtype=np.float64, where=live) for line in capture.cube.read()]
+        roi = find_coarse_roi(np.stack(brightness) / np.maximum(live.sum(axis=-1), 1), config.roi_brightness)
     if roi is None:
         raise InputError(f"{header}: the tarp has no usable region, because the image is dark; take it again.")
     return _white_in(capture, roi, config, defects)
