@@ -9,6 +9,7 @@ from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.calibration.dark import dark_columns
 from hsi_sc_nerf.data.calibration.defects import Defects
 from hsi_sc_nerf.data.calibration.white_reference import WhiteReference
+from hsi_sc_nerf.data.calibration.white_steps import mean_over_columns
 from hsi_sc_nerf.data.regions import dilate, largest_component
 from hsi_sc_nerf.data.session import Capture
 from hsi_sc_nerf.errors import InputError
@@ -30,10 +31,12 @@ def flat_field(
     config: CalibrationConfig,
     defects: Defects | None = None,
 ) -> Float[np.ndarray, "lines samples"]:
-    """Illumination of each pixel over its mean in the region that the white spectrum was taken from.
+    """Illumination of each pixel over that of the white spectrum.
 
-    The same in all bands, and positive. It is for frames taken with the camera, and under lamps, that stand as they
-    did for the tarp; reflectance over it is what a tarp before the whole image would have given.
+    The same in all bands, and positive; on average 1 over the region that the white spectrum was taken from, but for
+    dirt and folds in it, which lower the spectrum and not the illumination. It is for frames taken with the camera,
+    and under lamps, that stand as they did for the tarp; reflectance over it is what a tarp before the whole image
+    would have given.
 
     Args:
         tarp: the capture of the white tarp.
@@ -57,7 +60,7 @@ def flat_field(
     if defects is not None:
         use = use & ~defects.dead
     dark = dark_columns(None if tarp.dark is None else tarp.dark.read(), samples, bands)
-    brightness = relative_brightness(counts, dark, np.nan_to_num(white.mean_spectrum()), use)
+    brightness = relative_brightness(counts, dark, np.nan_to_num(mean_over_columns(white.measured)), use)
     region = np.zeros(brightness.shape, bool)
     x0, y0, x1, y1 = white.roi
     region[y0:y1, x0:x1] = brightness[y0:y1, x0:x1] > config.roi_brightness
@@ -69,10 +72,7 @@ def flat_field(
             f"{header}: the tarp is too small in its image to tell how the light falls off; leave out "
             "--calibration.flat-field."
         )
-    surface = fit_surface(brightness, region, config.flat_field_order)
-    kept = np.zeros_like(region)
-    kept[y0:y1, x0:x1] = white.mask
-    return (surface / surface[kept].mean()).astype(np.float32)
+    return fit_surface(brightness, region, config.flat_field_order).astype(np.float32)
 
 
 def relative_brightness(
