@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hsi_sc_nerf.data.calibration.noise import (
     photon_transfer_slope,
     read_noise,
 )
+from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.simulate import frames
 from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -136,6 +138,16 @@ def test_dark_cube_of_another_width():
     white, dark = exposures()
     noise = measure_noise(white, REGION, dark[:, :20], dead=np.zeros((SAMPLES, BANDS), bool))
     assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
+
+
+def test_real_white_reference_follows_the_line():
+    folder = Path(__file__).parent / "data" / "maize_kernel"
+    white, dark = (open_cube(folder / f"{name}_reference_crop.hdr").read() for name in ("white", "dark"))
+    noise = measure_noise(white, np.ones(white.shape[:2], bool), dark)
+    mean = white.mean(axis=(0, 1)) - dark.mean(axis=(0, 1))
+    seen = np.square(np.diff(white.astype(float), 2, axis=0)).mean(axis=(0, 1)) / 6.0
+    assert mean.max() > 20.0 * mean.min()
+    assert np.median(np.abs(seen / noise.variance(mean) - 1.0)) < 0.1
 
 
 def test_variance_of_a_reading():

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
 from scipy import stats
 
 QUANTISATION_VARIANCE = 1.0 / 12.0
@@ -126,15 +126,7 @@ def photon_transfer_slope(
     inside = inside_all[centres - 1]
     if inside.sum() < FEWEST_PIXELS:
         return None
-    difference = np.zeros((len(centres), *white.shape[1:]), np.float32)
-    total = np.zeros(white.shape[1:])
-    saturated = np.zeros(white.shape[1:], bool)
-    for n, centre in enumerate(centres):
-        above, here, below = white[centre - 1 : centre + 2].astype(np.float32)
-        difference[n] = (above - 2.0 * here + below) * inside[n][:, None]
-        total += here * inside[n][:, None]
-        if saturation_counts is not None:
-            saturated |= (np.maximum(np.maximum(above, here), below) >= saturation_counts) & inside[n][:, None]
+    difference, total, saturated = _second_differences(white, centres, inside, saturation_counts)
     columns = inside.any(axis=0)
     alive = np.broadcast_to(columns[:, None], saturated.shape) & (True if dead is None else ~dead)
     saturated &= alive
@@ -162,10 +154,34 @@ def photon_transfer_slope(
         return None
     slope = 0.0
     for _ in range(5):
-        # Variances are known to a share of themselves.
+        # A variance is known to a share of itself, so the weights need the slope that they give.
         weight = readings[used] / np.maximum(offset + slope * x, QUANTISATION_VARIANCE) ** 2
         slope = max(0.0, float((weight * x * (y - offset)).sum() / (weight * x * x).sum()))
     return slope
+
+
+def _second_differences(
+    white: Num[np.ndarray, "lines samples bands"],
+    centres: Int[np.ndarray, "triples"],
+    inside: Bool[np.ndarray, "triples samples"],
+    saturation_counts: float | None,
+) -> tuple[
+    Float[np.ndarray, "triples samples bands"], Float[np.ndarray, "samples bands"], Bool[np.ndarray, "samples bands"]
+]:
+    """Second differences about each centre, the sum of the centres' counts, and which elements saturate anywhere.
+
+    All three inside the region alone.
+    """
+    difference = np.zeros((len(centres), *white.shape[1:]), np.float32)
+    total = np.zeros(white.shape[1:])
+    saturated = np.zeros(white.shape[1:], bool)
+    for n, centre in enumerate(centres):
+        three = white[centre - 1 : centre + 2].astype(np.float32) * inside[n][:, None]
+        difference[n] = three[0] - 2.0 * three[1] + three[2]
+        total += three[1]
+        if saturation_counts is not None:
+            saturated |= three.max(axis=0) >= saturation_counts
+    return difference, total, saturated
 
 
 def _no_outlier(
