@@ -25,8 +25,8 @@ from capture_factory import (
     write_session,
 )
 
-from hsi_sc_nerf.data import process as process_module
-from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data import calibrated_frames as frames_module
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig, LampDriftConfig
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, Container, open_packed
 from hsi_sc_nerf.data.process import ProcessConfig, process_session
@@ -48,13 +48,13 @@ def session(tmp_path):
 def calls(monkeypatch) -> list[str]:
     """Names of the captures that are really calibrated."""
     seen = []
-    real = process_module.process_frame
+    real = frames_module.process_frame
 
     def counting(cube, *arguments, **options):
         seen.append(cube.header_path.stem)
         return real(cube, *arguments, **options)
 
-    monkeypatch.setattr(process_module, "process_frame", counting)
+    monkeypatch.setattr(frames_module, "process_frame", counting)
     return seen
 
 
@@ -128,14 +128,16 @@ def test_other_settings_redo_what_depends_on_them(session, tmp_path, calls):
     output = run(session, tmp_path / "data")
     run(session, output, ProcessConfig(masks=MaskConfig(threshold=0.1)))
     assert len(calls) == 4
-    run(session, output, ProcessConfig(calibration=CalibrationConfig(smoothing_bands=1)))
+    run(session, output, ProcessConfig(calibration=CalibrationConfig(bounds=(0.0, 0.9))))
     assert len(calls) == 8
 
 
 def test_a_changed_capture_is_done_again_alone(session, tmp_path, calls):
-    output = run(session, tmp_path / "data")
+    # All of that frame gets darker, which would be taken for the lamps.
+    config = ProcessConfig(calibration=CalibrationConfig(lamp_drift=LampDriftConfig(correct="never")))
+    output = run(session, tmp_path / "data", config)
     write_capture(session, "ball_3", expose(frame_reflectance(180.0) * 0.9))
-    run(session, output)
+    run(session, output, config)
     assert calls[4:] == ["ball_3"]
     cube = open_packed(output).frames[2].cube()
     np.testing.assert_allclose(cube / REFLECTANCE_SCALE, 0.9 * frame_reflectance(180.0), atol=1e-3)
@@ -153,7 +155,7 @@ def test_damaged_output_is_made_again(session, tmp_path, calls):
 
 def test_a_stopped_run_goes_on(session, tmp_path, monkeypatch):
     done = []
-    real = process_module.process_frame
+    real = frames_module.process_frame
 
     def stops_at_the_third(cube, *arguments, **options):
         name = cube.header_path.stem
@@ -163,7 +165,7 @@ def test_a_stopped_run_goes_on(session, tmp_path, monkeypatch):
         done.append(name)
         return real(cube, *arguments, **options)
 
-    monkeypatch.setattr(process_module, "process_frame", stops_at_the_third)
+    monkeypatch.setattr(frames_module, "process_frame", stops_at_the_third)
     one_by_one = ProcessConfig(workers=1)
     with pytest.raises(KeyboardInterrupt):
         run(session, tmp_path / "data", one_by_one)

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, PictureBands, Tally, pack_counts
+from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, Tally, pack_counts
 from hsi_sc_nerf.data.envi import Cube, open_cube
 from hsi_sc_nerf.data.masks import MaskConfig, bin_width, foreground_score
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, write_packed_cube
+from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
 from hsi_sc_nerf.data.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 
@@ -135,3 +136,14 @@ def border_spectrum(
     middle = [ordered[(measured[some] - odd) // 2, some] for odd in (0, 1)]
     median[some] = np.mean(middle, axis=0) / REFLECTANCE_SCALE
     return median
+
+
+def object_spectrum(
+    cube_path: Path, foreground: Bool[np.ndarray, "lines samples"], pixels: int = 2000
+) -> Float[np.ndarray, "bands"]:
+    """Mean spectrum of a packed frame's foreground, from so many of its pixels; nan where there is none."""
+    at = np.flatnonzero(foreground)
+    chosen = np.unravel_index(at[:: max(1, len(at) // pixels)], foreground.shape)
+    reflectance, valid = unpack(open_cube(cube_path).memmap()[chosen])
+    measured = valid.sum(axis=0)
+    return np.where(measured > 0, reflectance.sum(axis=0) / np.maximum(measured, 1), np.nan)

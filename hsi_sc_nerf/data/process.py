@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import write_json, write_png
+from hsi_sc_nerf.data.calibrated_frames import pack_frames
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, dark_counts
-from hsi_sc_nerf.data.calibration.white_reference import WhiteReference, white_reference
-from hsi_sc_nerf.data.fingerprint import capture_files, fingerprint, session_fingerprint
-from hsi_sc_nerf.data.frames import FrameNotes, FramePaths, border_spectrum, finished_notes, process_frame
+from hsi_sc_nerf.data.calibration.reflectance import Tally
+from hsi_sc_nerf.data.calibration.report import (
+    REPORT_NAME,
+    describe_calibration,
+    describe_tally,
+    draw_calibration,
+    write_calibration,
+)
+from hsi_sc_nerf.data.calibration.session import calibrate_session
+from hsi_sc_nerf.data.calibration.uncertainty import typical_uncertainty
+from hsi_sc_nerf.data.fingerprint import session_fingerprint
+from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, object_spectrum
 from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask
 from hsi_sc_nerf.data.packed import (
     TRANSFORMS_NAME,
@@ -31,9 +38,9 @@ from hsi_sc_nerf.data.packed import (
     write_transforms,
 )
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.data.report import mask_picture, white_reference_picture
+from hsi_sc_nerf.data.report import mask_picture
 from hsi_sc_nerf.data.scene_box import object_box, scene_box
-from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Capture, Session, open_session
+from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.estimate import TurntablePoses, estimate_turntable_poses
 from hsi_sc_nerf.poses.picture import draw_poses
@@ -63,7 +70,7 @@ class ProcessConfig:
     scene_margin_m: float = 0.005
     """The box of everything that turns is widened by this, metres."""
     workers: int = 2
-    """Frames that are calibrated at the same time; each needs memory for three copies of a raw cube."""
+    """Frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
 
 
 def process_session(
@@ -99,14 +106,27 @@ def process_session(
         )
     _clear_transforms(output_dir)
 
-    white = white_reference(session.white, config.calibration)
-    white_reference_picture(
-        output_dir / "report" / "white_reference.png", session.white.cube, white, config.pseudo_rgb_nm
-    )
-    console.print(f"White reference: {int(white.mask.sum())} pixels of the tarp in {session.white.name}.")
-
+    with console.status("measuring white, noise and lamps"):
+        calibration = calibrate_session(session, config.calibration)
+        draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
+    for sentence in describe_calibration(session, calibration):
+        console.print(sentence, highlight=False)
     names = [capture.name for capture in session.frames]
-    notes = _process_frames(session, output_dir, white, config, progress)
+    notes = pack_frames(
+        session,
+        calibration,
+        output_dir,
+        config.masks,
+        pseudo_rgb_nm=config.pseudo_rgb_nm,
+        marker_range_nm=config.marker_range_nm,
+        workers=config.workers,
+        progress=progress,
+    )
+    tally = Tally.total(note.tally for note in notes)
+    wavelengths_nm = session.wavelengths_nm[calibration.bands]
+    values = sum(note.score.size for note in notes) * len(wavelengths_nm)
+    console.print(describe_tally(tally, values), highlight=False)
+
     try:
         poses = estimate_poses(
             [note.gray for note in notes],
@@ -148,18 +168,29 @@ def process_session(
     )
     size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(bounds, axis=0)[0])
     console.print(f"Object: inside a box of {size_mm} mm.")
+    used = [note for note, posed in zip(notes, poses.used, strict=True) if posed]
+    typical = None
+    if calibration.uncertainty is not None:
+        typical = typical_uncertainty(calibration.uncertainty, _mean_spectrum(frames, masks))
+    write_calibration(output_dir / REPORT_NAME, session, calibration, tally, typical)
+    widths_nm = session.frames[0].cube.fwhm_nm
     dataset = PackedDataset(
         root=output_dir,
         intrinsics=poses.intrinsics,
         distortion=np.array(poses.distortion, dtype=float),
-        wavelengths_nm=session.wavelengths_nm,
-        pseudo_rgb_nm=session.wavelengths_nm[nearest_bands(session.wavelengths_nm, config.pseudo_rgb_nm)],
+        wavelengths_nm=wavelengths_nm,
+        fwhm_nm=None if widths_nm is None else widths_nm[calibration.bands],
+        pseudo_rgb_nm=wavelengths_nm[nearest_bands(wavelengths_nm, config.pseudo_rgb_nm)],
         object_name=session.info.object or session.path.resolve().name,
         scene_box_m=scene_box(bounds, poses.marker_corners_m, container, config.scene_margin_m),
         object_box_m=bounds,
         background_reflectance=_background(frames, masks),
         container=container,
         frames=tuple(frames),
+        flagged_values=sum(int(note.tally.flagged.sum()) for note in used),
+        bad_bands_nm=np.delete(session.wavelengths_nm, calibration.bands),
+        uncertainty=calibration.uncertainty,
+        typical_uncertainty=typical,
         fingerprint=stamp,
     )
     write_transforms(dataset)
@@ -182,59 +213,6 @@ def _clear_transforms(output_dir: Path) -> None:
     if transforms.exists() and not is_packed(output_dir):
         raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
     transforms.unlink(missing_ok=True)
-
-
-def _process_frames(
-    session: Session, output_dir: Path, white: WhiteReference, config: ProcessConfig, progress: bool
-) -> list[FrameNotes]:
-    """Notes of all frames, in order; frames that an earlier run finished are not touched."""
-    common = [
-        capture_files(session, session.white),
-        asdict(config.calibration),
-        [config.masks.spectral_bins, config.masks.smoothing_px],
-        [config.pseudo_rgb_nm, config.marker_range_nm],
-    ]
-
-    def work(index: int) -> FrameNotes:
-        capture = session.frames[index]
-        paths = FramePaths.of(output_dir, capture.name)
-        stamp = fingerprint([common, capture_files(session, capture)])
-        return finished_notes(paths, stamp) or process_frame(
-            capture.cube,
-            _frame_calibration(capture, white, config.calibration),
-            paths,
-            stamp,
-            config.masks,
-            pseudo_rgb_nm=config.pseudo_rgb_nm,
-            marker_range_nm=config.marker_range_nm,
-        )
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        Progress(*columns, console=Console(stderr=True), disable=not progress) as bar,
-        ThreadPoolExecutor(config.workers) as pool,
-    ):
-        task = bar.add_task("Calibrating frames", total=len(session.frames))
-        futures = [pool.submit(work, index) for index in range(len(session.frames))]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                bar.advance(task)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
-
-
-def _frame_calibration(capture: Capture, white: WhiteReference, config: CalibrationConfig) -> FrameCalibration:
-    _, samples, bands = capture.cube.shape
-    dark = dark_counts(None if capture.dark is None else capture.dark.read(), samples)
-    return FrameCalibration(
-        dark=np.zeros((1, bands)) if dark is None else dark[0],
-        gain=1.0 / np.atleast_2d(white.spectrum),
-        bands=np.arange(bands),
-        bounds=config.bounds,
-    )
 
 
 def _container(session: Session) -> Container | None:
@@ -290,6 +268,18 @@ def _make_masks(
 
 
 def _background(frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]) -> Float[np.ndarray, "bands"]:
-    """Median over frames of the spectra along the image's border; nan-free, 0 in bands that no frame shows there."""
+    """Median over frames of the spectra along the image's border; 0 in a band that no frame shows there."""
     spectra = np.stack([border_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
-    return np.ma.median(np.ma.masked_invalid(spectra), axis=0).filled(0.0)
+    shown = np.isfinite(spectra).any(axis=0)
+    background = np.zeros(spectra.shape[1])
+    background[shown] = np.nanmedian(spectra[:, shown], axis=0)
+    return background
+
+
+def _mean_spectrum(
+    frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]
+) -> Float[np.ndarray, "bands"]:
+    """Mean over frames of the object's spectrum; 0 in a band that no frame has."""
+    spectra = np.stack([object_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
+    shown = np.isfinite(spectra)
+    return np.where(shown, spectra, 0.0).sum(axis=0) / np.maximum(shown.sum(axis=0), 1)
