@@ -1,0 +1,203 @@
+"""From free poses of single frames to the machine that made them: one axis, one angle a frame, a fixed camera.
+
+Structure from motion gives each frame six numbers, where the machine has one. In its world the object lies still and
+the camera goes round: with B the camera's rotation in the first frame and u the axis, frame i has
+
+    R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
+
+for the axis stands still before the camera. Both are linear in what is looked for (u, then p and q). The object lies
+about the axis, so q is known well even where a frame's rotation and place are wrong together, as they are where a
+small object is seen from far away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.errors import InputError
+
+FEWEST_FRAMES = 3
+# A frame contradicts the machine if a misfit is above this and above so many times the median misfit.
+_CONTRADICTS_DEG = 3.0
+_CONTRADICTS_DISTANCES = 0.02
+_CONTRADICTS_MEDIANS = 6.0
+# With steps below this the poses are all one: a camera that stands still, with no axis.
+_LEAST_TURN_DEG = 2.0
+_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class TurntableFit:
+    """The machine nearest to free poses, in the poses' own unit of length.
+
+    The turntable's frame: z is the axis, up; the camera sits at (``distance``, 0, 0) at the angle 0. Angles are
+    counter-clockwise seen from above, relative to the first frame that was fitted, unwrapped over the frames. Rows of
+    frames without a pose are nan. A frame that ``contradicts`` the others took no part and has no angle.
+    """
+
+    to_turntable: Float[np.ndarray, "3 3"]
+    """Rotation from the poses' world into the turntable's frame."""
+    origin: Float[np.ndarray, "3"]
+    """The turntable frame's origin in the poses' world: the axis' point at the camera's height."""
+    distance: float
+    camera_rotation: Float[np.ndarray, "3 3"]
+    """From the turntable's frame to OpenCV's camera axes, at the angle 0."""
+    angles_rad: Float[np.ndarray, "n"]
+    rotation_misfit_deg: Float[np.ndarray, "n"]
+    position_misfit: Float[np.ndarray, "n"]
+    """How far the frame's pose shifts the axis before the camera, in distances of the camera from the axis."""
+    contradicts: Bool[np.ndarray, "n"]
+
+    def place(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the poses' world in the turntable's frame, with the camera's distance as the unit of length."""
+        return (points - self.origin) @ self.to_turntable.T / self.distance
+
+
+def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> TurntableFit:
+    """The axis, the camera before it and one angle a frame that suit free poses best.
+
+    The axis comes from the frames that most pairs of frames agree with; single wrong poses do no harm. Poses alone
+    do not tell which end of an axis is up: it is taken up in the image, to within 90 degrees.
+
+    Args:
+        world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
+
+    Raises:
+        InputError: fewer than three poses, or poses that do not turn about one axis.
+    """
+    posed = np.isfinite(world_to_camera).all(axis=(1, 2))
+    if posed.sum() < FEWEST_FRAMES:
+        raise InputError(
+            f"{int(posed.sum())} posed frame(s) cannot fix a turntable's axis; {FEWEST_FRAMES} or more are needed"
+        )
+    rotations, shifts = world_to_camera[posed, :3, :3], world_to_camera[posed, :3, 3]
+    good = _agreeing(rotations)
+    while good.sum() >= FEWEST_FRAMES:
+        axis, base, angles = _about_one_axis(rotations, good)
+        on_axis, before_camera = _axis_place(rotations, shifts, axis, good)
+        distance = float(np.linalg.norm(_across(base.T @ before_camera, axis)))
+        misfit_deg = np.rad2deg(_angle_between(rotations, base @ _turns(axis, angles)))
+        misfit = np.linalg.norm(rotations @ on_axis + shifts - before_camera, axis=-1) / max(distance, 1e-12)
+        wrong = _above(misfit_deg, good, _CONTRADICTS_DEG) | _above(misfit, good, _CONTRADICTS_DISTANCES)
+        if not wrong[good].any():
+            break
+        good = good & ~wrong
+    if good.sum() < FEWEST_FRAMES or np.ptp(np.unwrap(angles[good])) < np.deg2rad(_LEAST_TURN_DEG):
+        raise InputError(
+            "the poses that were found do not turn about one axis: the camera seems to stand still or to move freely; "
+            "mask out what does not turn, or take markers"
+        )
+
+    if (base @ axis)[1] > 0.0:  # the image's y points down
+        axis, angles = -axis, -angles
+    place = -base.T @ before_camera
+    across = _across(place, axis)
+    x = across / np.linalg.norm(across)
+    first = int(np.flatnonzero(good)[0])
+    # The frame's x belongs to the angle 0 of `base`; turn both to the first fitted frame.
+    to_turntable = Rotation.from_rotvec([0.0, 0.0, angles[first]]).as_matrix() @ np.stack(
+        [x, np.cross(axis, x), axis]
+    )
+    camera_rotation = base @ np.stack([x, np.cross(axis, x), axis]).T
+    angles[~good] = np.nan
+    angles[good] = np.unwrap(angles[good]) - angles[first]
+    rows = np.full((3, len(posed)), np.nan)
+    rows[:, posed] = angles, misfit_deg, misfit
+    contradicts = np.zeros(len(posed), bool)
+    contradicts[posed] = ~good
+    return TurntableFit(
+        to_turntable=to_turntable,
+        origin=on_axis + (place @ axis) * axis,
+        distance=distance,
+        camera_rotation=camera_rotation,
+        angles_rad=rows[0],
+        rotation_misfit_deg=rows[1],
+        position_misfit=rows[2],
+        contradicts=contradicts,
+    )
+
+
+def _agreeing(rotations):
+    """Frames in line with the axis of the one pair of frames that leaves the smallest median misfit.
+
+    An axis u of the world and its image v in the camera satisfy R_i u = v in every frame.
+    """
+    i, j = np.triu_indices(len(rotations), 1)
+    relative = Rotation.from_matrix(np.swapaxes(rotations[i], -1, -2) @ rotations[j]).as_rotvec()
+    size = np.linalg.norm(relative, axis=-1)
+    turned = size > np.deg2rad(_LEAST_TURN_DEG)
+    if not turned.any():
+        return np.zeros(len(rotations), bool)
+    axes = relative[turned] / size[turned, None]
+    in_camera = np.einsum("pij,pj->pi", rotations[i[turned]], axes)
+    away = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
+    best = away[np.argmin(np.median(away, axis=1))]
+    return best <= max(np.deg2rad(_CONTRADICTS_DEG), _CONTRADICTS_MEDIANS * float(np.median(best)))
+
+
+def _about_one_axis(rotations, good):
+    """Axis, base rotation and angles with R_i close to base Rot(axis, a_i), by least squares over the good frames."""
+    # |R_i u - v| is least where u is what the mean rotation shortens least.
+    axis = np.linalg.svd(rotations[good].mean(axis=0))[2][0]
+    base = rotations[good][0]
+    cross = _cross_matrix(axis)
+    for _ in range(_ROUNDS):
+        relative = base.T @ rotations
+        cosine = np.trace(relative, axis1=1, axis2=2) - axis @ relative @ axis
+        sine = np.einsum("nij,ij->n", relative, cross)
+        angles = np.arctan2(sine, cosine)
+        base = _nearest_rotation((rotations @ np.swapaxes(_turns(axis, angles), -1, -2))[good].sum(axis=0))
+    return axis, base, angles
+
+
+def _axis_place(rotations, shifts, axis, good):
+    """R_i p + t_i = q: p in the world, at the height of what the camera looks at, q in the camera.
+
+    The sum of distances is made least, not of their squares, by reweighting: one wrong place must not pull.
+    """
+    rotations, shifts = rotations[good], shifts[good]
+    n = len(rotations)
+    places = -np.einsum("nji,nj->ni", rotations, shifts)
+    # Where the viewing rays meet: there p is near the object, whose place the poses tell best.
+    sideways = np.eye(3) - rotations[:, 2, :, None] * rotations[:, 2, None, :]
+    seen = np.linalg.lstsq(sideways.reshape(-1, 3), np.einsum("nij,nj->ni", sideways, places).ravel(), rcond=1e-6)[0]
+    plane = np.linalg.svd(axis[None])[2][1:].T
+    design = np.concatenate([rotations @ plane, -np.tile(np.eye(3), (n, 1, 1))], axis=-1)
+    wanted = -(rotations @ seen + shifts)
+    weight = np.ones(n)
+    for _ in range(_ROUNDS):
+        weighted = (design * weight[:, None, None]).reshape(3 * n, 5)
+        solution = np.linalg.lstsq(weighted, (wanted * weight[:, None]).ravel(), rcond=None)[0]
+        left = np.linalg.norm(design @ solution - wanted, axis=-1)
+        weight = 1.0 / np.sqrt(np.maximum(left, max(1e-3 * float(np.median(left)), 1e-12)))
+    return seen + plane @ solution[:2], solution[2:]
+
+
+def _above(misfit, good, least):
+    return misfit > max(least, _CONTRADICTS_MEDIANS * float(np.median(misfit[good])))
+
+
+def _turns(axis, angles):
+    return Rotation.from_rotvec(np.outer(angles, axis)).as_matrix()
+
+
+def _across(vector, axis):
+    return vector - (vector @ axis) * axis
+
+
+def _angle_between(a, b):
+    chord = np.linalg.norm(a - b, axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
+    return 2.0 * np.arcsin(np.minimum(1.0, chord))
+
+
+def _nearest_rotation(matrix):
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def _cross_matrix(v):
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,0 +1,112 @@
+"""From free poses to the machine: exact round trips, partial turns, either direction, wrong poses, no turn at all."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
+
+ELEVATION_DEG, ROLL_DEG, DISTANCE = 25.0, 4.0, 0.42
+
+
+def machine():
+    """Turntable frame to OpenCV camera axes, of a camera at (DISTANCE, 0, 0) that looks down and is a little rolled."""
+    looks_back = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    down, roll = Rotation.from_euler("x", -ELEVATION_DEG, degrees=True), Rotation.from_euler("z", ROLL_DEG, True)
+    return roll.as_matrix() @ down.as_matrix() @ looks_back
+
+
+def free_poses(angles_deg, scale=3.0, seed=0):
+    """World-to-camera in a world of another orientation, place and scale; the world's points and the machine's."""
+    rng = np.random.default_rng(seed)
+    world = Rotation.random(random_state=rng).as_matrix()
+    shift = rng.normal(size=3)
+    poses = np.tile(np.eye(4), (len(angles_deg), 1, 1))
+    for pose, angle in zip(poses, angles_deg, strict=True):
+        turn = Rotation.from_euler("z", angle, True).as_matrix()
+        pose[:3, :3] = machine() @ turn @ world.T
+        # World point Y = scale * world X + shift; the camera's coordinates in the world's scale.
+        pose[:3, 3] = -scale * machine() @ [DISTANCE, 0.0, 0.0] - pose[:3, :3] @ shift
+    points = rng.normal(size=(5, 3)) * 0.05
+    return poses, scale * points @ world.T + shift, points
+
+
+@pytest.mark.parametrize(
+    "angles_deg",
+    [
+        np.arange(0, 360, 18.0),
+        -np.arange(0, 360, 18.0),
+        np.linspace(0, 200, 15),
+        np.linspace(0, 25, 6),
+        np.arange(0, 360, 24.0) + np.random.default_rng(3).normal(0, 3, 15),
+    ],
+)
+def test_exact_poses_give_the_exact_machine(angles_deg):
+    poses, in_world, points = free_poses(angles_deg)
+    fit = turntable_from_poses(poses)
+    np.testing.assert_allclose(np.rad2deg(fit.angles_rad), angles_deg - angles_deg[0], atol=1e-6)
+    turn = Rotation.from_euler("z", angles_deg[0], True).as_matrix()
+    np.testing.assert_allclose(fit.camera_rotation, machine(), atol=1e-8)
+    np.testing.assert_allclose(fit.place(in_world), points @ turn.T / DISTANCE, atol=1e-8)
+    assert fit.distance == pytest.approx(3.0 * DISTANCE)
+    assert not fit.contradicts.any()
+    assert np.max(fit.rotation_misfit_deg) < 1e-5
+    assert np.max(fit.position_misfit) < 1e-8
+
+
+def test_frames_without_a_pose_stay_without_one():
+    angles_deg = np.arange(0, 360, 20.0)
+    poses, _, _ = free_poses(angles_deg)
+    poses[[0, 7]] = np.nan
+    fit = turntable_from_poses(poses)
+    assert np.isnan(fit.angles_rad[[0, 7]]).all()
+    have = np.isfinite(fit.angles_rad)
+    assert have.sum() == 16
+    np.testing.assert_allclose(np.rad2deg(fit.angles_rad[have]), angles_deg[have] - 20.0, atol=1e-6)
+
+
+def test_wrong_poses_are_found_and_do_no_harm():
+    angles_deg = np.arange(0, 360, 18.0)
+    poses, _, _ = free_poses(angles_deg)
+    wrong = [2, 5, 6, 11, 13, 19]
+    for k in wrong[:4]:
+        poses[k, :3, :3] = Rotation.random(random_state=k).as_matrix() @ poses[k, :3, :3]
+    for k in wrong[4:]:
+        poses[k, :3, 3] += 0.3
+    fit = turntable_from_poses(poses)
+    np.testing.assert_array_equal(np.flatnonzero(fit.contradicts), wrong)
+    assert np.isnan(fit.angles_rad[wrong]).all()
+    np.testing.assert_allclose(fit.camera_rotation, machine(), atol=1e-6)
+    good = ~fit.contradicts
+    np.testing.assert_allclose(np.rad2deg(fit.angles_rad[good]), angles_deg[good], atol=1e-5)
+
+
+def test_noise_averages_out():
+    angles_deg = np.arange(0, 360, 6.0)
+    poses, _, _ = free_poses(angles_deg)
+    rng = np.random.default_rng(1)
+    for pose in poses:
+        # As in structure from motion the object stays where it is in the image: rotation and place err together.
+        turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0, 0.5, 3))).as_matrix()
+        centre = np.array([0.0, 0.0, 3.0 * DISTANCE])
+        pose[:3, :3] = turn @ pose[:3, :3]
+        pose[:3, 3] = turn @ (pose[:3, 3] - centre) + centre
+    fit = turntable_from_poses(poses)
+    assert not fit.contradicts.any()
+    off = Rotation.from_matrix(fit.camera_rotation @ machine().T).magnitude()
+    assert np.rad2deg(off) < 0.4
+    assert fit.distance == pytest.approx(3.0 * DISTANCE, rel=0.01)
+
+
+def test_a_camera_that_stands_still_has_no_axis():
+    poses, _, _ = free_poses(np.zeros(10))
+    with pytest.raises(InputError, match="do not turn about one axis"):
+        turntable_from_poses(poses)
+
+
+def test_two_poses_are_too_few():
+    poses, _, _ = free_poses(np.array([0.0, 10.0, 20.0]))
+    poses[1] = np.nan
+    with pytest.raises(InputError, match="cannot fix"):
+        turntable_from_poses(poses)
