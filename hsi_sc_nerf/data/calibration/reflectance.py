@@ -134,6 +134,7 @@ def pack_counts(
     counts = np.asarray(counts)  # lines of a memory map would be memory maps, which are slower to make
     file_bands = as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
+    any_dead = len(dead.at) > 0
     scale, offset = _line_constants(calibration, samples)
     per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
     tests = _tests_of_counts(calibration, counts.dtype)
@@ -179,13 +180,15 @@ def pack_counts(
             for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
                 counters[name].add(clipped if flagged is None else clipped & ~flagged)
             np.clip(values, low + _HALF, high + _HALF, out=values)
-        values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
+        if any_dead:
+            values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
         draw.line(line, values)
 
         np.copyto(numbers, values, casting="unsafe")
         if flagged is not None:
             numbers[flagged] = FLAGGED
-        numbers.reshape(-1)[dead.at] = FLAGGED
+        if any_dead:
+            numbers.reshape(-1)[dead.at] = FLAGGED
         in_block = line % _BLOCK_LINES
         cv2.transpose(numbers, dst=block[in_block])
         if in_block == _BLOCK_LINES - 1 or line == lines - 1:

@@ -1,0 +1,283 @@
+"""What processing a frame costs beside copying its raw file and beside SPy with numpy, as a table.
+
+    uv run python benchmarks/processing_speed.py --page README.md
+
+Each way is a process of its own, which first reads its input files (so that they come from the system's memory), then
+works on one frame without the clock, for what is loaded once, then with it; it writes files that were not there. The
+ways take turns, and the median of the rounds is told, for the time and for its ratio to copying in the same round.
+"Processor" is the time that the processor spent, of which other work on the machine changes little. Frames with the
+counts of a plausible camera are made for it and deleted at the end; or give a session of your own.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+from spectral.io import envi
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.cli.steps import run_step
+from hsi_sc_nerf.data.calibration.config import CalibrationConfig
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.data.calibration.session import calibrate_session
+from hsi_sc_nerf.data.envi import Cube, write_cube
+from hsi_sc_nerf.data.frames import FramePaths, process_frame
+from hsi_sc_nerf.data.masks import MaskConfig
+from hsi_sc_nerf.data.session import Capture, Session, open_session
+
+TABLE_STARTS, TABLE_ENDS = "<!-- processing speed -->", "<!-- end of processing speed -->"
+COLUMNS = ["way", "frames", "workers", "a frame, ms", "of copying", "processor, ms", "of copying", "peak memory, MiB"]
+DARK_COUNTS, WHITE_COUNTS = 100, 3000
+MARKER_RANGE_NM = (450.0, 700.0)
+CALIBRATION_NAME = "calibration.pickle"
+
+Work = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class ProcessingSpeed:
+    """Measure what processing frames costs, beside copying their raw files and beside SPy with numpy."""
+
+    session: Path | None = None
+    """A session to process; one is made if not given."""
+    size: int = 512
+    """Width and height of the frames that are made, pixels."""
+    bands: int = paper.BANDS
+    """Bands of the frames that are made."""
+    frames: int = 12
+    """Frames that are processed side by side."""
+    workers: int = 2
+    """How many side by side."""
+    rounds: int = 3
+    """How often each way takes its turn."""
+    folder: Path | None = None
+    """Where to make files; the system's folder for temporary files if not given."""
+    page: Path | None = None
+    """Markdown page whose table (between the marks of this benchmark) is replaced."""
+    figures: Path | None = None
+    """JSON file for the figures of all rounds."""
+
+    def main(self) -> None:
+        """Measure, print the table, write it into the page."""
+        with tempfile.TemporaryDirectory(prefix="processing-speed-", dir=self.folder) as folder:
+            scratch = Path(folder)
+            session = self.session
+            if session is None:
+                session = scratch / "session"
+                _run("make", session, scratch, self.frames, 1, size=self.size, bands=self.bands)
+            _run("calibrate", session, scratch, 0, 1)
+            many = min(self.frames, len(_load(scratch)[0]))
+            jobs = [("nothing", 0, 1), ("copy", 1, 1), ("process", 1, 1), ("spy", 1, 1)]
+            jobs += [("copy", many, self.workers), ("process", many, self.workers)]
+            rows = [{"way": way, "frames": frames, "workers": workers, "rounds": []} for way, frames, workers in jobs]
+            for _ in range(self.rounds):
+                for row in rows:
+                    row["rounds"].append(_run(row["way"], session, scratch, row["frames"], row["workers"]))
+        if self.figures is not None:
+            self.figures.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        self._show(rows)
+
+    def _show(self, rows: list[dict]) -> None:
+        table = Table(*COLUMNS)
+        cells = [_cells(row, rows) for row in rows]
+        for line in cells:
+            table.add_row(*line)
+        Console(width=118).print(table)
+        if self.page is not None:
+            text = self.page.read_text(encoding="utf-8")
+            before, rest = text.split(TABLE_STARTS)
+            lines = "\n".join(f"| {' | '.join(line)} |" for line in (COLUMNS, ["---"] * len(COLUMNS), *cells))
+            after = rest.split(TABLE_ENDS)[1]
+            self.page.write_text(f"{before}{TABLE_STARTS}\n{lines}\n{TABLE_ENDS}{after}", encoding="utf-8")
+
+
+WAYS = {
+    "nothing": "Python and what it imports",
+    "copy": "shutil.copyfile of the raw file",
+    "process": "process_frame (this package)",
+    "spy": "SPy load(), numpy, save_image",
+}
+
+
+def _cells(row: dict, rows: list[dict]) -> list[str]:
+    peak = f"{np.median([r['peak_mib'] for r in row['rounds']]):.0f}"
+    if row["way"] == "nothing":
+        return [WAYS["nothing"], "", "", "", "", "", "", peak]
+    cells = [WAYS[row["way"]], str(row["frames"]), str(row["workers"])]
+    copy = next(
+        r for r in rows if r["way"] == "copy" and (r["frames"], r["workers"]) == (row["frames"], row["workers"])
+    )
+    for figure in ("milliseconds", "processor_milliseconds"):
+        own, copying = (np.array([r[figure] for r in rs["rounds"]]) for rs in (row, copy))
+        cells += [f"{np.median(own):.0f}", f"{np.median(own / copying):.1f}"]
+    return [*cells, peak]
+
+
+def _run(way: str, session: Path, scratch: Path, frames: int, workers: int, **made: int) -> dict[str, float]:
+    """Times a frame and peak memory of one way, in a process of its own."""
+    log = scratch / "log"
+    options = {"way": way, "session": session, "scratch": scratch, "frames": frames, "workers": workers, **made}
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    cost = run_step(way, [sys.executable, __file__, *words], log)
+    return {**json.loads(log.read_text(encoding="utf-8")), "peak_mib": cost.peak_memory_mib}
+
+
+@dataclass(frozen=True)
+class OneWay:
+    """Do one way's work and print its times a frame."""
+
+    way: str
+    """Which."""
+    session: Path
+    """The frames."""
+    scratch: Path
+    """For what is written; deleted at the end."""
+    frames: int
+    """How many."""
+    workers: int
+    """How many side by side."""
+    size: int = 512
+    """Of the frames that are made."""
+    bands: int = paper.BANDS
+    """Of the frames that are made."""
+
+    def main(self) -> None:
+        """Warm up, do the work, print its times."""
+        times = {}
+        if self.way == "make":
+            _make_session(self.session, self.size, self.bands, self.frames)
+        elif self.way == "calibrate":
+            calibration = calibrate_session(open_session(self.session), CalibrationConfig())
+            with (self.scratch / CALIBRATION_NAME).open("wb") as file:
+                pickle.dump((calibration.cubes, calibration.frames), file)
+        elif self.way != "nothing":
+            times = self._timed()
+        print(json.dumps(times))
+
+    def _timed(self) -> dict[str, float]:
+        output_dir = self.scratch / "output"
+        session = open_session(self.session)
+        for path in {c.data_path for capture in session.frames[: self.frames] for c in capture.cubes}:
+            with path.open("rb") as file:
+                while file.read(1 << 24):
+                    pass
+        ways = {"copy": _copying, "process": _processing, "spy": _spy}
+        work = ways[self.way](session, self.scratch, output_dir)
+        with _fresh(output_dir):
+            work(0)
+        with _fresh(output_dir), ThreadPoolExecutor(self.workers) as pool:
+            started, processor_started = time.perf_counter(), time.process_time()
+            list(pool.map(work, range(self.frames)))
+            seconds, processor_seconds = time.perf_counter() - started, time.process_time() - processor_started
+        return {
+            "milliseconds": 1000.0 * seconds / self.frames,
+            "processor_milliseconds": 1000.0 * processor_seconds / self.frames,
+        }
+
+
+@contextmanager
+def _fresh(folder: Path) -> Iterator[None]:
+    folder.mkdir(parents=True)
+    try:
+        yield
+    finally:
+        shutil.rmtree(folder)
+
+
+def _load(scratch: Path) -> tuple[tuple[Cube, ...], tuple[FrameCalibration, ...]]:
+    with (scratch / CALIBRATION_NAME).open("rb") as file:
+        return pickle.load(file)
+
+
+def _copying(session: Session, _: Path, output_dir: Path) -> Work:
+    def work(i: int) -> None:
+        shutil.copyfile(session.frames[i].cube.data_path, output_dir / f"{i}.raw")
+
+    return work
+
+
+def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
+    cubes, calibrations = _load(scratch)
+
+    def work(i: int) -> None:
+        process_frame(
+            cubes[i],
+            calibrations[i],
+            FramePaths.of(output_dir, session.frames[i].name),
+            "",
+            MaskConfig(),
+            pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
+            marker_range_nm=MARKER_RANGE_NM,
+        )
+
+    return work
+
+
+def _spy(session: Session, _: Path, output_dir: Path) -> Work:
+    """As SPy's manual would have it: (S - D) / (W - D), clipped, saved."""
+    tarp = session.white
+    if tarp is None:
+        raise ValueError("a session without a white tarp")
+    white = _central_spectrum(tarp)
+
+    def work(i: int) -> None:
+        capture = session.frames[i]
+        sample = envi.open(str(capture.cube.header_path)).load()
+        dark = envi.open(str(capture.dark.header_path)).load().mean(axis=0) if capture.dark else np.float32(0.0)
+        reflectance = np.clip((sample - dark) / (white - dark), 0.0, 1.0)
+        envi.save_image(str(output_dir / f"{i}.hdr"), reflectance, dtype=np.float32)
+
+    return work
+
+
+def _central_spectrum(capture: Capture) -> np.ndarray:
+    lines, samples, _ = capture.cube.shape
+    middle = capture.cube.memmap()[lines // 3 : -(lines // 3), samples // 3 : -(samples // 3)]
+    return middle.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
+
+
+def _make_session(path: Path, size: int, bands: int, frames: int) -> None:
+    """A leaf before a gray wall under a lamp that is weak at both ends, in 12-bit counts with photon noise."""
+    rng = np.random.default_rng(0)
+    wavelengths_nm = np.linspace(*paper.WAVELENGTH_RANGE_NM, bands)
+    lamp = WHITE_COUNTS * np.exp(-(((wavelengths_nm - 680.0) / 230.0) ** 2))
+    leaf = 0.05 + 0.45 / (1.0 + np.exp((705.0 - wavelengths_nm) / 12.0))
+    y, x = np.mgrid[:size, :size] / size - 0.5
+
+    def write(name: str, reflectance: np.ndarray) -> None:
+        light = (reflectance * lamp).astype(np.float32)
+        light += np.sqrt(light) * rng.standard_normal(light.shape, np.float32)
+        counts = np.clip(np.rint(light + DARK_COUNTS), 0, 4095).astype(np.uint16)
+        dark = rng.normal(DARK_COUNTS, 2.0, (8, size, bands)).round().astype(np.uint16)
+        for stem, cube in ((name, counts), (f"DARKREF_{name}", dark)):
+            write_cube(path / name / "capture" / f"{stem}.hdr", cube, wavelengths_nm=wavelengths_nm)
+
+    write("white_reference", np.ones((size, size, 1)))
+    on_leaf = np.hypot(x, 1.5 * y) < 0.25
+    write("frame_000", np.where(on_leaf[..., None], leaf, 0.8))
+    # What is in a frame does not change what it costs.
+    for i in range(1, max(2, frames)):
+        for stem in ("", "DARKREF_"):
+            for suffix in (".hdr", ".raw"):
+                source = path / "frame_000" / "capture" / f"{stem}frame_000{suffix}"
+                target = path / f"frame_{i:03d}" / "capture" / f"{stem}frame_{i:03d}{suffix}"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, target)
+
+
+if __name__ == "__main__":
+    tyro.cli(OneWay if "--way" in sys.argv else ProcessingSpeed).main()
