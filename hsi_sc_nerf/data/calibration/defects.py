@@ -17,7 +17,7 @@ NEIGHBOURS = 11
 LEAST_RESPONSE, LARGEST_RESPONSE = 0.5, 2.0
 """An element follows the light if it counts between these shares of what its neighbours count."""
 LEAST_BRIGHTNESS = 0.02
-"""What counts less than this share of its neighbours in all bands is taken for dead, not for a shadow."""
+"""A sample that counts less than this share of its neighbours in all bands is taken for dead, not for a shadow."""
 CERTAINTY = 6.0
 """Differences count from this many standard deviations on: of 10^8 elements none is wrong by chance."""
 DEAD_BAND_SHARE = 0.5
@@ -128,7 +128,10 @@ def elements_without_response(
         if not lit.any():
             continue
         # How much brighter a sample is than others, in all bands: an edge of the white, or of a thing in the frames.
-        brightness = np.maximum(np.median(light[:, lit] / usual[lit], axis=1), LEAST_BRIGHTNESS)[:, None]
+        brightness = np.median(light[:, lit] / usual[lit], axis=1)
+        around = ndimage.median_filter(brightness, size=NEIGHBOURS, mode="mirror")
+        brightness = np.where(brightness < LEAST_BRIGHTNESS * around, around, brightness)
+        brightness = np.maximum(brightness, LEAST_BRIGHTNESS)[:, None]
         neighbours = ndimage.median_filter(light / brightness, size=(NEIGHBOURS, 1), mode="mirror")
         expected = neighbours * brightness
         spread = 1.4826 * np.median(np.abs(light - expected), axis=0)
