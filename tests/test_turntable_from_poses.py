@@ -11,7 +11,7 @@ ELEVATION_DEG, ROLL_DEG, DISTANCE = 25.0, 4.0, 0.42
 
 
 def machine():
-    """Turntable frame to OpenCV camera axes, of a camera at (DISTANCE, 0, 0) that looks down and is a little rolled."""
+    """Turntable frame to OpenCV camera axes, of a camera at (DISTANCE, 0, 0) that looks down, a little rolled."""
     looks_back = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     down, roll = Rotation.from_euler("x", -ELEVATION_DEG, degrees=True), Rotation.from_euler("z", ROLL_DEG, True)
     return roll.as_matrix() @ down.as_matrix() @ looks_back

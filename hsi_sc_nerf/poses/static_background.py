@@ -84,4 +84,4 @@ def noise_spread(mean: Float[np.ndarray, "h w"], spread: Float[np.ndarray, "h w"
 
 
 def _odd(size: float) -> int:
-    return 2 * int(round(size / 2)) + 1
+    return 2 * round(size / 2) + 1

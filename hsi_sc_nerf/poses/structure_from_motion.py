@@ -1,4 +1,4 @@
-"""Structure from motion by COLMAP for a turntable: what stands still is masked out, neighbours in the turn are matched.
+"""Structure from motion by COLMAP for a turntable: what stands still is masked, neighbours in the turn are matched.
 
 J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (CVPR 2016). Every frame gets a pose of its own
 here; ``turntable_from_poses`` and ``track_adjust`` make one machine of them.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
-from hsi_sc_nerf.poses.track_adjust import Tracks
+from hsi_sc_nerf.poses.tracks import Tracks
 from hsi_sc_nerf.poses.turntable_from_poses import FEWEST_FRAMES
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _STRETCH_PERCENTILES = (0.5, 99.5)
 class StructureFromMotionConfig:
     """Settings of structure from motion."""
 
-    background: StaticBackgroundConfig = StaticBackgroundConfig()
+    background: StaticBackgroundConfig = field(default_factory=StaticBackgroundConfig)
     """How pixels that stand still are told; they carry no features."""
     peak_threshold: float = 0.004
     """Least contrast of a SIFT feature; smaller finds more on smooth skin, and more noise."""
@@ -48,7 +48,7 @@ class StructureFromMotionConfig:
     refine_focal: bool = False
     """Let COLMAP change the focal length, after mapping."""
     threads: int = -1
-    """Threads; -1 for as many as there are cores. Mapping takes one, so that a session gives the same result again."""
+    """Threads; -1 for as many as there are cores. Mapping takes one, so that it gives the same again."""
     seed: int = 0
     """Of COLMAP's random sampling."""
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project, reproject
 
 FEWEST_FRAMES = 3
 _STEPS = 60
@@ -49,56 +50,6 @@ class TrackAdjustConfig:
 
 
 @dataclass(frozen=True)
-class Tracks:
-    """Points of the object that were found in several frames: one row a point seen in a frame.
-
-    Pixel coordinates have their origin at the image's upper left corner.
-    """
-
-    frame: Int[np.ndarray, "n"]
-    point: Int[np.ndarray, "n"]
-    pixels: Float[np.ndarray, "n 2"]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, keep: np.ndarray) -> Tracks:
-        """The rows that ``keep`` (a mask or indices) picks."""
-        return Tracks(self.frame[keep], self.point[keep], self.pixels[keep])
-
-
-@dataclass(frozen=True)
-class TrackedTurntable:
-    """Camera, motion and points, in units of the distance between camera and axis.
-
-    The frame: z is the turntable's axis, up; the camera sits at (1, 0, 0). A point X of the object is seen in frame i
-    at the camera's coordinates ``camera_rotation @ (Rot(z, angle_i) X - (1, 0, 0))``, in OpenCV's axes. ``frames`` and
-    ``points`` (ascending) say which frame and point of the tracks the rows of ``angles_rad`` and ``places`` are.
-    """
-
-    focal_px: float
-    centre_px: tuple[float, float]
-    radial: tuple[float, float]
-    """OpenCV's k1, k2."""
-    camera_rotation: Float[np.ndarray, "3 3"]
-    frames: Int[np.ndarray, "f"]
-    angles_rad: Float[np.ndarray, "f"]
-    points: Int[np.ndarray, "p"]
-    places: Float[np.ndarray, "p 3"]
-
-    def restricted(self, tracks: Tracks) -> TrackedTurntable:
-        """The turntable with only the frames and points of the tracks; angles stay relative to the same zero."""
-        frames, points = np.isin(self.frames, tracks.frame), np.isin(self.points, tracks.point)
-        return replace(
-            self,
-            frames=self.frames[frames],
-            angles_rad=self.angles_rad[frames],
-            points=self.points[points],
-            places=self.places[points],
-        )
-
-
-@dataclass(frozen=True)
 class AdjustedTracks:
     """The adjusted machine, and how well it explains the tracks.
 
@@ -111,7 +62,7 @@ class AdjustedTracks:
     outliers: Bool[np.ndarray, "n"]
     residual_px: Float[np.ndarray, "m 2"]
     focal_sigma: float | None
-    """Standard deviation of the focal length as a share of it, from the residuals' spread; None where it was given."""
+    """Standard deviation of the focal length, as a share of it, from the residuals; None where it was given."""
 
     @property
     def overall_error_px(self) -> float:
@@ -155,11 +106,6 @@ def adjust_tracks(start: TrackedTurntable, tracks: Tracks, config: TrackAdjustCo
     return AdjustedTracks(turntable, kept, ~good, reproject(turntable, kept) - kept.pixels, sigma)
 
 
-def reproject(turntable: TrackedTurntable, tracks: Tracks) -> Float[np.ndarray, "n 2"]:
-    """Where the turntable puts each row of the tracks, pixels."""
-    return _project(turntable, *_rows(turntable, tracks))[0]
-
-
 def _enough(tracks, good, config):
     """Of the good rows those of points in enough frames and of frames with enough points."""
     good = good.copy()
@@ -179,25 +125,9 @@ def _enough(tracks, good, config):
     return good
 
 
-def _rows(turntable, tracks):
-    return np.searchsorted(turntable.frames, tracks.frame), np.searchsorted(turntable.points, tracks.point)
-
-
-def _project(turntable, frame, point):
-    """Pixels, and what their derivatives need: the points in the room and before the camera, and the turns."""
-    turn = Rotation.from_rotvec(np.outer(turntable.angles_rad, [0.0, 0.0, 1.0])).as_matrix()[frame]
-    in_room = np.einsum("nij,nj->ni", turn, turntable.places[point])
-    in_camera = (in_room - [1.0, 0.0, 0.0]) @ turntable.camera_rotation.T
-    flat = in_camera[:, :2] / in_camera[:, 2:]
-    squared = (flat**2).sum(-1, keepdims=True)
-    k1, k2 = turntable.radial
-    pixels = turntable.focal_px * (1.0 + squared * (k1 + k2 * squared)) * flat + turntable.centre_px
-    return pixels, in_room, in_camera, flat, turn
-
-
 def _slopes(turntable, frame, point, config):
     """Derivatives of the pixels by the shared numbers (n, 2, s), the frame's angle (n, 2), the point (n, 2, 3)."""
-    pixels, in_room, in_camera, flat, turn = _project(turntable, frame, point)
+    pixels, in_room, in_camera, flat, turn = project(turntable, frame, point)
     k1, k2 = turntable.radial
     squared = (flat**2).sum(-1)[:, None, None]
     by_flat = turntable.focal_px * (
@@ -249,11 +179,11 @@ def _adjust(turntable, tracks, config):
     B. Triggs et al., "Bundle adjustment - a modern synthesis" (2000), sections 4.3 and 6.1. The loss is
     rho(r^2) = 2 s^2 (sqrt(1 + r^2 / s^2) - 1) of each residual's length r, by reweighting.
     """
-    frame, point = _rows(turntable, tracks)
+    frame, point = turntable.rows(tracks)
     scale2 = config.loss_px**2
 
     def measure(machine):
-        pixels, _, in_camera, _, _ = _project(machine, frame, point)
+        pixels, _, in_camera, _, _ = project(machine, frame, point)
         if (in_camera[:, 2] <= 1e-3).any() or not np.isfinite(pixels).all():
             return np.inf, pixels
         residual = pixels - tracks.pixels
@@ -267,7 +197,7 @@ def _adjust(turntable, tracks, config):
         weight = 1.0 / np.sqrt(1.0 + (residual**2).sum(-1) / scale2)
         system = _normal_equations(turntable, frame, point, residual, np.sqrt(weight), config)
         while damping < _LARGEST_DAMPING:
-            step, places_step, reduced = _solve(*system, damping)
+            step, places_step, reduced = _solve(system, damping)
             candidate = None if step is None else _moved(turntable, step, places_step, config)
             lower, there = (np.inf, None) if candidate is None else measure(candidate)
             if lower < cost:
@@ -317,8 +247,9 @@ def _summed(values, index, size):
     return np.stack([np.bincount(index, c, size) for c in columns], axis=-1).reshape(size, *values.shape[1:])
 
 
-def _solve(normal, gradient, blocks, coupling, point_gradient, damping):
+def _solve(system, damping):
     """The damped step of the machine's numbers and of the points, and the reduced normal matrix; None if singular."""
+    normal, gradient, blocks, coupling, point_gradient = system
     diagonal = np.einsum("pii->pi", blocks)
     damped = blocks + (damping * diagonal + 1e-12 * (1.0 + diagonal.max()))[:, :, None] * np.eye(3)
     inverse = np.linalg.inv(damped)

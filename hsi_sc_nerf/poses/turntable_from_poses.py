@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.tracks import TrackedTurntable
 
 FEWEST_FRAMES = 3
 # A frame contradicts the machine if a misfit is above this and above so many times the median misfit.
@@ -56,6 +57,22 @@ class TurntableFit:
         """Points of the poses' world in the turntable's frame, with the camera's distance as the unit of length."""
         return (points - self.origin) @ self.to_turntable.T / self.distance
 
+    def tracked(
+        self, places: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
+    ) -> TrackedTurntable:
+        """Where ``track_adjust`` can start from: the fitted frames, and points of the poses' world, by row."""
+        frames = np.flatnonzero(np.isfinite(self.angles_rad))
+        return TrackedTurntable(
+            focal_px=focal_px,
+            centre_px=centre_px,
+            radial=(0.0, 0.0),
+            camera_rotation=self.camera_rotation,
+            frames=frames,
+            angles_rad=self.angles_rad[frames],
+            points=np.arange(len(places)),
+            places=self.place(places),
+        )
+
 
 def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> TurntableFit:
     """The axis, the camera before it and one angle a frame that suit free poses best.
@@ -88,8 +105,8 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
         good = good & ~wrong
     if good.sum() < FEWEST_FRAMES or np.ptp(np.unwrap(angles[good])) < np.deg2rad(_LEAST_TURN_DEG):
         raise InputError(
-            "the poses that were found do not turn about one axis: the camera seems to stand still or to move freely; "
-            "mask out what does not turn, or take markers"
+            "the poses that were found do not turn about one axis: the camera seems to stand still or to move freely "
+            "(mask out what does not turn, or take markers)"
         )
 
     if (base @ axis)[1] > 0.0:  # the image's y points down

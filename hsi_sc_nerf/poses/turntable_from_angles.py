@@ -1,0 +1,163 @@
+"""The camera before a turntable whose angles are known, from points seen in several frames alone.
+
+With the angles known, only the camera's rotation before the axis and its focal length are not: four numbers, for the
+distance is the unit of length. A point seen in two frames gives one equation for them, for its two rays meet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project
+
+# Cameras that are tried: how far they look down, and their focal lengths in image widths.
+_ELEVATIONS_DEG = (5.0, 25.0, 50.0)
+_FOCAL_FACTORS = (1.0, 1.8, 3.5)
+# Pairs of rays that are looked at, and the turn between them.
+_MOST_PAIRS = 2000
+_PAIR_TURN_DEG = (8.0, 90.0)
+_LOSS_PX = 1.0
+# Of a wrong camera's points about half lie behind it.
+_IN_FRONT_SHARE = 0.75
+
+
+def turntable_from_angles(
+    tracks: Tracks,
+    frames: Int[np.ndarray, "f"],
+    angles_rad: Float[np.ndarray, "f"],
+    size_px: tuple[int, int],
+    *,
+    direction_known: bool = True,
+    focal_px: float | None = None,
+) -> TrackedTurntable:
+    """The camera that makes the rays of equal points meet, and these points: a start for ``adjust_tracks``.
+
+    The axis is taken up in the image, to within 90 degrees, and the principal point in the image's middle.
+
+    Args:
+        tracks: points seen in frames.
+        frames: the tracks' frames with known angles, ascending.
+        angles_rad: their angles, counter-clockwise seen from above.
+        size_px: width and height of the images.
+        direction_known: otherwise the angles are turned over where that suits the tracks better.
+        focal_px: the focal length, if it is known.
+
+    Raises:
+        InputError: the tracks do not tell the camera, or contradict the angles.
+    """
+    width, height = size_px
+    centre = (width / 2, height / 2)
+    rows = _pairs(tracks, frames, angles_rad)
+    focals = [factor * width for factor in _FOCAL_FACTORS] if focal_px is None else [focal_px]
+    best, best_cost = None, np.inf
+    for sign, elevation_deg, focal in product((1.0,) if direction_known else (1.0, -1.0), _ELEVATIONS_DEG, focals):
+        angles = sign * angles_rad
+        base = _looking_down(elevation_deg)
+        turns = np.stack([_turn(-angles[np.searchsorted(frames, tracks.frame[r])]) for r in rows])
+        rays = np.stack([tracks.pixels[r] - centre for r in rows])
+
+        def gap(x, turns=turns, rays=rays, base=base, focal=focal):
+            rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ base
+            return _gaps_px(rotation, focal * np.exp(x[3] if len(x) > 3 else 0.0), turns, rays)
+
+        found = least_squares(gap, np.zeros(3 if focal_px else 4), loss="soft_l1", f_scale=_LOSS_PX, max_nfev=40)
+        rotation = Rotation.from_rotvec(found.x[:3]).as_matrix() @ base
+        if found.cost >= best_cost or rotation[1, 2] > 0.0:
+            continue
+        machine = TrackedTurntable(
+            focal_px=float(focal * np.exp(found.x[3] if len(found.x) > 3 else 0.0)),
+            centre_px=centre,
+            radial=(0.0, 0.0),
+            camera_rotation=rotation,
+            frames=frames,
+            angles_rad=angles,
+            points=np.unique(tracks.point),
+            places=np.zeros((0, 3)),
+        )
+        machine, share = _with_points(machine, tracks)
+        if share >= _IN_FRONT_SHARE:
+            best, best_cost = machine, found.cost
+    if best is None:
+        raise InputError(
+            "the features do not suit the turntable's known angles; check the nominal step and the direction, or take "
+            "markers"
+        )
+    return best
+
+
+def _pairs(tracks, frames, angles_rad):
+    """Rows of the tracks, paired: a point's sightings a fair turn apart, evenly taken from all."""
+    known = np.flatnonzero(np.isin(tracks.frame, frames))
+    order = known[np.lexsort((tracks.frame[known], tracks.point[known]))]
+    angle = angles_rad[np.searchsorted(frames, tracks.frame[order])]
+    first, second = [], []
+    for apart in range(1, len(frames)):
+        same = tracks.point[order[apart:]] == tracks.point[order[:-apart]]
+        if not same.any():
+            break
+        turn = np.rad2deg(np.abs(angle[apart:] - angle[:-apart]))
+        take = same & (turn >= _PAIR_TURN_DEG[0]) & (turn <= _PAIR_TURN_DEG[1])
+        first.append(order[:-apart][take])
+        second.append(order[apart:][take])
+    pairs = np.stack([np.concatenate(first), np.concatenate(second)]) if first else np.zeros((2, 0), int)
+    if pairs.shape[1] < 8:
+        raise InputError("too few points of the object are seen in frames that lie apart; give it more texture")
+    return pairs[:, np.linspace(0, pairs.shape[1] - 1, min(_MOST_PAIRS, pairs.shape[1])).astype(int)]
+
+
+def _gaps_px(rotation, focal_px, turns, pixels):
+    """By how far both rays of each pair miss each other, in pixels (Sampson's approximation).
+
+    Rays of directions r, r' from places c, c' meet if (c' - c) . (r x r') = 0; the slopes of this by the pixels make
+    it a distance in the image (R. Hartley and A. Zisserman, "Multiple view geometry", section 11.4.3).
+    """
+    before = np.concatenate([pixels / focal_px, np.ones((*pixels.shape[:2], 1))], axis=-1)
+    rays = np.einsum("knij,knj->kni", turns, before @ rotation)
+    apart = turns[1, :, :, 0] - turns[0, :, :, 0]
+    normals = np.cross(rays[::-1], apart[None] * np.array([1.0, -1.0])[:, None, None])
+    miss = (rays[0] * normals[0]).sum(-1)
+    slopes = np.einsum("knji,knj->kni", turns, normals) @ rotation.T
+    return miss / (np.linalg.norm(slopes[..., :2], axis=-1) ** 2).sum(0) ** 0.5 * focal_px
+
+
+def _with_points(machine, tracks):
+    """The machine with every point where its rays come nearest to each other, less those behind the camera.
+
+    Also returns the share of sightings before the camera.
+    """
+    tracks = tracks.select(np.isin(tracks.frame, machine.frames))
+    machine = replace(machine, points=np.unique(tracks.point))
+    frame, point = machine.rows(tracks)
+    turn = _turn(-machine.angles_rad)[frame]
+    flat = (tracks.pixels - machine.centre_px) / machine.focal_px
+    rays = np.einsum("nij,nj->ni", turn, np.c_[flat, np.ones(len(flat))] @ machine.camera_rotation)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    size = len(machine.points)
+    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
+    np.add.at(normal, point, across)
+    np.add.at(right, point, np.einsum("nij,nj->ni", across, turn[:, :, 0]))
+    # A point seen once, or from one side, stays near the axis.
+    places = np.linalg.solve(normal + 1e-9 * np.eye(3), right[..., None])[..., 0]
+    machine = replace(machine, places=places)
+    behind = project(machine, frame, point)[2][:, 2] <= 0.0
+    wrong = np.zeros(size, bool)
+    wrong[point[behind]] = True
+    return replace(machine, points=machine.points[~wrong], places=places[~wrong]), 1.0 - float(behind.mean())
+
+
+def _looking_down(elevation_deg):
+    """From the turntable's frame to OpenCV's camera axes, of a camera at (1, 0, 0) that looks down at the axis."""
+    c, s = np.cos(np.deg2rad(elevation_deg)), np.sin(np.deg2rad(elevation_deg))
+    return np.array([[0.0, 1.0, 0.0], [s, 0.0, -c], [-c, 0.0, -s]])
+
+
+def _turn(angles_rad):
+    return Rotation.from_rotvec(np.outer(angles_rad, [0.0, 0.0, 1.0])).as_matrix()
