@@ -278,6 +278,16 @@ def test_static_pixels_of_counts_that_cannot_be_used():
     assert not static_pixels(counts.copy(), np.full((200, 3), np.inf)).any()
 
 
+def test_a_course_that_is_off_by_little_in_each_frame_but_in_all_of_them():
+    frames, spread = 40, 5.0
+    counts = 1000.0 + spread * np.random.default_rng(1).standard_normal((400, frames, 3))
+    # Two standard deviations, tolerance included, up and down in turn.
+    counts[:50] += 2.0 * np.hypot(spread, 2.0) * (-1.0) ** np.arange(frames)[:, None]
+    static = static_pixels(counts.astype(np.float32), np.full((400, 3), spread**2))
+    assert not static[:50].any()
+    assert static[50:].mean() > 0.99
+
+
 def test_picture(tmp_path):
     drift = measure(drawn())
     lamp_drift_picture(tmp_path / "drift.png", drift, WAVELENGTHS_NM, corrected=True)
