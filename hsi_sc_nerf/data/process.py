@@ -139,11 +139,14 @@ def process_session(
         )
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
-    write_json(output_dir / "poses.json", poses.report())
+    report = poses.report()
+    write_json(output_dir / "poses.json", report)
     draw_poses(poses, output_dir / "report" / "poses.png")
     frames = _posed_frames(output_dir, names, poses)
     mean_error_px = np.mean([frame.reprojection_error_px for frame in frames])
     console.print(f"Poses: {len(frames)} of {len(names)} frames, {mean_error_px:.2f} px.")
+    for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
+        console.print(f"Warning: {warning}.", highlight=False)
 
     container = _container(session)
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
@@ -213,6 +216,18 @@ def _clear_transforms(output_dir: Path) -> None:
     if transforms.exists() and not is_packed(output_dir):
         raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
     transforms.unlink(missing_ok=True)
+
+
+def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:
+    """A warning where the turntable's axis, clockwise from the picture's upright, points to another side."""
+    quarter_turns = round(-axis_tilt_in_image_deg / 90.0)
+    if quarter_turns == 0:
+        return []
+    rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
+    return [
+        f"the turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
+        f"{session.info_path} to have them upright"
+    ]
 
 
 def _container(session: Session) -> Container | None:
