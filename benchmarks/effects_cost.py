@@ -22,7 +22,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from hsi_sc_nerf.data.calibration.reflectance import dark_counts, normalise
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.effects import EFFECTS
 from hsi_sc_nerf.simulate.frames import Capture, Simulation
@@ -100,7 +99,7 @@ def _make(scene: Scene) -> _Made:
     return _Made(
         prepare_s=prepared - started,
         frames_s=made - prepared,
-        reflectance=[normalise(f.counts, dark_counts(f.dark, f.counts.shape[1]), signal) for f in frames],
+        reflectance=[np.clip(_above_dark(f) / signal, 0.0, 1.0) for f in frames],
         on_object=[frame.coverage > 0.5 for frame in frames],
     )
 

@@ -5,13 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.calibration.dark import dark_columns
 from hsi_sc_nerf.data.calibration.defects import Defects
-from hsi_sc_nerf.data.calibration.reflectance import calibrate, dark_counts, normalise
+from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, pack_counts
 from hsi_sc_nerf.data.calibration.white_reference import column_white, target_white, white_reference
 from hsi_sc_nerf.data.calibration.white_steps import (
     column_sums,
@@ -23,7 +24,8 @@ from hsi_sc_nerf.data.calibration.white_steps import (
     white_mask,
 )
 from hsi_sc_nerf.data.envi import Cube, open_cube, write_cube
-from hsi_sc_nerf.data.pseudo_rgb import gray_image, nearest_bands, pseudo_rgb
+from hsi_sc_nerf.data.packed import unpack
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.data.report import column_white_picture, white_reference_picture
 from hsi_sc_nerf.data.session import Capture
 from hsi_sc_nerf.errors import InputError
@@ -165,32 +167,6 @@ def test_a_camera_with_few_broad_bands_keeps_its_lamps_spectrum(tmp_path):
     np.testing.assert_array_equal(smoothed.window_bands, [1, 3, 5, 5, 5, 3, 1])
 
 
-def test_dark_counts_by_sample_or_by_band():
-    dark = np.arange(2 * 3 * 4).reshape(2, 3, 4)
-    np.testing.assert_allclose(dark_counts(dark, 3), dark.mean(0, keepdims=True))
-    np.testing.assert_allclose(dark_counts(dark, 9), dark.mean((0, 1), keepdims=True))
-    assert dark_counts(None, 3) is None
-
-
-@settings(deadline=None)
-@given(st.integers(0, 2**31))
-def test_normalisation_inverts_the_exposure(seed):
-    rng = np.random.default_rng(seed)
-    reflectance = rng.uniform(0.0, 1.0, (3, 4, 7))
-    dark = rng.uniform(0.0, 50.0, (1, 4, 7))
-    counts = reflectance * LAMP + dark
-    np.testing.assert_allclose(normalise(counts, dark.astype(np.float32), LAMP), reflectance, atol=2e-6)
-
-
-def test_normalisation_clips_and_keeps_its_input():
-    counts = np.array([[[0.0] * 7, [500.0] * 7, [5000.0] * 7]], dtype=np.float32)
-    before = counts.copy()
-    result = normalise(counts, np.full((1, 1, 7), 100.0, np.float32), np.full(7, 1000.0))
-    np.testing.assert_allclose(result[0, :, 0], [0.0, 0.4, 1.0])
-    np.testing.assert_array_equal(counts, before)
-    np.testing.assert_allclose(normalise(counts, None, np.full(7, 1000.0), (0.0, 2.0))[0, 2], 2.0)
-
-
 def test_white_reference_of_a_folded_tarp(tmp_path):
     dark = np.full((3, 60, 7), 10.0)
     white = white_reference(capture(tmp_path, "white", tarp_scene(), dark), CONFIG)
@@ -328,22 +304,15 @@ def test_real_maize_kernel():
         for name in ("4-22-22_right_same_B73_top_00", "dark_reference_crop", "white_reference_crop")
     )
     reference = white_reference(Capture("white", white, dark), CONFIG)
-    reflectance = calibrate(Capture("kernel", kernel, dark), reference.spectrum, CONFIG)
-    assert reflectance.dtype == np.float32
-    assert reflectance.min() >= 0.0
-    assert reflectance.max() <= 1.0
+    every_band = np.arange(kernel.shape[2])
+    calibration = FrameCalibration(reference.dark, 1.0 / reference.spectrum, every_band)
+    reflectance, valid = unpack(
+        pack_counts(kernel.memmap(), calibration, PictureBands(every_band[:3], every_band, 9)).packed
+    )
+    assert valid.all()
     centre = reflectance[13:18, 19:24].mean(axis=(0, 1))
     bands = nearest_bands(kernel.wavelengths_nm, [550.0, 700.0, 750.0, 800.0, 900.0])
     np.testing.assert_allclose(centre[bands], [0.54, 0.83, 0.85, 0.85, 0.85], atol=0.025)
-
-
-def test_pictures_of_bands():
-    reflectance = np.zeros((2, 2, 7), np.float32)
-    reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 1.5]
-    image = pseudo_rgb(reflectance, WAVELENGTHS_NM, (790.0, 500.0, 1200.0))
-    assert image[0, 0].tolist() == [round(0.5 * 255), round(0.2 * 255), 255]
-    assert gray_image(reflectance, WAVELENGTHS_NM, (450.0, 700.0))[0, 0] == round(0.3 * 255)
-    assert gray_image(reflectance[..., :6], WAVELENGTHS_NM[:6], (2000.0, 2500.0))[0, 0] == round(0.35 * 255)
 
 
 def test_white_reference_picture(tmp_path):

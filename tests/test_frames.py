@@ -13,6 +13,7 @@ from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, finished_notes, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
+from hsi_sc_nerf.data.pseudo_rgb import bands_within, pseudo_rgb
 from hsi_sc_nerf.errors import InputError
 
 WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
@@ -135,3 +136,12 @@ def test_border_spectrum_of_measured_values(tmp_path):
     border[1:-1, 1:-1] = False
     expected = np.append(np.nanmedian(reflectance[border][:, :5], axis=0), np.nan)
     np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), expected, atol=1e-5)
+
+
+def test_pictures_of_bands():
+    reflectance = np.zeros((2, 2, BANDS), np.float32)
+    reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, -0.5, 1.5]
+    image = pseudo_rgb(reflectance, WAVELENGTHS_NM, (990.0, 640.0, 490.0))
+    assert image[0, 0].tolist() == [255, 0, round(0.2 * 255)]
+    assert bands_within(WAVELENGTHS_NM, (500.0, 700.0)).tolist() == [1, 2, 3, 4]
+    assert bands_within(WAVELENGTHS_NM, (2000.0, 2500.0)).tolist() == list(range(BANDS))

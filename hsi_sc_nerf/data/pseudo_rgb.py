@@ -33,15 +33,6 @@ def bands_within(
     return np.flatnonzero(inside if inside.any() else np.ones_like(inside))
 
 
-def gray_image(
-    reflectance: Float[np.ndarray, "lines samples bands"],
-    wavelengths_nm: Float[np.ndarray, "bands"],
-    range_nm: tuple[float, float],
-) -> UInt8[np.ndarray, "lines samples"]:
-    """Mean over the bands in ``range_nm`` (over all bands where the instrument has none there)."""
-    return to_8_bit(reflectance[..., bands_within(wavelengths_nm, range_nm)].mean(axis=-1))
-
-
 def to_8_bit(reflectance: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Reflectance 0 to 1 as 0 to 255, rounded; what lies outside is clipped."""
     return np.rint(np.clip(reflectance, 0.0, 1.0) * 255.0).astype(np.uint8)

@@ -14,10 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.calibration.line_pictures import LinePictures, PictureBands, as_slice
 from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag
-from hsi_sc_nerf.data.session import Capture
 
 # Lines that are stored at a time: an upright copy of single lines would write 400 bytes here and 400 there.
 _BLOCK_LINES = 8
@@ -297,43 +295,3 @@ def _band_major(line: Num[np.ndarray, "samples bands"]) -> Num[np.ndarray, "band
         return line.T
     moved = cv2.transpose(np.ascontiguousarray(line).view(_MOVED_AS[line.itemsize]))
     return moved.view(line.dtype)
-
-
-def dark_counts(
-    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int
-) -> Float[np.ndarray, "1 columns bands"] | None:
-    """What the sensor counts without light: the mean over the dark cube's lines, for each sample and band.
-
-    A dark cube of another width cannot be matched sample by sample and gives one spectrum (columns = 1).
-    """
-    if dark is None:
-        return None
-    over_lines = dark.mean(axis=0, keepdims=True, dtype=np.float64)
-    columns = over_lines if dark.shape[1] == samples else over_lines.mean(axis=1, keepdims=True)
-    return columns.astype(np.float32)
-
-
-def normalise(
-    counts: Num[np.ndarray, "lines samples bands"],
-    dark: Float[np.ndarray, "1 columns bands"] | None,
-    white: Float[np.ndarray, "bands"],
-    bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS,
-) -> Float[np.ndarray, "lines samples bands"]:
-    """Step 6: reflectance (S - D) / (W - D), clipped to ``bounds``; float32.
-
-    ``white`` is W - D, positive in each band (``white_reference`` sees to it).
-    """
-    reflectance = np.array(counts, dtype=np.float32, order="C")
-    if dark is not None:
-        reflectance -= dark
-    reflectance /= white.astype(np.float32)
-    return np.clip(reflectance, *bounds, out=reflectance)
-
-
-def calibrate(
-    capture: Capture, white: Float[np.ndarray, "bands"], config: CalibrationConfig
-) -> Float[np.ndarray, "lines samples bands"]:
-    """Reflectance of a frame, read from disk and normalised with the tarp's spectrum."""
-    counts = capture.cube.memmap()
-    dark = dark_counts(None if capture.dark is None else capture.dark.memmap(), counts.shape[1])
-    return normalise(counts, dark, white, config.bounds)
