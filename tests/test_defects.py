@@ -138,6 +138,15 @@ def test_readings_that_pile_up_at_an_unusual_count():
     assert saturation_counts([r.counts for r in (white, *frames)], live) is None
 
 
+def test_the_flat_top_of_a_smooth_highlight_is_no_saturation():
+    y, x = np.meshgrid(np.arange(60.0) - 30.0, np.arange(200.0) - 100.0, indexing="ij")
+    dome = np.rint(3000.0 - 0.02 * (x**2 + y**2))[..., None].astype(np.uint16)
+    live = np.ones((200, 1), bool)
+    assert np.count_nonzero(dome == dome.max()) > 60
+    assert saturation_counts([dome], live) is None
+    assert saturation_counts([np.minimum(dome, 2990)], live) == 2990.0
+
+
 def test_saturation_of_next_to_nothing():
     live = np.ones((30, 20), bool)
     counts = np.random.default_rng(0).normal(2000.0, 20.0, (10, 30, 20)).round().astype(np.uint16)
