@@ -187,7 +187,7 @@ def test_saturation_clips_exactly_where_truth_says(tmp_path):
         np.testing.assert_array_equal(counts, np.minimum(unlimited, LARGEST))
         clipped.append((unlimited > LARGEST).mean())
         metadata = (tmp_path / "s" / capture / "metadata" / f"{capture}.xml").read_text()
-        assert '<key field="integration time" unit="ms">16</key>' in metadata
+        assert '<key field="integration_time" unit="ms">16.0</key>' in metadata
     assert 0.05 < np.mean(clipped) < 0.9
     # The tarp is taken with the same integration time, so where neither stops the ratio is the one without.
     white, white_quiet = tarp(simulation.white().counts)[0], tarp(quiet.white().counts)[0]
