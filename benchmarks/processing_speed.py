@@ -4,9 +4,10 @@
 
 Each way is a process of its own, which first reads its input files (so that they come from the system's memory), then
 works on one frame without the clock, for what is loaded once, then with it; it writes files that were not there. The
-ways take turns, and the median of the rounds is told, for the time and for its ratio to copying in the same round.
-"Processor" is the time that the processor spent, of which other work on the machine changes little. Frames with the
-counts of a plausible camera are made for it and deleted at the end; or give a session of your own.
+ways take turns. Told are the medians over the rounds of the time and of its ratio to copying as many files one after the
+other in the same round; "processor" is the time that the processor spent, all workers together, of which other work on
+the machine changes less. Frames with the counts of a plausible camera are made for it and deleted at the end; or give a
+session of your own.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -82,8 +84,10 @@ class ProcessingSpeed:
             _run("calibrate", session, scratch, 0, 1)
             many = min(self.frames, len(_load(scratch)[0]))
             jobs = [("nothing", 0, 1), ("copy", 1, 1), ("process", 1, 1), ("spy", 1, 1)]
-            jobs += [("copy", many, self.workers), ("process", many, self.workers)]
-            rows = [{"way": way, "frames": frames, "workers": workers, "rounds": []} for way, frames, workers in jobs]
+            jobs += [("copy", many, 1), ("copy", many, self.workers), ("process", many, self.workers)]
+            rows: list[dict[str, Any]] = [
+                {"way": way, "frames": frames, "workers": workers, "rounds": []} for way, frames, workers in jobs
+            ]
             for _ in range(self.rounds):
                 for row in rows:
                     row["rounds"].append(_run(row["way"], session, scratch, row["frames"], row["workers"]))
@@ -105,12 +109,7 @@ class ProcessingSpeed:
             self.page.write_text(f"{before}{TABLE_STARTS}\n{lines}\n{TABLE_ENDS}{after}", encoding="utf-8")
 
 
-WAYS = {
-    "nothing": "Python and what it imports",
-    "copy": "shutil.copyfile of the raw file",
-    "process": "process_frame (this package)",
-    "spy": "SPy load(), numpy, save_image",
-}
+WAYS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}
 
 
 def _cells(row: dict, rows: list[dict]) -> list[str]:

@@ -55,12 +55,15 @@ def foreground_score(
 
     Where a pixel is part object and part flat background the score is nearly its share times the object's score.
     """
-    smooth = [cv2.GaussianBlur(image, (0, 0), smoothing_px) for image in binned] if smoothing_px > 0.0 else binned
-    mean = np.mean(smooth, axis=0)
-    squares = np.zeros_like(mean)
-    for image in smooth:
-        cv2.accumulateSquare(image - mean, squares)
-    return np.sqrt(squares / len(binned))
+    # Differences from the first bin, whose squares single precision holds: exactly 0 for a flat spectrum.
+    first = _smoothed(binned[0], smoothing_px)
+    difference, total, squares = np.empty_like(first), np.zeros_like(first), np.zeros_like(first)
+    for image in binned[1:]:
+        cv2.subtract(_smoothed(image, smoothing_px), first, dst=difference)
+        cv2.accumulate(difference, total)
+        cv2.accumulateSquare(difference, squares)
+    total /= len(binned)
+    return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
 
 
 def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tuple[float, float]:
@@ -150,6 +153,10 @@ def foreground_mask(
     rim = dilate(body, closing_px)
     sticking_out = touching(weak & ~rim, dilate(rim, 3), min_area_px=closing_px + 1)
     return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
+
+
+def _smoothed(image: Float[np.ndarray, "lines samples"], sigma_px: float) -> Float[np.ndarray, "lines samples"]:
+    return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.0 else image
 
 
 _Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]
