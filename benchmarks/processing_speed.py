@@ -4,10 +4,10 @@
 
 Each way is a process of its own, which first reads its input files (so that they come from the system's memory), then
 works on one frame without the clock, for what is loaded once, then with it; it writes files that were not there. The
-ways take turns. Told are the medians over the rounds of the time and of its ratio to copying as many files one after the
-other in the same round; "processor" is the time that the processor spent, all workers together, of which other work on
-the machine changes less. Frames with the counts of a plausible camera are made for it and deleted at the end; or give a
-session of your own.
+ways take turns. Told are the medians over the rounds of the time and of its ratio to copying as many files one after
+the other in the same round; "processor" is the time that the processor spent, all workers together, of which other
+work on the machine changes less. Frames with the counts of a plausible camera are made for it and deleted at the end;
+or give a session of your own.
 """
 
 from __future__ import annotations
