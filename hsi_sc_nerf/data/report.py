@@ -33,7 +33,7 @@ def white_reference_picture(path: Path, cube: Cube, white: WhiteReference, rgb_n
     """
     x0, y0, x1, y1 = white.roi
     raw = cube.memmap()[..., nearest_bands(cube.wavelengths_nm, rgb_nm)].astype(float)
-    image = to_8_bit(raw / np.maximum(np.percentile(raw, 99.5, axis=(0, 1)), 1e-9))
+    image = to_8_bit(raw / np.maximum(np.percentile(raw, 95.0, axis=(0, 1)), 1e-9))
     figure = _figure(14.0, 14.0)
     axes = figure.subplot_mosaic(
         [["image", "deviation", "kept"], ["lower", "chosen", "higher"], ["spectrum"] * 3, ["smoothing"] * 3],
