@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from hsi_sc_nerf.models.validity import cleared, has_angle
+from hsi_sc_nerf.models.validity import cleared, count_bands, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, safe_log10, safe_sqrt, select_pixels, spectral_angle
 
 # The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
@@ -34,8 +34,8 @@ SSIM_C2 = 0.03**2
 SSIM_WINDOW_PX = 11
 SSIM_WINDOW_SIGMA_PX = 1.5
 
-# Values of one image in a block: 16 MiB a temporary in float64.
-_BLOCK_VALUES = 1 << 21
+# Values of one image in a block: 8 MiB a temporary in float64, of which there are some dozens.
+_BLOCK_VALUES = 1 << 20
 
 Image = Float[Tensor, "h w bands"]
 Mask = Bool[Tensor, "h w"]
@@ -68,10 +68,10 @@ def _pixel_mean(
 
 
 def _band_mean(values: Float[Tensor, "n bands"], valid: Bool[Tensor, "n bands"] | None) -> Float[Tensor, "bands"]:
-    """Mean of each band over its valid pixels; 0 without any."""
+    """Mean of each band over its valid pixels, of values that are 0 elsewhere; 0 without any."""
     if valid is None:
         return values.sum(0) / max(values.shape[0], 1)
-    return torch.where(valid, values, 0.0).sum(0) / valid.sum(0).clamp_min(1)
+    return values.sum(0) / valid.sum(0, dtype=torch.int32).clamp_min(1)
 
 
 def _mean_over_bands(scores: Float[Tensor, "bands"], mask: Mask | None, valid: Valid | None) -> Float[Tensor, ""]:
@@ -97,7 +97,7 @@ def squared_error_map(predicted: Image, target: Image, valid: Valid | None = Non
         [
             (p.double() - t.double()).square().mean(-1)
             if v is None
-            else (p.double() - t.double()).square().sum(-1) / v.sum(-1)
+            else (p.double() - t.double()).square().sum(-1) / count_bands(v)
             for p, t, v in _blocks(predicted, target, valid, 0)
         ]
     )
@@ -120,7 +120,7 @@ def spectral_rmse(
 ) -> Float[Tensor, ""]:
     """Root of the squared error's mean over pixels and bands (paper, spectral RMSE); valid values count alike."""
     squares = squared_error_map(predicted, target, valid)
-    return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else valid.sum(-1))), predicted)
+    return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else count_bands(valid))), predicted)
 
 
 def pixel_mean_rmse(
@@ -187,6 +187,8 @@ def _ssim_over_pixels(
 ) -> Float[Tensor, "bands"]:
     mean_p, mean_t = _band_mean(p, valid), _band_mean(t, valid)
     p, t = p - mean_p, t - mean_t
+    if valid is not None:
+        p, t = cleared(p, valid), cleared(t, valid)
     variance_p, variance_t = _band_mean(p.square(), valid), _band_mean(t.square(), valid)
     return _ssim(mean_p, mean_t, variance_p, variance_t, _band_mean(p * t, valid))
 
@@ -247,7 +249,7 @@ def per_band_windowed_ssim(
             scores.append(local.mean(0))
         else:
             at_centres = some_valid[mask]
-            scores.append(torch.where(at_centres.any(0), _band_mean(local, at_centres), 1.0))
+            scores.append(torch.where(at_centres.any(0), _band_mean(cleared(local, at_centres), at_centres), 1.0))
     return narrow(torch.cat(scores), predicted)
 
 

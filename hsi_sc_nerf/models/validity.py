@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MIN_BANDS_OF_AN_ANGLE = 2
@@ -24,6 +24,12 @@ def cleared(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> F
     return torch.where(valid, values, 0.0)
 
 
+def count_bands(valid: Bool[Tensor, "*pixels bands"]) -> Int[Tensor, "*pixels"]:
+    """How many bands of each pixel are valid."""
+    # torch makes integers of this kind of all that it adds up: 64-bit ones of a whole image are half a gigabyte.
+    return valid.sum(-1, dtype=torch.int16)
+
+
 def has_angle(valid: Bool[Tensor, "*pixels bands"]) -> Bool[Tensor, "*pixels"]:
     """Pixels with bands enough to tell a spectral angle from."""
-    return valid.sum(-1) >= MIN_BANDS_OF_AN_ANGLE
+    return count_bands(valid) >= MIN_BANDS_OF_AN_ANGLE
