@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.track_adjust import TrackAdjustConfig, _moved, _slopes, adjust_tracks
+from hsi_sc_nerf.poses.track_adjust import TrackAdjustConfig, _moved, _slopes, adjust_tracks, split_half_error_deg
 from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project, reproject
 from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
 
@@ -163,3 +163,14 @@ def test_tracks_of_something_else_are_refused():
     few = sightings(true)
     with pytest.raises(InputError, match="too few points"):
         adjust_tracks(true, few.select(few.point < 5))
+
+
+def test_halves_of_the_points_tell_the_error():
+    true = machine(np.arange(0, 360, 18.0), points=400)
+    errors, told = [], []
+    for noise_px in (0.05, 0.5):
+        found = adjust_tracks(true, sightings(true, noise_px=noise_px))
+        errors.append(pose_error_deg(found.turntable, true))
+        told.append(split_half_error_deg(found))
+    assert told[0] < 0.1 < told[1]
+    assert 0.2 < told[1] / errors[1] < 5.0

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from hsi_sc_nerf.data.regions import dilate, ellipse_close_open
+from hsi_sc_nerf.data.regions import dilate, ellipse_close_open, touching
 
 # Brightness classes of equal size in which the noise is measured: photon noise grows with the light.
 _BRIGHTNESS_CLASSES = 16
@@ -34,8 +34,10 @@ class StaticBackgroundConfig:
     """And by more than this standard deviation, gray levels: rounding to 8 bits alone makes less."""
     closing_share: float = 0.04
     """Gaps in what moves up to this share of the image's shorter side are closed: even skin between its patterns."""
-    margin_share: float = 0.006
-    """What moves is widened by this share of the image's shorter side."""
+    margin_share: float = 0.002
+    """What moves is widened by this share of the image's shorter side. Little, for the wall begins right there."""
+    least_area_share: float = 0.0005
+    """Moving specks below this share of the image's area are left out: the jagged rim of an even disc."""
 
 
 def moving_pixels(
@@ -61,6 +63,7 @@ def moving_pixels(
     # Opening first drops single pixels that noise alone lifts above the threshold, before closing joins them.
     moving = ellipse_close_open(moving, close_px=0, open_px=2)
     moving = ellipse_close_open(moving, close_px=_odd(config.closing_share * side), open_px=3)
+    moving = touching(moving, moving, min_area_px=round(config.least_area_share * moving.size))
     return dilate(moving, _odd(2 * config.margin_share * side))
 
 

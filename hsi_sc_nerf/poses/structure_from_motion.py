@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
@@ -99,28 +101,37 @@ def structure_from_motion(
         ValueError: images of different sizes, or as many names as images are not given.
     """
     config = config or StructureFromMotionConfig()
-    if len(images) != len(names) or len({image.shape for image in images}) > 1:
-        raise ValueError("structure_from_motion: needs images of one size and one name an image")
-    if len(images) < FEWEST_FRAMES:
-        raise InputError(
-            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
-            f"give {FEWEST_FRAMES} or more frames of one session"
-        )
-    moving = moving_pixels(images, config.background) if moving is None else moving
-    if not moving.any():
-        raise InputError(
-            f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "
-            "between the frames, and that the object has some texture"
-        )
+    moving = _checked(images, names, config, moving)
     with _working_folder(images, moving) as folder:
         _match(folder, len(images), images[0].shape, config, focal_px)
         reconstruction = _map(folder, config)
         if reconstruction is None:
-            raise InputError(
-                f"the frames {names[0]} ... {names[-1]} have too little texture to find poses from features; take "
-                "markers, smaller steps, or a band in which the object shows patterns"
-            )
+            raise _too_little_texture(names)
         return _free_poses(reconstruction, names, moving)
+
+
+def matched_tracks(
+    images: Sequence[UInt8[np.ndarray, "h w"]],
+    names: Sequence[str],
+    config: StructureFromMotionConfig | None = None,
+    *,
+    moving: Bool[np.ndarray, "h w"] | None = None,
+) -> Tracks:
+    """Features that several frames share, without any pose: where the turntable's angles are known, this is enough.
+
+    Matches are joined to tracks; a track that comes to two places in one frame is a mistake and left out.
+
+    Raises:
+        InputError, ValueError: as ``structure_from_motion``.
+    """
+    config = config or StructureFromMotionConfig()
+    moving = _checked(images, names, config, moving)
+    with _working_folder(images, moving) as folder:
+        _match(folder, len(images), images[0].shape, config, None)
+        tracks = _joined(folder)
+    if len(tracks) == 0:
+        raise _too_little_texture(names)
+    return tracks
 
 
 def neighbour_pairs(frames: int, config: StructureFromMotionConfig) -> list[tuple[int, int]]:
@@ -132,6 +143,31 @@ def neighbour_pairs(frames: int, config: StructureFromMotionConfig) -> list[tupl
     return [
         (i, j) for i in range(frames) for j in range(i + 1, frames) if min(j - i, frames - (j - i)) <= reach
     ]  # fmt: skip
+
+
+def _checked(images, names, config, moving):
+    """The mask of what moves, found if not given, after checks of what was given."""
+    if len(images) != len(names) or len({image.shape for image in images}) > 1:
+        raise ValueError("structure from motion needs images of one size and one name an image")
+    if len(images) < FEWEST_FRAMES:
+        raise InputError(
+            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
+            f"give {FEWEST_FRAMES} or more frames of one session"
+        )
+    moving = moving_pixels(images, config.background) if moving is None else moving
+    if not moving.any():
+        raise InputError(
+            f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "
+            "between the frames, and that the object has some texture"
+        )
+    return moving
+
+
+def _too_little_texture(names):
+    return InputError(
+        f"the frames {names[0]} ... {names[-1]} show too little texture to find poses from features; take markers, "
+        "smaller steps, or a band in which the object shows patterns"
+    )
 
 
 @contextmanager
@@ -171,6 +207,11 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: StructureF
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = config.threads
     extraction.sift.peak_threshold = config.peak_threshold
+    # Images are numbered here, in their order: extraction would number them as its threads come along.
+    pycolmap.Database.open(folder / "database.db").close()
+    pycolmap.import_images(
+        folder / "database.db", folder / "images", camera_mode=pycolmap.CameraMode.SINGLE, options=reader
+    )
     pycolmap.extract_features(
         folder / "database.db",
         folder / "images",
@@ -194,6 +235,30 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: StructureF
         verification_options=verification,
         device=pycolmap.Device.cpu,
     )
+
+
+def _joined(folder: Path) -> Tracks:
+    """Tracks of the verified matches in the folder's database."""
+    import pycolmap
+
+    with pycolmap.Database.open(folder / "database.db") as database:
+        images = {image.image_id: _frame_of(image.name) for image in database.read_all_images()}
+        places = {i: database.read_keypoints(i)[:, :2] for i in images}
+        pairs, geometries = database.read_two_view_geometries()
+    order = sorted(images, key=images.__getitem__)
+    first = dict(zip(order, np.cumsum([0] + [len(places[i]) for i in order[:-1]]).tolist(), strict=True))
+    links = [np.zeros((0, 2), int)]
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        links.append(geometry.inlier_matches.astype(int) + [first[i] for i in pycolmap.pair_id_to_image_pair(pair)])
+    a, b = np.concatenate(links).T
+    frame = np.concatenate([np.full(len(places[i]), images[i]) for i in order])
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(frame), len(frame)))
+    track = connected_components(graph, directed=False)[1]
+    _, one, twice = np.unique(np.stack([track, frame]), axis=1, return_inverse=True, return_counts=True)
+    contradicts = np.isin(track, track[twice[one.ravel()] > 1])
+    keep = (np.bincount(track)[track] > 1) & ~contradicts
+    _, point = np.unique(track[keep], return_inverse=True)
+    return Tracks(frame[keep], point, np.concatenate([places[i] for i in order])[keep].astype(float))
 
 
 def _map(folder: Path, config: StructureFromMotionConfig) -> pycolmap.Reconstruction | None:

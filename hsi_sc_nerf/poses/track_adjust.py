@@ -20,6 +20,8 @@ _STEPS = 60
 _SMALLEST_GAIN = 1e-6
 _LARGEST_DAMPING = 1e8
 _OUTLIER_ROUNDS = 4
+# Far from the solution a small loss scale holds on to what fits by chance.
+_FIRST_LOSS_PX = 1.0
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 
@@ -37,8 +39,9 @@ class TrackAdjustConfig:
     radial_terms: int = 0
     """How many coefficients of radial lens distortion are found: 0, 1 (k1) or 2 (k1, k2). An object in the middle of
     the image hardly tells them from the focal length: only for points that reach the image's borders."""
-    loss_px: float = 0.5
-    """Residuals well above this count by their size, not its square (soft L1), pixels."""
+    loss_px: float = 0.1
+    """Residuals well above this count by their size, not its square (soft L1), pixels. Small, for what is no point of
+    the object, such as an outline or the shadow side of a bump, creeps over it and does so by little."""
     outlier_sigmas: float = 4.0
     """Observations beyond this many standard deviations are thrown out; these are measured on the residuals."""
     least_outlier_px: float = 0.3
@@ -89,7 +92,8 @@ def adjust_tracks(start: TrackedTurntable, tracks: Tracks, config: TrackAdjustCo
     """
     config = config or TrackAdjustConfig()
     good = _enough(tracks, np.isin(tracks.frame, start.frames) & np.isin(tracks.point, start.points), config)
-    turntable = start
+    kept = tracks.select(good)
+    turntable, _ = _adjust(start.restricted(kept), kept, replace(config, loss_px=max(config.loss_px, _FIRST_LOSS_PX)))
     for _ in range(_OUTLIER_ROUNDS):
         kept = tracks.select(good)
         turntable, _ = _adjust(turntable.restricted(kept), kept, config)
@@ -104,6 +108,24 @@ def adjust_tracks(start: TrackedTurntable, tracks: Tracks, config: TrackAdjustCo
     kept = tracks.select(good)
     turntable, sigma = _adjust(turntable.restricted(kept), kept, config)
     return AdjustedTracks(turntable, kept, ~good, reproject(turntable, kept) - kept.pixels, sigma)
+
+
+def split_half_error_deg(found: AdjustedTracks, config: TrackAdjustConfig | None = None) -> float | None:
+    """How far the poses can be trusted: half the largest rotation between those from two halves of the points.
+
+    Least squares takes residuals for chance; what creeps over a bumpy or shiny object errs in company, and the halves
+    show it. None where half of the points cannot fix the machine.
+    """
+    halves = []
+    for half in (0, 1):
+        try:
+            tracks = found.tracks.select(found.tracks.point % 2 == half)
+            halves.append(adjust_tracks(found.turntable, tracks, config).turntable)
+        except InputError:
+            return None
+    both = np.intersect1d(halves[0].frames, halves[1].frames)
+    one, other = (h.camera_to_world()[np.isin(h.frames, both), :3, :3] for h in halves)
+    return float(np.rad2deg(Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()) / 2.0)
 
 
 def _enough(tracks, good, config):

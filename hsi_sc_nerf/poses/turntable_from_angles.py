@@ -20,10 +20,13 @@ from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project
 # Cameras that are tried: how far they look down, and their focal lengths in image widths.
 _ELEVATIONS_DEG = (5.0, 25.0, 50.0)
 _FOCAL_FACTORS = (1.0, 1.8, 3.5)
+# A longer lens is hardly told from one that is infinitely long: each start keeps near its own, by this in logarithms.
+_FOCAL_REACH = 0.35
 # Pairs of rays that are looked at, and the turn between them.
 _MOST_PAIRS = 2000
 _PAIR_TURN_DEG = (8.0, 90.0)
-_LOSS_PX = 1.0
+# Misses well above this hardly count (Cauchy): of raw matches a good part is wrong.
+_LOSS_PX = 0.3
 # Of a wrong camera's points about half lie behind it.
 _IN_FRONT_SHARE = 0.75
 
@@ -64,15 +67,17 @@ def turntable_from_angles(
         rays = np.stack([tracks.pixels[r] - centre for r in rows])
 
         def gap(x, turns=turns, rays=rays, base=base, focal=focal):
-            rotation = Rotation.from_rotvec(x[:3]).as_matrix() @ base
-            return _gaps_px(rotation, focal * np.exp(x[3] if len(x) > 3 else 0.0), turns, rays)
+            return _gaps_px(Rotation.from_rotvec(x[:3]).as_matrix() @ base, focal * np.exp(x[3]), turns, rays)
 
-        found = least_squares(gap, np.zeros(3 if focal_px else 4), loss="soft_l1", f_scale=_LOSS_PX, max_nfev=40)
+        reach = np.array([np.inf, np.inf, np.inf, _FOCAL_REACH if focal_px is None else 1e-9])
+        found = least_squares(
+            gap, np.zeros(4), bounds=(-reach, reach), x_scale="jac", loss="cauchy", f_scale=_LOSS_PX, max_nfev=60
+        )
         rotation = Rotation.from_rotvec(found.x[:3]).as_matrix() @ base
         if found.cost >= best_cost or rotation[1, 2] > 0.0:
             continue
         machine = TrackedTurntable(
-            focal_px=float(focal * np.exp(found.x[3] if len(found.x) > 3 else 0.0)),
+            focal_px=float(focal * np.exp(found.x[3])),
             centre_px=centre,
             radial=(0.0, 0.0),
             camera_rotation=rotation,
@@ -86,8 +91,8 @@ def turntable_from_angles(
             best, best_cost = machine, found.cost
     if best is None:
         raise InputError(
-            "the features do not suit the turntable's known angles; check the nominal step and the direction, or take "
-            "markers"
+            "the features do not suit the turntable's known angles; check the nominal step and the direction, or "
+            "take markers"
         )
     return best
 
