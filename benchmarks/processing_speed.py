@@ -17,6 +17,7 @@ import pickle
 import shutil
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -211,8 +212,11 @@ def _copying(session: Session, _: Path, output_dir: Path) -> Work:
 
 def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
     cubes, calibrations = _load(scratch)
+    own = threading.local()
 
     def work(i: int) -> None:
+        if not hasattr(own, "buffer"):
+            own.buffer = np.empty(np.prod(cubes[i].shape), np.uint16)
         process_frame(
             cubes[i],
             calibrations[i],
@@ -221,6 +225,7 @@ def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
             MaskConfig(),
             pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
             marker_range_nm=MARKER_RANGE_NM,
+            buffer=own.buffer,
         )
 
     return work

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, Tally
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, finished_notes, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, Tally, pack_counts
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, pack_counts
+from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.packed import FLAGGED, LARGEST_REFLECTANCE, REFLECTANCE_SCALE, PixelFlag
 
 LINES, SAMPLES, BANDS = 11, 6, 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import fields
 from pathlib import Path
@@ -37,7 +38,13 @@ def pack_frames(
     """
     settings = [masks.spectral_bins, masks.smoothing_px, pseudo_rgb_nm, marker_range_nm]
 
+    # A worker packs frame after frame in the same memory.
+    own = threading.local()
+    values = max(cube.shape[0] * cube.shape[1] for cube in calibration.cubes) * len(calibration.bands)
+
     def work(index: int) -> FrameNotes:
+        if not hasattr(own, "buffer"):
+            own.buffer = np.empty(values, np.uint16)
         capture, of_frame = session.frames[index], calibration.frames[index]
         paths = FramePaths.of(output_dir, capture.name)
         stamp = fingerprint([settings, capture_files(session, capture), _digest(of_frame)])
@@ -49,6 +56,7 @@ def pack_frames(
             masks,
             pseudo_rgb_nm=pseudo_rgb_nm,
             marker_range_nm=marker_range_nm,
+            buffer=own.buffer,
         )
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

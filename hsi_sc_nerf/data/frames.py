@@ -10,11 +10,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Num, UInt8
+from jaxtyping import Bool, Float, Num, UInt8, UInt16
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
 from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, Tally, pack_counts
+from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, pack_counts
+from hsi_sc_nerf.data.calibration.tally import Tally
+from hsi_sc_nerf.data.cube_lines import CubeLines
 from hsi_sc_nerf.data.envi import Cube, open_cube
 from hsi_sc_nerf.data.masks import MaskConfig, bin_width, foreground_score
 from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
@@ -83,8 +85,11 @@ def process_frame(
     *,
     pseudo_rgb_nm: tuple[float, float, float],
     marker_range_nm: tuple[float, float],
+    buffer: UInt16[np.ndarray, "values"] | None = None,
 ) -> FrameNotes:
     """Calibrate a frame's raw cube; write its packed cube, flags, pseudo-RGB picture and notes, all upright.
+
+    Frame after frame may be packed in the same ``buffer`` (``pack_counts``).
 
     Raises:
         InputError: the raw cube cannot be read or the disk is full.
@@ -96,7 +101,8 @@ def process_frame(
         gray=bands_within(wavelengths_nm, marker_range_nm),
         bin_width=bin_width(len(wavelengths_nm), masks.spectral_bins),
     )
-    frame = pack_counts(cube.memmap(), calibration, pictures)
+    with CubeLines(cube) as lines:
+        frame = pack_counts(lines, calibration, pictures, buffer)
 
     def upright(image: Num[np.ndarray, "lines samples *channels"]) -> Num[np.ndarray, "h w *channels"]:
         return np.rot90(image, calibration.quarter_turns)

@@ -15,7 +15,6 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import write_json, write_png
 from hsi_sc_nerf.data.calibrated_frames import pack_frames
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
-from hsi_sc_nerf.data.calibration.reflectance import Tally
 from hsi_sc_nerf.data.calibration.report import (
     REPORT_NAME,
     describe_calibration,
@@ -24,6 +23,7 @@ from hsi_sc_nerf.data.calibration.report import (
     write_calibration,
 )
 from hsi_sc_nerf.data.calibration.session import calibrate_session
+from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.calibration.uncertainty import typical_uncertainty
 from hsi_sc_nerf.data.fingerprint import session_fingerprint
 from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, object_spectrum

@@ -41,9 +41,12 @@ class LinePictures:
         whole_bins, rest = divmod(kept, bands.bin_width)
         self.rgb = np.empty((3, lines, samples), np.float32)
         self.gray = np.empty((lines, samples), np.float32)
-        self.binned = np.empty((whole_bins + (rest > 0), lines, samples), np.float32)
+        # Line by line in memory, where one line after the other is written.
+        by_line = np.empty((lines, whole_bins + (rest > 0), samples), np.float32)
+        self.binned = by_line.swapaxes(0, 1)
         self._rgb_bands = bands.rgb
         self._gray_bands = as_slice(bands.gray)
+        self._per_gray = np.float32(1.0 / (len(bands.gray) * REFLECTANCE_SCALE))
         self._bin_shape = (whole_bins, bands.bin_width, samples)
         self._in_whole_bins = kept - rest
         self._sums = np.empty((len(self.binned), samples), np.float32)
@@ -54,7 +57,10 @@ class LinePictures:
     def line(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
         """Take what the pictures need of a line, whose values are packed numbers and a half."""
         self.rgb[:, line] = _reflectance(values[self._rgb_bands])
-        self.gray[line] = _reflectance(values[self._gray_bands].mean(axis=0))
+        gray = self.gray[line]
+        np.add.reduce(values[self._gray_bands], axis=0, out=gray)
+        gray *= self._per_gray
+        gray -= _HALF_UNIT
         whole_bins = self._bin_shape[0]
         binnable = values[: self._in_whole_bins].reshape(self._bin_shape)
         np.add.reduce(binnable, axis=1, out=self._sums[:whole_bins])

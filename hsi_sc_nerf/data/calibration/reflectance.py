@@ -6,8 +6,9 @@ at hand. What a session does not have (no saturation level, no flat field, ...) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -15,12 +16,11 @@ from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.calibration.line_pictures import LinePictures, PictureBands, as_slice
+from hsi_sc_nerf.data.calibration.tally import Counter, Tally
 from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 
 # Lines that are stored at a time: an upright copy of single lines would write 400 bytes here and 400 there.
 _BLOCK_LINES = 8
-# How many times a uint8 can be counted up.
-_COUNTABLE = 255
 # What `cv2.transpose` moves in place of numbers of the same size.
 _MOVED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
 _HALF = np.float32(0.5)
@@ -60,39 +60,6 @@ class FrameCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class Tally:
-    """How many of a frame's values were clipped or flagged, in each of the kept bands (those of the packed cube).
-
-    Each value is counted once: a dead element is nothing else, no data is not saturated, and what is flagged is not
-    clipped. A value is clipped where that changes it by half a packed unit or more.
-
-    Attributes:
-        clipped_low: raised to the lower bound.
-        clipped_high: lowered to the upper bound.
-        saturated: flagged because the reading is saturated.
-        dead: flagged because the detector's element is dead.
-        no_data: flagged because the file says that there is no data, or because a float is not finite.
-    """
-
-    clipped_low: Int[np.ndarray, "kept"]
-    clipped_high: Int[np.ndarray, "kept"]
-    saturated: Int[np.ndarray, "kept"]
-    dead: Int[np.ndarray, "kept"]
-    no_data: Int[np.ndarray, "kept"]
-
-    @property
-    def flagged(self) -> Int[np.ndarray, "kept"]:
-        """Values that are no measurement."""
-        return self.saturated + self.dead + self.no_data
-
-    @staticmethod
-    def total(tallies: Iterable[Tally]) -> Tally:
-        """The sum over frames (at least one)."""
-        listed = list(tallies)
-        return Tally(**{f.name: np.sum([getattr(t, f.name) for t in listed], axis=0) for f in fields(Tally)})
-
-
-@dataclass(frozen=True, eq=False)
 class PackedReflectance:
     """A frame's reflectance and what was seen on the way, in the orientation of the file.
 
@@ -117,19 +84,31 @@ class PackedReflectance:
     binned: Float[np.ndarray, "bins lines samples"]
 
 
+class Lines(Protocol):
+    """Raw counts, a line ``(samples, bands)`` at a time: an array, or a file that is read as it goes."""
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype
+
+    def __getitem__(self, line: int) -> Num[np.ndarray, "samples bands"]: ...
+
+
 def pack_counts(
-    counts: Num[np.ndarray, "lines samples bands"], calibration: FrameCalibration, pictures: PictureBands
+    counts: Lines,
+    calibration: FrameCalibration,
+    pictures: PictureBands,
+    buffer: UInt16[np.ndarray, "values"] | None = None,
 ) -> PackedReflectance:
     """Reflectance of a frame's raw counts, clipped, packed and flagged, and pictures of it.
 
-    Fastest for the memory map of a BIL file; takes memory for the result and little more.
+    Fastest for the lines of a BIL file. The packed numbers lie in ``buffer``, if one is given, of at least as many
+    numbers: fresh memory takes a good part of the time.
 
     Raises:
         ValueError: the calibration is not finite where it is needed, or the illumination not positive.
     """
     lines, samples, _ = counts.shape
     kept = len(calibration.bands)
-    counts = np.asarray(counts)  # lines of a memory map would be memory maps, which are slower to make
     file_bands = as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
     any_dead = len(dead.at) > 0
@@ -141,15 +120,18 @@ def pack_counts(
 
     turns = calibration.quarter_turns
     upright_shape = (samples, lines) if turns % 2 else (lines, samples)
-    packed = np.rot90(np.empty((*upright_shape, kept), np.uint16), -turns)
+    if buffer is None:
+        buffer = np.empty(lines * samples * kept, np.uint16)
+    packed = np.rot90(buffer[: lines * samples * kept].reshape(*upright_shape, kept), -turns)
     flags = np.zeros((lines, samples), np.uint8)
     flags |= dead.pixel_flags
     draw = LinePictures(pictures, kept, lines, samples)
-    counters = {name: _Counter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
+    counters = {name: Counter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
 
     values = np.empty((kept, samples), np.float32)
     numbers = np.empty((kept, samples), np.uint16)
-    block = np.empty((_BLOCK_LINES, samples, kept), np.uint16)
+    # What lies upright in the file is transposed to its place at once.
+    block = packed[:1] if turns == 0 else np.empty((_BLOCK_LINES, samples, kept), np.uint16)
     for line in range(lines):
         raw = _band_major(counts[line])
         with np.errstate(over="ignore"):  # a double that no float32 holds is no count
@@ -187,9 +169,11 @@ def pack_counts(
             numbers[flagged] = FLAGGED
         if any_dead:
             numbers.reshape(-1)[dead.at] = FLAGGED
-        in_block = line % _BLOCK_LINES
+        in_block = line % len(block)
         cv2.transpose(numbers, dst=block[in_block])
-        if in_block == _BLOCK_LINES - 1 or line == lines - 1:
+        if turns == 0:
+            block = packed[line + 1 : line + 2]
+        elif in_block == len(block) - 1 or line == lines - 1:
             packed[line - in_block : line + 1] = block[: in_block + 1]
 
     tally = Tally(
@@ -220,33 +204,6 @@ class _DeadElements:
         replaced_by = np.where((nearest < 0) | (nearest >= kept), band, nearest) * samples + sample
         flags = np.where(dead.any(axis=0), np.uint8(PixelFlag.DEAD), np.uint8(0))
         return _DeadElements(band * samples + sample, replaced_by, dead.sum(axis=1), flags)
-
-
-class _Counter:
-    """Counts, for each element of a line, in how many lines it was marked; without widening every mark."""
-
-    def __init__(self, bands: int, samples: int) -> None:
-        self._total = np.zeros((bands, samples), np.int64)
-        self._recent = np.zeros((bands, samples), np.uint8)
-        self._lines = 0
-
-    def add(self, marked: Bool[np.ndarray, "bands samples"]) -> None:
-        """Count one line."""
-        np.add(self._recent, marked.view(np.uint8), out=self._recent)
-        self._lines += 1
-        if self._lines == _COUNTABLE:
-            self._flush()
-
-    def by_band(self, without: Int[np.ndarray, "elements"]) -> Int[np.ndarray, "bands"]:
-        """Sum over the samples, some (flat) elements left out."""
-        self._flush()
-        self._total.reshape(-1)[without] = 0
-        return self._total.sum(axis=1)
-
-    def _flush(self) -> None:
-        self._total += self._recent
-        self._recent[:] = 0
-        self._lines = 0
 
 
 def _line_constants(

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.data.calibration.lamp_drift import LampDrift, NotMeasurable
 from hsi_sc_nerf.data.calibration.pictures import lamp_drift_picture, uncertainty_picture
-from hsi_sc_nerf.data.calibration.reflectance import Tally
 from hsi_sc_nerf.data.calibration.session import SessionCalibration
+from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.calibration.white_reference import WhiteReference
 from hsi_sc_nerf.data.report import column_white_picture, white_reference_picture
 from hsi_sc_nerf.data.session import Session
