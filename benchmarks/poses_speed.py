@@ -36,6 +36,7 @@ from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
 GRAY_RANGE_NM = (450.0, 700.0)
+WALL = ("textured_background",)
 # Right is what meets the targets without markers.
 RIGHT_DEG, RIGHT_MM = 0.3, 1.5
 Images = Sequence[UInt8[np.ndarray, "h w"]]
@@ -63,6 +64,7 @@ class PosesSpeed:
 
     def main(self) -> None:
         """Simulate what is missing, estimate poses in every way, print the table and write table.json."""
+        self.output_dir.mkdir(parents=True, exist_ok=True)
         sessions = (
             {"given": self.session} if self.session else {"even": self._made(()), "patterned": self._made(WALL)}
         )
@@ -83,7 +85,6 @@ class PosesSpeed:
         scene = override(
             load_scene(self.scene), frames=self.frames, size_px=self.size, bands=self.bands, effects=effects
         )
-        self.output_dir.mkdir(parents=True, exist_ok=True)
         return simulate_session(scene, path)
 
     def _ways(self, truth: Truth) -> dict[str, tuple[Callable[[Images, list[str]], Poses], bool]]:
@@ -98,9 +99,6 @@ class PosesSpeed:
             "features": (from_features, False),
         }
         return {**ways, "COLMAP's defaults": (from_colmap_defaults, False)} if self.plain else ways
-
-
-WALL = ("textured_background",)
 
 
 def gray_images(session: Session) -> list[UInt8[np.ndarray, "h w"]]:

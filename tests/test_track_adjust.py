@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.late_frames import with_late_frames
 from hsi_sc_nerf.poses.track_adjust import TrackAdjustConfig, _moved, _slopes, adjust_tracks, split_half_error_deg
 from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project, reproject
 from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
@@ -174,3 +175,17 @@ def test_halves_of_the_points_tell_the_error():
         told.append(split_half_error_deg(found))
     assert told[0] < 0.1 < told[1]
     assert 0.2 < told[1] / errors[1] < 5.0
+
+
+def test_lost_frames_come_back_at_their_angle():
+    true = machine(-np.arange(0, 360, 18.0))
+    tracks = sightings(true, noise_px=0.1)
+    pixels = tracks.pixels.copy()
+    pixels[np.flatnonzero(tracks.frame == 9)[::4]] += 20.0
+    pixels[tracks.frame == 13] = np.random.default_rng(0).uniform(50, 200, ((tracks.frame == 13).sum(), 2))
+    tracks = replace(tracks, pixels=pixels)
+    some = np.isin(true.frames, [4, 9, 13, 19], invert=True)
+    lost = replace(true, frames=true.frames[some], angles_rad=true.angles_rad[some])
+    found = with_late_frames(lost, tracks)
+    np.testing.assert_array_equal(found.frames, np.delete(true.frames, 13))
+    np.testing.assert_allclose(found.angles_rad, np.delete(true.angles_rad, 13), atol=2e-3)
