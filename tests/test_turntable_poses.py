@@ -9,7 +9,7 @@ import pytest
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.adjust import _Problem, adjust, reproject, whitening
+from hsi_sc_nerf.poses.adjust import Problem, Unknowns, adjust, reproject, whitening
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
 from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m, on_disc
 from hsi_sc_nerf.poses.geometry import project, rotation_angle_deg
@@ -92,18 +92,37 @@ def test_noisy_corners_give_close_poses():
     assert position < 1.0
 
 
-def test_derivatives_are_those_of_the_residuals():
+@pytest.mark.parametrize("unknowns", [Unknowns(), Unknowns(2), Unknowns(1, (0.02, 0.003))])
+def test_derivatives_are_those_of_the_residuals(unknowns):
     scene = MarkerScene(frames=5)
     observations = exact_observations(scene, noise_px=0.5)
-    centre = (64.0, 64.0)
-    start = initialise(observations, centre, 128, SIDE_M)
-    weights = np.random.default_rng(0).normal(size=(len(observations), 8, 8))
-    problem = _Problem(start, observations, centre, SIDE_M, weights)
-    x = problem.pack(start)
+    start = initialise(observations, (64.0, 64.0), 128, SIDE_M)
+    rng = np.random.default_rng(0)
+    problem = Problem(start, observations, (64.0, 64.0), SIDE_M, rng.normal(size=(len(observations), 8, 8)), unknowns)
+    here = problem.moved(start, 0.05 * rng.normal(size=problem.columns.size))
+    columns, values = problem.rows(here)
+    jacobian = np.zeros((len(observations), 8, problem.columns.size + 1))
+    for row in range(len(observations)):
+        jacobian[row, :, columns[row]] += values[row].T
+    steps = 1e-6 * np.eye(problem.columns.size)
     numeric = np.stack(
-        [(problem.residuals(x + d) - problem.residuals(x - d)) / 2e-6 for d in 1e-6 * np.eye(len(x))], -1
+        [
+            (problem.residuals(problem.moved(here, d)) - problem.residuals(problem.moved(here, -d))) / 2e-6
+            for d in steps
+        ],
+        axis=-1,
     )
-    np.testing.assert_allclose(problem.jacobian(x), numeric, atol=1e-5 * np.abs(numeric).max())
+    np.testing.assert_allclose(jacobian[..., :-1], numeric, atol=1e-5 * np.abs(numeric).max())
+    # The normal equations are made of them, and of the motions' own spread.
+    normal, gradient = problem.normal_equations(here, loss_scale=1e9)
+    flat, residual = jacobian[..., :-1].reshape(-1, len(gradient)), problem.residuals(here).ravel()
+    spread = np.zeros(len(gradient))
+    if unknowns.motion_spread:
+        spread[problem.columns.motion] = 1.0 / np.repeat(unknowns.motion_spread, (2, 3)) ** 2
+    np.testing.assert_allclose(normal, flat.T @ flat + np.diag(spread), atol=1e-9 * np.abs(normal).max())
+    own = np.zeros(len(gradient))
+    own[problem.columns.motion] = problem.motions(here) * np.sqrt(spread[problem.columns.motion])
+    np.testing.assert_allclose(gradient, flat.T @ residual + own, atol=1e-9 * np.abs(gradient).max())
 
 
 def test_frames_without_a_shared_marker_are_not_linked():

@@ -1,19 +1,65 @@
-"""Bundle adjustment over exactly what the machine has: a fixed camera, one axis, an angle a frame, square markers."""
+"""Bundle adjustment over exactly what the machine has: a fixed camera, one axis, an angle a frame, square markers.
+
+Where the residuals call for it (``choose``), radial lens distortion and small motions of the table are found as well.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.initialise import Observations, Turntable, square_corners
+from hsi_sc_nerf.poses.initialise import Observations, Turntable
+from hsi_sc_nerf.poses.projection import corner_slopes, project_corners
 
 _STEPS = 100
 _SMALLEST_GAIN = 1e-9
+_LARGEST_DAMPING = 1e8
+_CAMERA, _MARKER, _MOTION = 5, 6, 5
 
-# Parameters: log focal, camera rotation vector, log distance, then angles (but the first), then 6 a marker.
-_CAMERA = 5
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What the adjustment finds beside the camera, the angles and the marker layout."""
+
+    radial_terms: int = 0
+    """How many coefficients of radial lens distortion: none, k1, or k1 and k2; the others stay as they are."""
+    motion_spread: tuple[float, float] | None = None
+    """Standard deviations of the table's tilts (rad) and shifts (m) over the frames; None where it keeps still."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where the unknowns lie in the vector of all of them.
+
+    In order: camera (5), radial terms, an angle a frame but the first, a marker's pose (6), a frame's motion (5).
+    """
+
+    size: int
+    """How many unknowns there are; ``angle`` of the first frame points to this place, behind them all."""
+    radial: Int[np.ndarray, "r"]
+    angle: Int[np.ndarray, "f"]
+    marker: Int[np.ndarray, "m 6"]
+    motion: Int[np.ndarray, "f 5"]
+
+    @staticmethod
+    def of(turntable: Turntable, unknowns: Unknowns) -> Columns:
+        """The layout of a turntable's unknowns."""
+        frames, markers = len(turntable.frames), len(turntable.markers)
+        angle = _CAMERA + unknowns.radial_terms
+        marker = angle + frames - 1
+        motion = marker + _MARKER * markers
+        size = motion + (_MOTION * frames if unknowns.motion_spread else 0)
+        return Columns(
+            size=size,
+            radial=np.arange(_CAMERA, angle),
+            angle=np.concatenate([[size], np.arange(angle, marker)]),
+            marker=np.arange(marker, motion).reshape(markers, _MARKER),
+            motion=np.arange(motion, size).reshape(-1, _MOTION),
+        )
 
 
 def adjust(
@@ -23,6 +69,7 @@ def adjust(
     side_m: float,
     weights: Float[np.ndarray, "n 8 8"],
     loss_scale: float,
+    unknowns: Unknowns | None = None,
 ) -> Turntable:
     """Least squares of weighted reprojection residuals with a soft L1 loss.
 
@@ -34,25 +81,32 @@ def adjust(
         weights: an observation's residual (x0, y0, x1, ...) is multiplied by this before the loss, for example by
             ``whitening`` of its covariance.
         loss_scale: weighted residuals well above this count by their size, not its square.
+        unknowns: what is found beside camera, angles and layout; nothing by default.
     """
-    problem = _Problem(start, observations, centre_px, side_m, weights)
-    return problem.unpack(_levenberg_marquardt(problem, problem.pack(start), loss_scale))
+    problem = Problem(start, observations, centre_px, side_m, weights, unknowns or Unknowns())
+    return _levenberg_marquardt(problem, start, loss_scale)
 
 
 def reproject(
     turntable: Turntable, observations: Observations, centre_px: tuple[float, float], side_m: float
 ) -> Float[np.ndarray, "n 4 2"]:
     """Where the turntable puts the corners of each observation, in pixels."""
-    problem = _Problem(turntable, observations, centre_px, side_m, None)
-    return problem.project(problem.pack(turntable))[0]
+    frame, marker = _rows(turntable, observations)
+    return project_corners(turntable, frame, marker, centre_px, side_m).pixels
 
 
 def angle_slopes(
     turntable: Turntable, observations: Observations, centre_px: tuple[float, float], side_m: float
 ) -> Float[np.ndarray, "n 8"]:
     """How each observation's corners (x0, y0, x1, ...) move with its frame's angle, px / rad."""
-    problem = _Problem(turntable, observations, centre_px, side_m, None)
-    return problem.slopes(problem.pack(turntable))[1]
+    frame, marker = _rows(turntable, observations)
+    projection = project_corners(turntable, frame, marker, centre_px, side_m)
+    return corner_slopes(turntable, frame, projection, centre_px).angle
+
+
+def loss(residual: np.ndarray, scale: float) -> float:
+    """Sum of the soft L1 loss rho(r^2) = 2 s^2 (sqrt(1 + r^2 / s^2) - 1): r^2 where small, 2 s |r| where large."""
+    return 2.0 * scale**2 * float(np.sum(np.sqrt(1.0 + (residual / scale) ** 2) - 1.0))
 
 
 def whitening(covariance: Float[np.ndarray, "n 8 8"]) -> Float[np.ndarray, "n 8 8"]:
@@ -60,132 +114,133 @@ def whitening(covariance: Float[np.ndarray, "n 8 8"]) -> Float[np.ndarray, "n 8 
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
 
 
-class _Problem:
-    """Projection and derivatives of all observations at once, with parameters packed in one vector."""
+class Problem:
+    """Weighted residuals and normal equations of all observations at once."""
 
-    def __init__(self, start, observations, centre_px, side_m, weights):
-        self.frames, self.markers = start.frames, start.markers
-        self.f = np.searchsorted(start.frames, observations.frame)
-        self.m = np.searchsorted(start.markers, observations.marker)
-        self.observed = observations.corners_px
-        self.centre = np.asarray(centre_px)
-        self.square = square_corners(side_m)
-        self.weights = weights
+    def __init__(
+        self,
+        start: Turntable,
+        observations: Observations,
+        centre_px: tuple[float, float],
+        side_m: float,
+        weights: Float[np.ndarray, "n 8 8"],
+        unknowns: Unknowns,
+    ) -> None:
+        self.columns = Columns.of(start, unknowns)
+        self.frame, self.marker = _rows(start, observations)
+        self.observed, self.weights = observations.corners_px, weights
+        self.centre_px, self.side_m = centre_px, side_m
+        spread = unknowns.motion_spread
+        self.motion_scale = None if spread is None else np.array([spread[0]] * 2 + [spread[1]] * 3)
 
-    def pack(self, turntable):
-        rotations = Rotation.from_matrix(turntable.marker_poses[:, :3, :3]).as_rotvec()
-        markers = np.concatenate([rotations, turntable.marker_poses[:, :3, 3]], -1)
-        camera = Rotation.from_matrix(turntable.camera_rotation).as_rotvec()
-        return np.concatenate(
-            [
-                [np.log(turntable.focal_px), *camera, np.log(turntable.distance_m)],
-                turntable.angles_rad[1:] - turntable.angles_rad[0],
-                markers.ravel(),
-            ]
+    def residuals(self, turntable: Turntable) -> Float[np.ndarray, "n 8"]:
+        """Weighted distances of the projected corners from the observed ones."""
+        pixels = project_corners(turntable, self.frame, self.marker, self.centre_px, self.side_m).pixels
+        return np.einsum("nij,nj->ni", self.weights, (pixels - self.observed).reshape(-1, 8))
+
+    def motions(self, turntable: Turntable) -> Float[np.ndarray, "f 5"]:
+        """The table's tilts and shifts in units of their spread: with the residuals they are made small."""
+        if self.motion_scale is None:
+            return np.zeros((0, _MOTION))
+        tilts = np.zeros((len(turntable.frames), 2)) if turntable.tilts_rad is None else turntable.tilts_rad
+        shifts = np.zeros((len(turntable.frames), 3)) if turntable.shifts_m is None else turntable.shifts_m
+        return np.concatenate([tilts, shifts], axis=-1) / self.motion_scale
+
+    def rows(self, turntable: Turntable) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n 8 k"]]:
+        """The unknowns that an observation depends on, and the derivatives of its weighted residuals by them."""
+        projection = project_corners(turntable, self.frame, self.marker, self.centre_px, self.side_m)
+        slopes = corner_slopes(turntable, self.frame, projection, self.centre_px)
+        c, n = self.columns, len(self.frame)
+        shared = np.broadcast_to(np.concatenate([np.arange(_CAMERA), c.radial]), (n, _CAMERA + len(c.radial)))
+        columns = [shared, c.angle[self.frame][:, None], c.marker[self.marker]]
+        values = [slopes.camera, slopes.radial[..., : len(c.radial)], slopes.angle[..., None], slopes.marker]
+        if self.motion_scale is not None:
+            columns.append(c.motion[self.frame])
+            values.append(slopes.motion)
+        return np.concatenate(columns, axis=1), self.weights @ np.concatenate(values, axis=2)
+
+    def side_slopes(self, turntable: Turntable) -> Float[np.ndarray, "n 8"]:
+        """Derivatives of the weighted residuals by the log of the marker's side."""
+        projection = project_corners(turntable, self.frame, self.marker, self.centre_px, self.side_m)
+        return np.einsum(
+            "nij,nj->ni", self.weights, corner_slopes(turntable, self.frame, projection, self.centre_px).size
         )
 
-    def unpack(self, x):
-        n = len(self.frames) - 1
-        markers = x[_CAMERA + n :].reshape(-1, 6)
-        poses = np.tile(np.eye(4), (len(markers), 1, 1))
-        poses[:, :3, :3] = Rotation.from_rotvec(markers[:, :3]).as_matrix()
-        poses[:, :3, 3] = markers[:, 3:]
-        return Turntable(
-            float(np.exp(x[0])),
-            Rotation.from_rotvec(x[1:4]).as_matrix(),
-            float(np.exp(x[4])),
-            self.frames,
-            np.concatenate([[0.0], x[_CAMERA : _CAMERA + n]]),
-            self.markers,
-            poses,
+    def normal_equations(
+        self, turntable: Turntable, loss_scale: float
+    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
+        """Normal matrix and gradient, each residual weighted by the loss's slope there."""
+        # The last column is that of the first frame's angle, which is no unknown.
+        normal, gradient = self.assemble(turntable, *self.rows(turntable), self.columns.size + 1, loss_scale)
+        return normal[:-1, :-1], gradient[:-1]
+
+    def assemble(
+        self,
+        turntable: Turntable,
+        columns: Int[np.ndarray, "n k"],
+        values: Float[np.ndarray, "n 8 k"],
+        size: int,
+        loss_scale: float,
+    ) -> tuple[Float[np.ndarray, "size size"], Float[np.ndarray, "size"]]:
+        """Normal matrix and gradient from ``rows``.
+
+        An observation knows some twenty of several hundred unknowns: only their products are made.
+        """
+        residual = self.residuals(turntable)
+        weighted = values / np.sqrt(1.0 + (residual / loss_scale) ** 2)[..., None]
+        place = columns[:, :, None] * size + columns[:, None, :]
+        products = np.swapaxes(weighted, 1, 2) @ values
+        normal = np.bincount(place.ravel(), products.ravel(), size**2).reshape(size, size)
+        gradient = np.bincount(columns.ravel(), np.einsum("nik,ni->nk", weighted, residual).ravel(), size)
+        if self.motion_scale is not None:
+            at = self.columns.motion
+            motions = self.motions(turntable)
+            weight = 1.0 / np.sqrt(1.0 + (motions / loss_scale) ** 2)
+            normal[at, at] += weight / self.motion_scale**2
+            gradient[at] += weight * motions / self.motion_scale
+        return normal, gradient
+
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "p"]) -> Turntable:
+        """The turntable after a step of the unknowns."""
+        c = self.columns
+        poses = turntable.marker_poses.copy()
+        by_marker = step[c.marker]
+        poses[:, :3, :3] = Rotation.from_rotvec(by_marker[:, :3]).as_matrix() @ poses[:, :3, :3]
+        poses[:, :3, 3] += by_marker[:, 3:]
+        radial = list(turntable.radial)
+        for power, at in enumerate(c.radial):
+            radial[power] += float(step[at])
+        moved = replace(
+            turntable,
+            focal_px=turntable.focal_px * float(np.exp(np.clip(step[0], -1.0, 1.0))),
+            camera_rotation=Rotation.from_rotvec(step[1:4]).as_matrix() @ turntable.camera_rotation,
+            distance_m=turntable.distance_m * float(np.exp(np.clip(step[4], -1.0, 1.0))),
+            angles_rad=turntable.angles_rad + np.append(step, 0.0)[c.angle],
+            marker_poses=poses,
+            radial=(radial[0], radial[1]),
         )
+        if self.motion_scale is None:
+            return moved
+        motions = self.motions(turntable) * self.motion_scale + step[c.motion]
+        return replace(moved, tilts_rad=motions[:, :2], shifts_m=motions[:, 2:])
 
-    def project(self, x):
-        t = self.unpack(x)
-        on_object = np.einsum("mij,kj->mki", t.marker_poses[:, :3, :3], self.square)
-        points = (on_object + t.marker_poses[:, None, :3, 3])[self.m]
-        turn = Rotation.from_rotvec(np.outer(t.angles_rad, [0.0, 0.0, 1.0])).as_matrix()[self.f]
-        in_room = np.einsum("nij,nkj->nki", turn, points)
-        in_camera = (in_room - [t.distance_m, 0.0, 0.0]) @ t.camera_rotation.T
-        pixels = t.focal_px * in_camera[..., :2] / in_camera[..., 2:] + self.centre
-        return pixels, (t, on_object[self.m], turn, in_room, in_camera)
-
-    def residuals(self, x):
-        residual = (self.project(x)[0] - self.observed).reshape(-1, 8)
-        return np.einsum("nij,nj->ni", self.weights, residual).ravel()
-
-    def slopes(self, x):
-        """Derivatives of the corners (n, 8, ...) by the camera (5), the frame's angle, and the marker's pose (6)."""
-        pixels, (t, on_object, turn, in_room, in_camera) = self.project(x)
-        z = in_camera[..., 2]
-        by_point = np.zeros((*z.shape, 2, 3))
-        by_point[..., 0, 0] = by_point[..., 1, 1] = t.focal_px / z
-        by_point[..., :2, 2] = -t.focal_px * in_camera[..., :2] / z[..., None] ** 2
-        to_camera = t.camera_rotation
-        camera = np.concatenate(
-            [
-                (pixels - self.centre)[..., None],
-                by_point @ -_cross_matrix(in_camera) @ _left_jacobian(x[None, 1:4])[0],
-                (by_point @ (-to_camera[:, 0] * t.distance_m))[..., None],
-            ],
-            -1,
-        )
-        sideways = np.stack([-in_room[..., 1], in_room[..., 0], np.zeros_like(z)], -1)
-        angle = np.einsum("nkij,nkj->nki", by_point, sideways @ to_camera.T)
-        to_pixels = by_point @ (to_camera @ turn)[:, None]
-        turns = _left_jacobian(x[_CAMERA + len(self.frames) - 1 :].reshape(-1, 6)[:, :3])[self.m]
-        marker = np.concatenate([to_pixels @ -_cross_matrix(on_object) @ turns[:, None], to_pixels], -1)
-        n = len(z)
-        return camera.reshape(n, 8, _CAMERA), angle.reshape(n, 8), marker.reshape(n, 8, 6)
-
-    def jacobian(self, x):
-        camera, angle, marker = self.slopes(x)
-        n, frames = len(camera), len(self.frames)
-        # The first angle is no parameter: its column is made and left out.
-        full = np.zeros((n, 8, _CAMERA + frames + 6 * len(self.markers)))
-        row = np.arange(n)
-        full[:, :, :_CAMERA] = self.weights @ camera
-        full[row, :, _CAMERA + self.f] = (self.weights @ angle[..., None])[..., 0]
-        columns = _CAMERA + frames + 6 * self.m[:, None] + np.arange(6)
-        full[row[:, None], :, columns] = np.swapaxes(self.weights @ marker, 1, 2)
-        return np.delete(full.reshape(n * 8, -1), _CAMERA, axis=1)
+    def cost(self, turntable: Turntable, loss_scale: float) -> float:
+        """What the adjustment makes small."""
+        return loss(self.residuals(turntable), loss_scale) + loss(self.motions(turntable), loss_scale)
 
 
-def _cross_matrix(v):
-    """Matrices [v]x with [v]x w = v x w."""
-    matrix = np.zeros((*v.shape, 3))
-    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    return matrix - np.swapaxes(matrix, -1, -2)
+def _rows(turntable, observations):
+    return (
+        np.searchsorted(turntable.frames, observations.frame),
+        np.searchsorted(turntable.markers, observations.marker),
+    )
 
 
-def _left_jacobian(rotvec):
-    """d(exp(w) s) = -[exp(w) s]x J(w) dw: the left Jacobian of SO(3)."""
-    angle = np.linalg.norm(rotvec, axis=-1)[:, None, None]
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    cross = _cross_matrix(rotvec)
-    return np.eye(3) + a * cross + b * (cross @ cross)
-
-
-def _levenberg_marquardt(problem, x, loss_scale):
-    """Minimise sum(rho(r^2)), rho(z) = 2 s^2 (sqrt(1 + z / s^2) - 1), by reweighted normal equations.
-
-    A few hundred unknowns against thousands of residuals: the normal matrix is small, and its Cholesky factor far
-    cheaper than the singular values of the Jacobian that ``scipy.optimize.least_squares`` takes.
-    """
-
-    def cost_of(residual):
-        return 2 * loss_scale**2 * float(np.sum(np.sqrt(1 + (residual / loss_scale) ** 2) - 1))
-
-    residual = problem.residuals(x)
-    cost, damping = cost_of(residual), 1e-3
+def _levenberg_marquardt(problem, turntable, loss_scale):
+    """A few hundred unknowns against thousands of residuals: the normal matrix is small, and its factor cheap."""
+    cost, damping = problem.cost(turntable, loss_scale), 1e-3
     for _ in range(_STEPS):
-        weight = 1.0 / np.sqrt(1 + (residual / loss_scale) ** 2)
-        jacobian = problem.jacobian(x)
-        weighted = jacobian * weight[:, None]
-        normal, gradient = weighted.T @ jacobian, weighted.T @ residual
+        normal, gradient = problem.normal_equations(turntable, loss_scale)
         scale = np.maximum(np.diag(normal), 1e-12)
         while True:
             try:
@@ -193,15 +248,15 @@ def _levenberg_marquardt(problem, x, loss_scale):
             except LinAlgError:
                 damping *= 10
                 continue
-            there = problem.residuals(x + step)
-            lower = cost_of(there)
-            if lower < cost or damping > 1e8:
+            there = problem.moved(turntable, step)
+            lower = problem.cost(there, loss_scale)
+            if lower < cost or damping > _LARGEST_DAMPING:
                 break
             damping *= 5
         gain = cost - lower
         if not gain > 0:
             break
-        x, residual, cost, damping = x + step, there, lower, max(damping / 10, 1e-12)
+        turntable, cost, damping = there, lower, max(damping / 10, 1e-12)
         if gain < _SMALLEST_GAIN * cost:
             break
-    return x
+    return turntable

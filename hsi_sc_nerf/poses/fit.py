@@ -29,6 +29,8 @@ _HOPELESS_UNEXPLAINED = 0.8
 # Errors of the pattern's model itself (print, lens, shading) that the pixels' residual does not show.
 _MODEL_ERROR_PX = 0.02
 _HUBER_SIGMAS = 2.5
+# A pixel's footprint is cut off at so many standard deviations of the blur.
+_BLUR_REACH = 3.0
 
 
 @dataclass(frozen=True)
@@ -69,20 +71,20 @@ def fit_marker(
     window = _window(corners_px, cells, image.shape)
     if window is None:
         return None
-    pixels, values = window
-    values = image[values]
+    first, inside = window
+    rows, columns = np.nonzero(inside)
+    values = image[rows + first[1], columns + first[0]]
     centre = corners_px.mean(0)
     extent = np.abs(corners_px - centre).max()
-    local = (pixels - centre) / extent
+    local = (np.stack([columns, rows], -1) + first + 0.5 - centre) / extent
     homography = _homography((corners_px - centre) / extent, cells)
-    offsets, weights = _footprint(corners_px, cells, blur_px)
-    offsets = offsets / extent
+    footprint = _Footprint.of(corners_px, cells, blur_px, first, inside.shape, centre, extent)
     unit_corners = cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     corners = corners_px
     shading = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
     robust = np.ones(len(local))
     for _ in range(_ITERATIONS):
-        rendered, slope = _render(local, offsets, weights, homography, dictionary, marker)
+        rendered, slope = (part[inside] for part in _render(footprint, homography, dictionary, marker))
         design = np.concatenate([shading, shading * rendered[:, None]], -1)
         root = np.sqrt(robust)[:, None]
         # Cholesky's factor of the 6 x 6 Gram matrix: as good as QR for these columns, and many times faster.
@@ -131,7 +133,7 @@ def quad_area(corners: Float[np.ndarray, "4 2"]) -> float:
 
 
 def _window(corners_px, cells, shape):
-    """Pixel centres in the marker with its margin, and their indices; None if it leaves the image."""
+    """First pixel (x, y) of a box around the marker and which of its pixels the fit takes; None outside the image."""
     to_image = cv2.getPerspectiveTransform(_unit_square(cells), corners_px.astype(np.float32))
     low, high = -_MARGIN_CELLS, cells + _MARGIN_CELLS
     outline = np.array([[[low, low], [high, low], [high, high], [low, high]]], np.float64)
@@ -139,15 +141,11 @@ def _window(corners_px, cells, shape):
     first, last = np.floor(outline.min(0)).astype(int), np.ceil(outline.max(0)).astype(int)
     if first.min() < 0 or last[0] > shape[1] or last[1] > shape[0]:
         return None
-    x, y = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
-    pixels = np.stack([x.ravel(), y.ravel()], -1) + 0.5
-    edge = np.roll(outline, -1, 0) - outline
-    inside = np.all(
-        edge[:, 0] * (pixels[:, None, 1] - outline[:, 1]) - edge[:, 1] * (pixels[:, None, 0] - outline[:, 0]) > 0, -1
-    )
-    if inside.sum() < 24:
-        return None
-    return pixels[inside], (y.ravel()[inside], x.ravel()[inside])
+    x, y = np.meshgrid(np.arange(first[0], last[0]) + 0.5, np.arange(first[1], last[1]) + 0.5)
+    inside = np.ones(x.shape, bool)
+    for corner, edge in zip(outline, np.roll(outline, -1, 0) - outline, strict=True):
+        inside &= edge[0] * (y - corner[1]) - edge[1] * (x - corner[0]) > 0
+    return (first, inside) if inside.sum() >= 24 else None
 
 
 def _unit_square(cells):
@@ -159,21 +157,39 @@ def _homography(corners, cells):
     return cv2.getPerspectiveTransform(corners.astype(np.float32), _unit_square(cells)).ravel()[:8]
 
 
-def _footprint(corners_px, cells, blur_px):
-    """Sample positions over one pixel (with blur around it), and their weights."""
-    side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
-    narrowest_cell = quad_area(corners_px) / side.max() / cells
-    # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
-    spacing = max(1.0 / np.clip(np.ceil(4.0 / narrowest_cell), 2, 6), 0.4 * blur_px)
-    reach = 0.5 + 2.5 * blur_px
-    count = int(np.ceil(2 * reach / spacing))
-    position = (np.arange(count) + 0.5) / count * 2 * reach - reach
-    weight = np.ones(count)
-    if blur_px > 0:
-        weight = ndtr((position + 0.5) / blur_px) - ndtr((position - 0.5) / blur_px)
-    weight = weight / weight.sum()
-    grid = np.stack(np.meshgrid(position, position), -1).reshape(-1, 2)
-    return grid, np.outer(weight, weight).ravel()
+@dataclass(frozen=True)
+class _Footprint:
+    """What each pixel of a window averages over: its own area and the blur around it, along x times along y.
+
+    The window is sampled on a finer grid; a pixel's row of ``over_x`` and of ``over_y`` weights the samples. Places
+    are relative to the marker's centre, in units of its extent.
+    """
+
+    x: Float[np.ndarray, "i"]
+    y: Float[np.ndarray, "j"]
+    over_x: Float[np.ndarray, "w i"]
+    over_y: Float[np.ndarray, "h j"]
+
+    @staticmethod
+    def of(corners_px, cells, blur_px, first, shape, centre, extent):
+        side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
+        narrowest_cell = quad_area(corners_px) / side.max() / cells
+        # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
+        a_pixel = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
+        if blur_px > 0:
+            a_pixel = int(np.clip(np.ceil(2.5 / blur_px), 1, a_pixel))
+        margin = int(np.ceil(_BLUR_REACH * blur_px))
+        axes = []
+        for start, size, middle in zip(first, shape[::-1], centre, strict=True):
+            samples = start - margin + (np.arange((size + 2 * margin) * a_pixel) + 0.5) / a_pixel
+            away = samples - (start + np.arange(size) + 0.5)[:, None]
+            if blur_px > 0:
+                weight = ndtr((away + 0.5) / blur_px) - ndtr((away - 0.5) / blur_px)
+            else:
+                weight = (np.abs(away) < 0.5).astype(float)
+            weight /= weight.sum(axis=1, keepdims=True)
+            axes.append(((samples - middle) / extent, weight.astype(np.float32)))
+        return _Footprint(axes[0][0], axes[1][0], axes[0][1], axes[1][1])
 
 
 @lru_cache(maxsize=64)
@@ -185,24 +201,36 @@ def _texture(dictionary, marker):
     return cv2.merge([texture, *slopes])
 
 
-def _render(local, offsets, weights, homography, dictionary, marker):
-    """The pattern seen by each pixel, in [0, 1], and its derivatives by the homography."""
-    x, y = (local[:, None, axis] + offsets[None, :, axis] for axis in (0, 1))
-    h = homography
-    inverse_d = 1.0 / (h[6] * x + h[7] * y + 1.0)
-    u = (h[0] * x + h[1] * y + h[2]) * inverse_d
-    v = (h[3] * x + h[4] * y + h[5]) * inverse_d
-    u_at, v_at = (((axis + 3) * _TEXELS - 0.5).astype(np.float32) for axis in (u, v))
-    seen = cv2.remap(_texture(dictionary, marker), u_at, v_at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    scaled = inverse_d * weights
-    du, dv = seen[..., 1] * scaled, seen[..., 2] * scaled
-    dd = -(du * u + dv * v)
-    slope = np.empty((len(local), 9))
-    for k, derivative in enumerate((du, dv, dd)):
-        slope[:, 3 * k] = np.einsum("ns,ns->n", derivative, x)
-        slope[:, 3 * k + 1] = np.einsum("ns,ns->n", derivative, y)
-        slope[:, 3 * k + 2] = derivative.sum(-1)
-    return np.einsum("ns,s->n", seen[..., 0], weights), slope[:, :8]
+def _render(footprint, homography, dictionary, marker):
+    """The pattern seen by each pixel of the window, in [0, 1], and its derivatives by the homography.
+
+    Single precision is a millionth of a cell here.
+    """
+    x, y = footprint.x.astype(np.float32), footprint.y.astype(np.float32)
+    h = np.append(homography, 1.0).astype(np.float32).reshape(3, 3)
+    inverse_d, u, v = ((h[k, 1] * y + h[k, 2])[:, None] + h[k, 0] * x for k in (2, 0, 1))
+    np.reciprocal(inverse_d, out=inverse_d)
+    u *= inverse_d
+    v *= inverse_d
+    to_texel = np.float32(3 * _TEXELS - 0.5)
+    seen = cv2.remap(
+        _texture(dictionary, marker),
+        u * np.float32(_TEXELS) + to_texel,
+        v * np.float32(_TEXELS) + to_texel,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    rendered, du, dv = cv2.split(seen)
+    du *= inverse_d
+    dv *= inverse_d
+    over_x, over_y = footprint.over_x.T, footprint.over_y
+    slope = np.empty((len(over_y), over_x.shape[1], 9))
+    for k, derivative in enumerate((du, dv, -(du * u + dv * v))):
+        along_x = derivative @ np.concatenate([over_x, over_x * x[:, None]], axis=1)
+        total, by_x = np.split(over_y @ along_x, 2, axis=1)
+        slope[..., 3 * k], slope[..., 3 * k + 2] = by_x, total
+        slope[..., 3 * k + 1] = (over_y * y) @ along_x[:, : over_x.shape[1]]
+    return (over_y @ (rendered @ over_x)).astype(float), slope[..., :8]
 
 
 def _corners(homography, unit_corners):

@@ -16,7 +16,7 @@ _COPLANAR_SIDES = 0.2
 
 
 def layout(turntable: Turntable, side_m: float) -> Float[np.ndarray, "m 4 3"]:
-    """Corners of the markers in the turntable's frame."""
+    """Corners of the markers in the turntable's frame, at the angle 0."""
     rotations, shifts = turntable.marker_poses[:, :3, :3], turntable.marker_poses[:, None, :3, 3]
     return np.einsum("mij,kj->mki", rotations, square_corners(side_m)) + shifts
 
@@ -49,11 +49,21 @@ def disc_tilt_deg(turntable: Turntable, side_m: float) -> float | None:
 
 def camera_to_world(turntable: Turntable, disc_m: float) -> Float[np.ndarray, "f 4 4"]:
     """Camera-to-world in the object frame (OpenGL axes): z = 0 on the disc, x towards the first frame's camera."""
-    first = np.eye(4)
-    first[:3, :3] = turntable.camera_rotation.T
-    first[:3, 3] = [turntable.distance_m, 0.0, -disc_m]
-    first = first @ OPENCV_TO_OPENGL
-    return np.stack([rotation_about_z(-np.rad2deg(a)) @ first for a in turntable.angles_rad])
+    in_room = np.eye(4)
+    in_room[:3, :3] = turntable.camera_rotation.T
+    in_room[:3, 3] = [turntable.distance_m, 0.0, 0.0]
+    to_room = np.tile(np.eye(4), (len(turntable.frames), 1, 1))
+    to_room[:, :3, :3], to_room[:, :3, 3] = turntable.motions()
+    to_object = rotation_about_z(-first_azimuth_deg(turntable))
+    to_object[2, 3] = -disc_m
+    return to_object @ np.linalg.inv(to_room) @ in_room @ OPENCV_TO_OPENGL
+
+
+def first_azimuth_deg(turntable: Turntable) -> float:
+    """Azimuth of the first frame's camera in the turntable's frame: not 0 only where the table wobbles."""
+    rotations, shifts = turntable.motions()
+    camera = ([turntable.distance_m, 0.0, 0.0] - shifts[0]) @ rotations[0]
+    return float(np.rad2deg(np.arctan2(camera[1], camera[0])))
 
 
 def loop_closure_deg(

@@ -7,7 +7,7 @@ ambiguity of a small square's pose, which the layout then resolves: one pose on 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from hsi_sc_nerf.poses.geometry import rotation_about_z
 
 # Fields of view over the width that are tried: from a tele lens to a very wide one.
 _FOV_RANGE_DEG = (5.0, 90.0)
-_FOV_STEPS = 40
+_FOV_STEPS = 16
 _HORIZONTAL_COSINE = 0.95
 
 
@@ -41,6 +41,20 @@ class Observations:
         """The rows that ``keep`` (a mask or indices) picks."""
         return Observations(self.frame[keep], self.marker[keep], self.corners_px[keep], self.covariance_px2[keep])
 
+    def has(self, frame: int, marker: int) -> bool:
+        """Whether the marker was seen in the frame."""
+        return bool(((self.frame == frame) & (self.marker == marker)).any())
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A marker in a frame that does not count: its error where it was measured, and the reason."""
+
+    frame: int
+    marker: int
+    error_px: float | None
+    why: str
+
 
 @dataclass(frozen=True)
 class Turntable:
@@ -57,6 +71,37 @@ class Turntable:
     angles_rad: Float[np.ndarray, "f"]
     markers: Int[np.ndarray, "m"]
     marker_poses: Float[np.ndarray, "m 4 4"]  # marker to object
+    radial: tuple[float, float] = (0.0, 0.0)  # lens distortion: OpenCV's k1, k2
+    tilts_rad: Float[np.ndarray, "f 2"] | None = None  # of a wobbling table, frame by frame; None: it keeps still
+    shifts_m: Float[np.ndarray, "f 3"] | None = None
+
+    def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
+        """Rotation and shift that take the object to its place in the room, frame by frame.
+
+        A wobbling table adds a small rotation about a level axis (of rotation vector (tilt x, tilt y, 0)) and a small
+        shift to the turn about its mean axis.
+        """
+        turns = Rotation.from_rotvec(np.outer(self.angles_rad, [0.0, 0.0, 1.0])).as_matrix()
+        if self.tilts_rad is None or self.shifts_m is None:
+            return turns, np.zeros((len(turns), 3))
+        level = np.concatenate([self.tilts_rad, np.zeros((len(turns), 1))], axis=-1)
+        return Rotation.from_rotvec(level).as_matrix() @ turns, self.shifts_m
+
+    def restricted(self, observations: Observations) -> Turntable:
+        """The turntable with only the frames and markers that are observed; the first frame's angle becomes 0."""
+        frames = np.isin(self.frames, observations.frame)
+        markers = np.isin(self.markers, observations.marker)
+        angle = float(self.angles_rad[frames][0])
+        turn = rotation_about_z(np.rad2deg(angle))
+        return replace(
+            self,
+            frames=self.frames[frames],
+            angles_rad=self.angles_rad[frames] - angle,
+            markers=self.markers[markers],
+            marker_poses=turn @ self.marker_poses[markers],
+            tilts_rad=None if self.tilts_rad is None else self.tilts_rad[frames],
+            shifts_m=None if self.shifts_m is None else self.shifts_m[frames],
+        )
 
 
 def square_corners(side_m: float) -> Float[np.ndarray, "4 3"]:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
 from hsi_sc_nerf.poses.adjust import reproject
 from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.frame import layout
-from hsi_sc_nerf.poses.initialise import Observations, Turntable
+from hsi_sc_nerf.poses.initialise import Observations, Rejected, Turntable
 from hsi_sc_nerf.poses.markers import Detections, detect_markers
 
+# Frames that are searched at the same time: OpenCV and NumPy let other threads work meanwhile.
+_WORKERS = 2
 # The camera's blur that is tried, standard deviation in pixels, and on how many markers.
-_BLURS_PX = (0.0, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7)
+_BLURS_PX = (0.0, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0)
 _MARKERS_TO_TELL_THE_BLUR = 10
 _BLUR_TOLERANCE_PX = 0.02
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
@@ -24,23 +29,40 @@ _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
 
 
-def observe(
-    images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progress: bool
-) -> tuple[Observations, float]:
-    """Detect and refine the markers of every frame; also returns the blur that explains them best, in pixels."""
-    detections = [
-        detect_markers(image, dictionary)
-        for image in track(images, "Finding markers", disable=not progress, transient=True)
-    ]
-    blur_px = find_blur(images, dictionary, detections)
-    rows = []
-    for i, found in enumerate(track(detections, "Refining corners", disable=not progress, transient=True)):
-        image = images[i].astype(float)
-        for marker, corners in sorted(found.items()):
-            fitted = fit_marker(image, dictionary, marker, corners, blur_px)
-            if fitted is not None:
-                rows.append((i, marker, fitted))
-    return _observations(rows), blur_px
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Markers of all frames; the blur that explains them best; and those where no pattern could be fitted."""
+
+    observations: Observations
+    blur_px: float
+    unexplained: tuple[Rejected, ...]
+
+
+def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progress: bool) -> Observed:
+    """Detect and refine the markers of every frame."""
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        detections = _all(
+            pool.map(lambda image: detect_markers(image, dictionary), images),
+            "Finding markers",
+            len(images),
+            progress,
+        )
+        blur_px = find_blur(images, dictionary, detections)
+
+        def refine(found: Detections, image: UInt8[np.ndarray, "h w"]) -> list[tuple[int, FittedMarker | None]]:
+            floats = image.astype(float)
+            return [(m, fit_marker(floats, dictionary, m, corners, blur_px)) for m, corners in sorted(found.items())]
+
+        fitted = _all(pool.map(refine, detections, images), "Refining corners", len(images), progress)
+    rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
+    why = "its pattern does not explain the pixels: hidden, blurred or misread"
+    unexplained = tuple(
+        Rejected(i, m, None, why) for i, found in enumerate(fitted) for m, fit in found if fit is None
+    )
+    return Observed(_observations(rows), blur_px, unexplained)
 
 
 def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detections: Sequence[Detections]) -> float:
@@ -53,9 +75,13 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
     if not seen:
         return 0.0
 
+    def unexplained(blur_px: float, i: int, marker: int, corners: Float[np.ndarray, "4 2"]) -> float:
+        fitted = fit_marker(images[i].astype(float), dictionary, marker, corners, blur_px)
+        return 1.0 if fitted is None else fitted.unexplained
+
     def left(blur_px: float) -> float:
-        fits = [fit_marker(images[i].astype(float), dictionary, m, c, blur_px) for i, m, c in seen]
-        return float(np.mean([1.0 if f is None else f.unexplained for f in fits]))
+        with ThreadPoolExecutor(_WORKERS) as pool:
+            return float(np.mean(list(pool.map(lambda s: unexplained(blur_px, *s), seen))))
 
     tried = [left(_BLURS_PX[0])]
     while len(tried) < len(_BLURS_PX) and (len(tried) < 3 or tried[-1] <= tried[-2]):
@@ -84,14 +110,15 @@ def observe_expected(
     frame, marker = np.array(expected).T
     blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
     corners = reproject(turntable, blank, centre_px, side_m)
-    rows = []
-    for i, m, start in zip(frame.tolist(), marker.tolist(), corners, strict=True):
-        fitted = fit_marker(
-            images[i].astype(float), dictionary, m, start, blur_px, largest_shift_px=_FARTHEST_FROM_EXPECTED_PX
-        )
-        if fitted is not None:
-            rows.append((i, m, fitted))
-    more = _observations(rows)
+
+    def look(i: int, marker: int, start: Float[np.ndarray, "4 2"]) -> FittedMarker | None:
+        image = images[i].astype(float)
+        return fit_marker(image, dictionary, marker, start, blur_px, largest_shift_px=_FARTHEST_FROM_EXPECTED_PX)
+
+    pairs = frame.tolist(), marker.tolist()
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        fitted = list(pool.map(look, *pairs, corners))
+    more = _observations([(i, m, fit) for i, m, fit in zip(*pairs, fitted, strict=True) if fit is not None])
     return Observations(
         *(np.concatenate([getattr(seen, k), getattr(more, k)]) for k in Observations.__dataclass_fields__)
     )
@@ -102,12 +129,16 @@ def _facing(turntable, side_m):
     centres = layout(turntable, side_m).mean(1)
     normals = turntable.marker_poses[:, :3, 2]
     pairs = []
-    for frame, angle in zip(turntable.frames.tolist(), turntable.angles_rad, strict=True):
-        camera = turntable.distance_m * np.array([np.cos(angle), -np.sin(angle), 0.0])
+    for frame, rotation, shift in zip(turntable.frames.tolist(), *turntable.motions(), strict=True):
+        camera = ([turntable.distance_m, 0.0, 0.0] - shift) @ rotation
         view = camera - centres
         cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
         pairs += [(frame, int(m)) for m in turntable.markers[cosine > _STEEPEST_COSINE]]
     return pairs
+
+
+def _all(work: Iterable[_T], what: str, total: int, progress: bool) -> list[_T]:
+    return list(track(work, what, total=total, disable=not progress, transient=True))
 
 
 def _observations(rows: list[tuple[int, int, FittedMarker]]) -> Observations:

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hsi_sc_nerf.poses.estimate import TurntablePoses
 from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX
+from hsi_sc_nerf.poses.result import TurntablePoses
 
 _ARROW_SHARE = 0.15
 

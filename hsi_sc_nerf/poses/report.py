@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.poses.estimate import TurntablePoses
+    from hsi_sc_nerf.poses.result import TurntablePoses
 
 # The paper's target for the reprojection error (section "Pose Estimation").
 REPROJECTION_TARGET_PX = 1.0
 # A session is a full turn if no more than this many of its steps are missing from 360 degrees.
 _STEPS_SHORT_OF_A_TURN = 1.5
+# Warn where the container's diameter by the markers is off by more than this.
+_LARGEST_DISAGREEMENT_PERCENT = 2.0
+# Warn of a marker that is this much larger or smaller than the others, if by so many standard deviations.
+_ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
+# Warn where the focal length, or the camera's distance, is known worse than this share.
+_LARGEST_SIGMA = 0.005
 
 
 def pose_report(poses: TurntablePoses) -> dict:
@@ -36,8 +42,13 @@ def pose_report(poses: TurntablePoses) -> dict:
         warnings.append(f"an angle departs from the nominal steps by {deviation:.1f} degrees")
     if poses.dropped:
         warnings.append(f"{len(poses.dropped)} of {len(poses.names)} frames could not be posed and are left out")
-    rotation = poses.camera_to_world[poses.used][0][:3, :3]
+    warnings += [*_model_warnings(poses), *_scale_warnings(poses)]
+    # The mean axis in the camera's axes: right, up, backwards.
+    axis = poses.camera_to_world[poses.used, 2, :3].mean(axis=0)
     return {
+        "method": poses.method,
+        "model": poses.model,
+        "wobble_deg": poses.wobble_deg,
         "intrinsics": asdict(poses.intrinsics),
         "distortion": list(poses.distortion),
         "blur_px": poses.blur_px,
@@ -59,9 +70,11 @@ def pose_report(poses: TurntablePoses) -> dict:
         "full_turn": full_turn,
         "loop_closure_deg": poses.loop_closure_deg if full_turn else None,
         # How far the axis leans from the image's upright, and how far the camera looks down.
-        "axis_tilt_in_image_deg": float(np.rad2deg(np.arctan2(rotation[2, 0], rotation[2, 1]))),
-        "camera_looks_down_deg": float(np.rad2deg(np.arcsin(rotation[2, 2]))),
+        "axis_tilt_in_image_deg": float(np.rad2deg(np.arctan2(axis[0], axis[1]))),
+        "camera_looks_down_deg": float(np.rad2deg(np.arctan2(axis[2], np.hypot(axis[0], axis[1])))),
         "axis_tilt_to_disc_deg": poses.disc_tilt_deg,
+        "scale": _scale(poses),
+        "uncertainty": _uncertainty(poses),
         "frames": {
             "total": len(poses.names),
             "used": int(poses.used.sum()),
@@ -71,6 +84,7 @@ def pose_report(poses: TurntablePoses) -> dict:
         "marker_dictionary": poses.dictionary,
         "disc_markers": list(poses.disc_markers),
         "marker_corners_m": {str(m): c.tolist() for m, c in sorted(poses.marker_corners_m.items())},
+        "outliers": [asdict(outlier) for outlier in poses.outliers],
         "warnings": warnings,
     }
 
@@ -79,6 +93,73 @@ def is_full_turn(angles_deg: np.ndarray) -> bool:
     """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""
     widest_step = np.abs(np.diff(angles_deg)).max()
     return bool(abs(angles_deg[-1] - angles_deg[0]) >= 360.0 - _STEPS_SHORT_OF_A_TURN * widest_step)
+
+
+def _model_warnings(poses: TurntablePoses) -> list[str]:
+    warnings = []
+    if poses.model == "free poses":
+        warnings.append(
+            f"the table wobbles by {poses.wobble_deg or 0.0:.2f} degrees (root mean square), so each frame has a "
+            "pose of its own"
+        )
+    if poses.uncertainty is not None:
+        for what, sigma in (
+            ("focal length", poses.uncertainty.focal),
+            ("camera's distance", poses.uncertainty.distance),
+        ):
+            if sigma > _LARGEST_SIGMA:
+                warnings.append(f"the {what} is known to {100.0 * sigma:.1f} % only; show more or larger markers")
+    return warnings
+
+
+def _scale_warnings(poses: TurntablePoses) -> list[str]:
+    if poses.scale is None:
+        return []
+    warnings = []
+    percent = poses.scale.disagreement_percent
+    if percent is not None and abs(percent) > _LARGEST_DISAGREEMENT_PERCENT:
+        comparison = "wider" if percent > 0 else "narrower"
+        warnings.append(
+            f"by the markers' side the container is {abs(percent):.1f} % {comparison} than given; measure the "
+            "markers' black square and the container again"
+        )
+    for marker, side in sorted(poses.scale.marker_sides.items()):
+        if abs(side - 1.0) > max(_ODD_SIDE, _ODD_SIDE_SIGMAS * poses.scale.marker_side_sigmas[marker]):
+            warnings.append(
+                f"marker {marker} seems {100.0 * abs(side - 1.0):.1f} % {'larger' if side > 1.0 else 'smaller'} than "
+                "the others; all must have one side"
+            )
+    return warnings
+
+
+def _scale(poses: TurntablePoses) -> dict | None:
+    scale = poses.scale
+    if scale is None:
+        return None
+    return {
+        "source": scale.source,
+        "marker_side_m": scale.marker_side_m,
+        "uncertainty_percent": 100.0 * scale.uncertainty,
+        "marker_sides": {
+            str(m): {"relative": side, "sigma": scale.marker_side_sigmas[m]} for m, side in scale.marker_sides.items()
+        },
+        "container_diameter_m": {
+            "given": scale.container_diameter_m,
+            "by_markers": scale.measured_container_diameter_m,
+            "disagreement_percent": scale.disagreement_percent,
+        },
+    }
+
+
+def _uncertainty(poses: TurntablePoses) -> dict | None:
+    sigma = poses.uncertainty
+    if sigma is None:
+        return None
+    return {
+        "focal_percent": 100.0 * sigma.focal,
+        "distance_percent": 100.0 * sigma.distance,
+        "angles_deg": {n: _number(a) for n, a in zip(poses.names, sigma.angle_deg, strict=True)},
+    }
 
 
 def _step_deviation(poses: TurntablePoses) -> float | None:

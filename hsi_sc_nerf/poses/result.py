@@ -1,0 +1,82 @@
+"""The result of every way to poses: by markers, by features, by known angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.poses.report import pose_report
+from hsi_sc_nerf.poses.scale import Scale
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A marker that was seen in a frame and not used there; ``error_px`` is None where it could not be measured."""
+
+    frame: str
+    marker: int
+    error_px: float | None
+    why: str
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations that follow from the fit of the corners, by the covariance of the adjustment."""
+
+    focal: float
+    """A share of the focal length."""
+    distance: float
+    """A share of the camera's distance from the axis, the scale taken for exact."""
+    angle_deg: Float[np.ndarray, "n"]
+    """Of each frame's angle, relative to the first used frame; nan where a frame is not used."""
+
+
+@dataclass(frozen=True)
+class TurntablePoses:
+    """Poses of all frames in the object frame (docs/architecture.md), and what they rest on.
+
+    Rows of frames that are not ``used`` are nan: a frame that cannot be posed is left out, never guessed.
+    ``dropped`` says why, by the frame's name. Angles are degrees, counter-clockwise seen from above, relative to the
+    first used frame and unwrapped over the session. Where the table wobbles (``model`` is "free poses") they are
+    turns about the mean axis, and the poses of two frames differ by more than a turn about z.
+    """
+
+    names: tuple[str, ...]
+    intrinsics: PinholeIntrinsics
+    distortion: tuple[float, float, float, float]
+    """OpenCV's k1, k2, p1, p2; k1 and k2 are exactly 0 where the images do not call for them."""
+    camera_to_world: Float[np.ndarray, "n 4 4"]
+    angles_deg: Float[np.ndarray, "n"]
+    reprojection_error_px: Float[np.ndarray, "n"]
+    used: Bool[np.ndarray, "n"]
+    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]]
+    dropped: dict[str, str]
+    dictionary: str | None
+    """OpenCV's name; None where the poses rest on no markers."""
+    markers_per_frame: tuple[int, ...]
+    overall_error_px: float
+    blur_px: float
+    disc_markers: tuple[int, ...]
+    disc_tilt_deg: float | None
+    loop_closure_deg: float | None
+    nominal_step_deg: float | None = None
+    nominal_direction: Literal["ccw", "cw"] | None = None
+    warnings: tuple[str, ...] = field(default=())
+    method: Literal["markers", "colmap", "angles"] = "markers"
+    """How the poses were found."""
+    model: Literal["turntable", "free poses"] = "turntable"
+    """One axis and one angle a frame; or, for a table that wobbles, small motions of each frame beside its angle."""
+    wobble_deg: float | None = None
+    """Root mean square of the table's tilts off its mean axis, where the poses are free."""
+    outliers: tuple[Outlier, ...] = ()
+    scale: Scale | None = None
+    """Where the size comes from; None where it is not known."""
+    uncertainty: Uncertainty | None = None
+
+    def report(self) -> dict:
+        """Everything a user needs to judge the poses, ready for JSON (see ``report.pose_report``)."""
+        return pose_report(self)
