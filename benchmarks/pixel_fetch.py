@@ -28,7 +28,7 @@ from spectral.io import envi
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.envi import open_cube, write_cube
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged, write_packed_cube
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged, write_packed_cube
 from hsi_sc_nerf.data.pixels import PixelReader
 
 TABLE_STARTS, TABLE_ENDS = "<!-- pixel fetch -->", "<!-- end of pixel fetch -->"

@@ -27,7 +27,8 @@ def flagged_dataset(tiny_dataset, tmp_path_factory):
 
     import numpy as np
 
-    from hsi_sc_nerf.data.packed import FLAGGED, open_packed, write_packed_cube, write_transforms
+    from hsi_sc_nerf.data.packed import open_packed, write_transforms
+    from hsi_sc_nerf.data.packed_cube import FLAGGED, write_packed_cube
 
     data = tmp_path_factory.mktemp("flagged") / "data"
     shutil.copytree(tiny_dataset[0], data)

@@ -16,7 +16,7 @@ from hsi_sc_nerf.data.calibration.session import SessionCalibration, calibrate_s
 from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths
 from hsi_sc_nerf.data.masks import MaskConfig
-from hsi_sc_nerf.data.packed import unpack
+from hsi_sc_nerf.data.packed_cube import unpack
 from hsi_sc_nerf.data.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.scene import load_scene, override

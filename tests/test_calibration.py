@@ -24,7 +24,7 @@ from hsi_sc_nerf.data.calibration.white_steps import (
     white_mask,
 )
 from hsi_sc_nerf.data.envi import Cube, open_cube, write_cube
-from hsi_sc_nerf.data.packed import unpack
+from hsi_sc_nerf.data.packed_cube import unpack
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.data.report import column_white_picture, white_reference_picture
 from hsi_sc_nerf.data.session import Capture

@@ -8,7 +8,7 @@ import torch
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.errors import InputError
 
 

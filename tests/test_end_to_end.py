@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, open_packed
+from hsi_sc_nerf.data.packed import open_packed
+from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.evaluation.processing import score_processing
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.truth import load_truth

@@ -13,7 +13,7 @@ from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, finished_notes, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.data.pseudo_rgb import bands_within, pseudo_rgb
 from hsi_sc_nerf.errors import InputError
 

@@ -12,20 +12,15 @@ from hsi_sc_nerf.data.atomic import write_png
 from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
 from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.data.frames import border_spectrum
-from hsi_sc_nerf.data.packed import (
+from hsi_sc_nerf.data.packed import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
+from hsi_sc_nerf.data.packed_cube import (
     FLAGGED,
     LARGEST_REFLECTANCE,
     REFLECTANCE_SCALE,
-    Container,
-    PackedDataset,
-    PackedFrame,
     PixelFlag,
-    is_packed,
-    open_packed,
     pack,
     unpack,
     write_packed_cube,
-    write_transforms,
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.data.packed import FLAGGED
+from hsi_sc_nerf.data.packed_cube import FLAGGED
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 
 

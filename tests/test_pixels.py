@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.data.envi import open_cube
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
 from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
 from hsi_sc_nerf.errors import InputError
 

@@ -28,7 +28,8 @@ from capture_factory import (
 from hsi_sc_nerf.data import calibrated_frames as frames_module
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig, LampDriftConfig
 from hsi_sc_nerf.data.masks import MaskConfig
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE, Container, open_packed
+from hsi_sc_nerf.data.packed import Container, open_packed
+from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.data.process import ProcessConfig, process_session
 from hsi_sc_nerf.errors import InputError
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.packed import open_packed, pack, unpack, write_packed_cube
+from hsi_sc_nerf.data.packed import open_packed
+from hsi_sc_nerf.data.packed_cube import pack, unpack, write_packed_cube
 from hsi_sc_nerf.evaluation.processing import score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 

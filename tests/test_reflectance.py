@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hsi_sc_nerf.data.calibration.line_pictures import PictureBands
 from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, pack_counts
 from hsi_sc_nerf.data.calibration.tally import Tally
-from hsi_sc_nerf.data.packed import FLAGGED, LARGEST_REFLECTANCE, REFLECTANCE_SCALE, PixelFlag
+from hsi_sc_nerf.data.packed_cube import FLAGGED, LARGEST_REFLECTANCE, REFLECTANCE_SCALE, PixelFlag
 
 LINES, SAMPLES, BANDS = 11, 6, 10
 PICTURES = PictureBands(rgb=np.array([5, 3, 1]), gray=np.array([1, 2, 4]), bin_width=3)

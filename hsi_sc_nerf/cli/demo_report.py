@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.cli.steps import StepCost
 from hsi_sc_nerf.data.atomic import write_json
-from hsi_sc_nerf.data.packed import PackedDataset, open_packed, unpack
+from hsi_sc_nerf.data.packed import PackedDataset, open_packed
+from hsi_sc_nerf.data.packed_cube import unpack
 from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
 from hsi_sc_nerf.evaluation.processing import ProcessingScore, score_processing
 from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface

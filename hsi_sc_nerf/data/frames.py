@@ -19,7 +19,7 @@ from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.cube_lines import CubeLines
 from hsi_sc_nerf.data.envi import Cube, open_cube
 from hsi_sc_nerf.data.masks import MaskConfig, bin_width, foreground_score
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
 from hsi_sc_nerf.data.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int, UInt16
 
-from hsi_sc_nerf.data.packed import unpack, unpack_unflagged
+from hsi_sc_nerf.data.packed_cube import unpack, unpack_unflagged
 from hsi_sc_nerf.errors import InputError
 
 

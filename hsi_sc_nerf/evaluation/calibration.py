@@ -12,7 +12,7 @@ from hsi_sc_nerf.data.calibration.lamp_drift import LampDrift
 from hsi_sc_nerf.data.calibration.session import SessionCalibration
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.frames import FramePaths
-from hsi_sc_nerf.data.packed import unpack
+from hsi_sc_nerf.data.packed_cube import unpack
 from hsi_sc_nerf.data.session import Session
 from hsi_sc_nerf.simulate.truth import Truth
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.packed import PackedDataset, unpack
+from hsi_sc_nerf.data.packed import PackedDataset
+from hsi_sc_nerf.data.packed_cube import unpack
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.poses.geometry import rotation_angle_deg
 from hsi_sc_nerf.simulate.truth import Truth

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from hsi_sc_nerf.data.packed import REFLECTANCE_SCALE
+from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
 
 # What the lines' values have on top, so that cutting off their decimals rounds them.
 _HALF_UNIT = np.float32(0.5 / REFLECTANCE_SCALE)

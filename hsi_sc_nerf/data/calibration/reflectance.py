@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.calibration.line_pictures import LinePictures, PictureBands, as_slice
 from hsi_sc_nerf.data.calibration.tally import Counter, Tally
-from hsi_sc_nerf.data.packed import FLAGGED, REFLECTANCE_SCALE, PixelFlag
+from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 
 # Lines that are stored at a time: an upright copy of single lines would write 400 bytes here and 400 there.
 _BLOCK_LINES = 8

@@ -34,7 +34,7 @@ from hsi_sc_nerf.data.calibration.white_source import (
     whites_of_frames,
 )
 from hsi_sc_nerf.data.envi import Cube
-from hsi_sc_nerf.data.packed import LARGEST_REFLECTANCE
+from hsi_sc_nerf.data.packed_cube import LARGEST_REFLECTANCE
 from hsi_sc_nerf.data.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 
