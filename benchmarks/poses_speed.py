@@ -28,6 +28,7 @@ from hsi_sc_nerf.data.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
 from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL
+from hsi_sc_nerf.poses.late_frames import with_late_frames
 from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
 from hsi_sc_nerf.poses.track_adjust import adjust_tracks
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
@@ -118,7 +119,8 @@ def from_features(images: Images, names: list[str]) -> Poses:
     """Our way without markers: masks, neighbours in the turn, one machine."""
     free = structure_from_motion(images, names)
     start = turntable_from_poses(free.world_to_camera).tracked(free.places, free.focal_px, free.centre_px)
-    turntable = adjust_tracks(start, free.tracks).turntable
+    adjusted = adjust_tracks(start, free.tracks).turntable
+    turntable = adjust_tracks(with_late_frames(adjusted, free.tracks), free.tracks).turntable
     poses = np.full((len(images), 4, 4), np.nan)
     poses[turntable.frames] = turntable.camera_to_world()
     return poses

@@ -126,7 +126,7 @@ def _gaps_px(rotation, focal_px, turns, pixels):
     before = np.concatenate([pixels / focal_px, np.ones((*pixels.shape[:2], 1))], axis=-1)
     rays = np.einsum("knij,knj->kni", turns, before @ rotation)
     apart = turns[1, :, :, 0] - turns[0, :, :, 0]
-    normals = np.cross(rays[::-1], apart[None] * np.array([1.0, -1.0])[:, None, None])
+    normals = np.cross(rays[::-1], apart)
     miss = (rays[0] * normals[0]).sum(-1)
     slopes = np.einsum("knji,knj->kni", turns, normals) @ rotation.T
     return miss / (np.linalg.norm(slopes[..., :2], axis=-1) ** 2).sum(0) ** 0.5 * focal_px
