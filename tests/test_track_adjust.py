@@ -145,7 +145,7 @@ def test_given_angles_and_focal_length_stay():
     assert pose_error_deg(found.turntable, true) < 1e-3
 
 
-@pytest.mark.parametrize(("sign", "elevation_deg"), [(1.0, 24.0), (-1.0, 24.0), (1.0, 2.0), (-1.0, 55.0)])
+@pytest.mark.parametrize(("sign", "elevation_deg"), [(1.0, 2.0), (-1.0, 55.0)])
 def test_known_angles_give_the_camera_from_scratch(sign, elevation_deg):
     true = machine(sign * np.arange(0, 360, 18.0), elevation_deg=elevation_deg)
     tracks = sightings(true, noise_px=0.2)
