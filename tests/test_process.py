@@ -109,8 +109,10 @@ def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
 
     run(session, tmp_path / "data", poses=poses)
     assert got["names"] == ["ball_1", "ball_2", "ball_3", "ball_4"]
-    assert (got["dictionary"], got["marker_side_m"]) == ("DICT_4X4_50", 0.02)
-    assert (got["nominal_step_deg"], got["direction"]) == (90, "ccw")
+    facts = got["facts"]
+    assert (facts.marker_dictionary, facts.marker_side_m) == ("DICT_4X4_50", 0.02)
+    assert (facts.nominal_step_deg, facts.direction) == (90, "ccw")
+    assert (facts.container_diameter_m, facts.container_height_m) == (0.09, 0.07)
     visible = (WAVELENGTHS_NM >= 450.0) & (WAVELENGTHS_NM <= 700.0)
     for image, angle in zip(got["images"], ANGLES_DEG, strict=True):
         assert image.dtype == np.uint8
@@ -232,7 +234,7 @@ def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
     seen = []
 
     def poses(images, names, **options):
-        seen.append(options["marker_side_m"])
+        seen.append(options["facts"].marker_side_m)
         raise InputError("enough")
 
     for info in (None, {"marker_side_m": 0.02}):

@@ -39,7 +39,7 @@ class PackedFrame:
         cube_path: header of the reflectance cube.
         flags_path: picture of the pixels' flags.
         angle_deg: the turntable's angle relative to the first frame, counter-clockwise seen from above.
-        reprojection_error_px: root mean square of the marker corners in this frame.
+        reprojection_error_px: root mean square of the markers or features in this frame; None for poses as given.
         camera_to_world: pose in the object frame, OpenGL axes, metres.
     """
 
@@ -49,7 +49,7 @@ class PackedFrame:
     cube_path: Path
     flags_path: Path
     angle_deg: float
-    reprojection_error_px: float
+    reprojection_error_px: float | None
     camera_to_world: Float[np.ndarray, "4 4"]
 
     def cube(self) -> UInt16[np.memmap, "lines samples bands"]:
@@ -208,7 +208,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
                 "flags_path": relative(frame.flags_path),
                 "capture": frame.capture,
                 "angle_deg": float(frame.angle_deg),
-                "reprojection_error_px": float(frame.reprojection_error_px),
+                "reprojection_error_px": frame.reprojection_error_px,
                 "transform_matrix": frame.camera_to_world.tolist(),
             }
             for frame in dataset.frames
@@ -222,6 +222,10 @@ def write_transforms(dataset: PackedDataset) -> Path:
 def _transforms_path(path: Path) -> Path:
     path = Path(path)
     return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
+
+
+def _float_or_none(value: Any) -> float | None:
+    return None if value is None else float(value)
 
 
 def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
@@ -270,7 +274,7 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
                 cube_path=root / frame["cube_path"],
                 flags_path=root / frame["flags_path"],
                 angle_deg=float(frame["angle_deg"]),
-                reprojection_error_px=float(frame["reprojection_error_px"]),
+                reprojection_error_px=_float_or_none(frame["reprojection_error_px"]),
                 camera_to_world=_numbers(frame, "transform_matrix", 4, 4),
             )
             for frame in content["frames"]

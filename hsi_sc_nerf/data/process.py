@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.atomic import write_json, write_png
+from hsi_sc_nerf.data.atomic import write_png
 from hsi_sc_nerf.data.calibrated_frames import pack_frames
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.calibration.report import (
@@ -26,7 +25,7 @@ from hsi_sc_nerf.data.calibration.session import calibrate_session
 from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.calibration.uncertainty import typical_uncertainty
 from hsi_sc_nerf.data.fingerprint import session_fingerprint
-from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, object_spectrum
+from hsi_sc_nerf.data.frames import border_spectrum, object_spectrum
 from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask
 from hsi_sc_nerf.data.packed import (
     TRANSFORMS_NAME,
@@ -37,18 +36,22 @@ from hsi_sc_nerf.data.packed import (
     open_packed,
     write_transforms,
 )
+from hsi_sc_nerf.data.posed_frames import (
+    PoseFunction,
+    check_scale,
+    container_under,
+    pose_frames,
+    posed_frames,
+    session_facts,
+)
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.data.report import mask_picture
 from hsi_sc_nerf.data.scene_box import object_box, scene_box
-from hsi_sc_nerf.data.session import SESSION_INFO_NAME, Session, open_session
+from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.estimate import TurntablePoses, estimate_turntable_poses
-from hsi_sc_nerf.poses.picture import draw_poses
-
-_log = logging.getLogger(__name__)
-
-PoseFunction = Callable[..., TurntablePoses]
-"""Called like ``poses.estimate.estimate_turntable_poses``."""
+from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.poses.ways import PoseWay, find_poses
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,14 @@ class ProcessConfig:
     """Foreground masks."""
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
     """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
+    poses: PoseWay = "auto"
+    """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
+    angles that session.json gives (angles); or by the first of these that works (auto)."""
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    """Poses from features."""
+    camera: Path | None = None
+    """A dataset that was made before with the same camera and turntable: with known angles and its camera, poses need
+    neither markers nor texture."""
     marker_side_m: float | None = None
     """Side of a marker's black square, metres; session.json's where it is not given here."""
     marker_range_nm: tuple[float, float] = (450.0, 700.0)
@@ -78,7 +89,7 @@ def process_session(
     output_dir: Path,
     config: ProcessConfig | None = None,
     progress: bool = True,
-    estimate_poses: PoseFunction = estimate_turntable_poses,
+    estimate_poses: PoseFunction = find_poses,
 ) -> Path:
     """Make the packed dataset ``output_dir`` (docs/architecture.md) from a capture session; returns its path.
 
@@ -98,12 +109,9 @@ def process_session(
     if _is_done(output_dir, stamp):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
-    marker_side_m = config.marker_side_m or session.info.marker_side_m
-    if marker_side_m is None:
-        raise InputError(
-            f"{session.path / SESSION_INFO_NAME}: does not give marker_side_m, the side of a marker's black square "
-            "in metres, without which nothing has a size; add it or give --marker-side-m."
-        )
+    earlier = None if config.camera is None else open_packed(config.camera)
+    facts = session_facts(session, config.marker_side_m, earlier)
+    check_scale(session, facts, config.poses)
     _clear_transforms(output_dir)
 
     with console.status("measuring white, noise and lamps"):
@@ -111,7 +119,6 @@ def process_session(
         draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
     for sentence in describe_calibration(session, calibration):
         console.print(sentence, highlight=False)
-    names = [capture.name for capture in session.frames]
     notes = pack_frames(
         session,
         calibration,
@@ -127,28 +134,10 @@ def process_session(
     values = sum(note.score.size for note in notes) * len(wavelengths_nm)
     console.print(describe_tally(tally, values), highlight=False)
 
-    try:
-        poses = estimate_poses(
-            [note.gray for note in notes],
-            names,
-            dictionary=session.info.marker_dictionary,
-            marker_side_m=marker_side_m,
-            nominal_step_deg=session.info.nominal_step_deg,
-            direction=session.info.direction,
-            progress=progress,
-        )
-    except InputError as error:
-        raise InputError(f"{session.path}: {error}") from error
-    report = poses.report()
-    write_json(output_dir / "poses.json", report)
-    draw_poses(poses, output_dir / "report" / "poses.png")
-    frames = _posed_frames(output_dir, names, poses)
-    mean_error_px = np.mean([frame.reprojection_error_px for frame in frames])
-    console.print(f"Poses: {len(frames)} of {len(names)} frames, {mean_error_px:.2f} px.")
-    for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
-        console.print(f"Warning: {warning}.", highlight=False)
-
-    container = _container(session)
+    images = [note.gray for note in notes]
+    poses = pose_frames(session, images, facts, config.poses, config.features, output_dir, console, estimate_poses)
+    frames = posed_frames(output_dir, poses)
+    container = container_under(session, poses)
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
     scores = [note.score for note, used in zip(notes, poses.used, strict=True) if used]
     masks = _make_masks(scores, camera_to_worlds, poses, container, config.masks)
@@ -216,46 +205,6 @@ def _clear_transforms(output_dir: Path) -> None:
     if transforms.exists() and not is_packed(output_dir):
         raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
     transforms.unlink(missing_ok=True)
-
-
-def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:
-    """A warning where the turntable's axis, clockwise from the picture's upright, points to another side."""
-    quarter_turns = round(-axis_tilt_in_image_deg / 90.0)
-    if quarter_turns == 0:
-        return []
-    rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
-    return [
-        f"the turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
-        f"{session.info_path} to have them upright"
-    ]
-
-
-def _container(session: Session) -> Container | None:
-    diameter, height = session.info.container_diameter_m, session.info.container_height_m
-    return None if diameter is None or height is None else Container(diameter, height)
-
-
-def _posed_frames(output_dir: Path, names: Sequence[str], poses: TurntablePoses) -> list[PackedFrame]:
-    """The frames that have a pose; each of the others gets a warning."""
-    frames = []
-    for i, name in enumerate(names):
-        if not poses.used[i]:
-            _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
-            continue
-        paths = FramePaths.of(output_dir, name)
-        frames.append(
-            PackedFrame(
-                capture=name,
-                image_path=paths.image,
-                mask_path=paths.mask,
-                cube_path=paths.cube,
-                flags_path=paths.flags,
-                angle_deg=float(poses.angles_deg[i]),
-                reprojection_error_px=float(poses.reprojection_error_px[i]),
-                camera_to_world=poses.camera_to_world[i],
-            )
-        )
-    return frames
 
 
 def _make_masks(

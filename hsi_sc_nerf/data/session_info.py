@@ -29,6 +29,8 @@ class SessionInfo:
         marker_side_m: side of a marker's black square, metres.
         container_diameter_m: of the upright cylinder that the object stands on.
         container_height_m: of its lid above the disc.
+        frame_angles_deg: the turntable's angle in each frame, degrees, for a table that makes uneven, known steps.
+        camera_distance_m: of the camera from the turntable's axis; gives the scale where no marker does.
         white_reference: name of the capture of the white tarp.
         band_centres: a CSV beside ``session.json`` with the band centres in nm, for cubes whose headers list none.
         panel_reflectance: a CSV beside ``session.json`` with the white's own reflectance by wavelength.
@@ -43,6 +45,8 @@ class SessionInfo:
     marker_side_m: float | None = None
     container_diameter_m: float | None = None
     container_height_m: float | None = None
+    frame_angles_deg: tuple[float, ...] | None = None
+    camera_distance_m: float | None = None
     white_reference: str = "white_reference"
     band_centres: str | None = None
     panel_reflectance: str | None = None
@@ -74,6 +78,8 @@ def read_session_info(path: Path) -> SessionInfo:
         raise InputError(
             f"{path}: gives one dimension of the container; give its diameter and its height, or neither."
         )
+    if "frame_angles_deg" in values:
+        values["frame_angles_deg"] = tuple(float(angle) for angle in values["frame_angles_deg"])
     return SessionInfo(**values)
 
 
@@ -96,7 +102,7 @@ def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
 
 
 def _check_value(path: Path, key: str, value: Any) -> None:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    is_number = _is_finite_number(value)
     if key == "direction":
         valid, wanted = value in ("ccw", "cw"), "ccw or cw (seen from above)"
     elif key in _FILES:
@@ -104,9 +110,16 @@ def _check_value(path: Path, key: str, value: Any) -> None:
         wanted = f"the name of a CSV file beside {path.name}"
     elif key in _TEXTS:
         valid, wanted = isinstance(value, str) and value != "", "a text"
+    elif key == "frame_angles_deg":
+        valid = isinstance(value, list) and all(_is_finite_number(angle) for angle in value)
+        wanted = "a list with one number a frame"
     elif key == "image_rotation_deg":
         valid, wanted = is_number and value in (0, 90, 180, 270), "0, 90, 180 or 270 degrees"
     else:
-        valid, wanted = is_number and 0.0 < value < float("inf"), "a positive number"
+        valid, wanted = is_number and value > 0.0, "a positive number"
     if not valid:
         raise InputError(f"{path}: {key} is {value!r}, but must be {wanted}; correct it.")
+
+
+def _is_finite_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf")

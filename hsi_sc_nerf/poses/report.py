@@ -47,6 +47,8 @@ def pose_report(poses: TurntablePoses) -> dict:
     axis = poses.camera_to_world[poses.used, 2, :3].mean(axis=0)
     return {
         "method": poses.method,
+        "chosen": poses.chosen,
+        "metric": poses.metric,
         "model": poses.model,
         "wobble_deg": poses.wobble_deg,
         "intrinsics": asdict(poses.intrinsics),

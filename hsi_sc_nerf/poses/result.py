@@ -68,6 +68,10 @@ class TurntablePoses:
     warnings: tuple[str, ...] = field(default=())
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
+    chosen: str = ""
+    """Which way was taken, and why not another."""
+    metric: bool = True
+    """Whether lengths are metres; otherwise they are in units of the camera's distance from the axis."""
     model: Literal["turntable", "free poses"] = "turntable"
     """One axis and one angle a frame; or, for a table that wobbles, small motions of each frame beside its angle."""
     wobble_deg: float | None = None

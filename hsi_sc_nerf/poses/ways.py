@@ -1,0 +1,115 @@
+"""The ways to poses, and which of them a session supports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
+from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, poses_by_angles, poses_by_colmap
+from hsi_sc_nerf.poses.known_camera import KnownCamera, poses_by_known_camera
+from hsi_sc_nerf.poses.result import TurntablePoses
+
+PoseWay = Literal["auto", "markers", "colmap", "angles"]
+
+
+@dataclass(frozen=True)
+class SessionFacts(Known):
+    """What is known of a session beside its images."""
+
+    container_diameter_m: float | None = None
+    container_height_m: float | None = None
+    frame_angles_deg: tuple[float, ...] | None = None
+    """One angle a frame, instead of even steps."""
+    camera: KnownCamera | None = None
+    """Of an earlier session."""
+
+    def angles_deg(self, frames: int) -> Float[np.ndarray, "n"] | None:
+        """The frames' known angles, relative to the first; positive where the direction is not known; or None.
+
+        Raises:
+            InputError: as many angles as frames are not given.
+        """
+        sign = -1.0 if self.direction == "cw" else 1.0
+        if self.frame_angles_deg is not None:
+            if len(self.frame_angles_deg) != frames:
+                raise InputError(
+                    f"{len(self.frame_angles_deg)} frame angles are given for {frames} frames; give one a frame"
+                )
+            return sign * (np.array(self.frame_angles_deg) - self.frame_angles_deg[0])
+        return None if self.nominal_step_deg is None else sign * self.nominal_step_deg * np.arange(frames)
+
+
+def find_poses(
+    images: Images,
+    names: Sequence[str],
+    facts: SessionFacts,
+    way: PoseWay,
+    config: FeatureConfig,
+    progress: bool = True,
+) -> TurntablePoses:
+    """Poses by one way, or by the first that works; they tell which was taken and why.
+
+    Raises:
+        InputError: the way, or every way, fails; says why.
+    """
+    if way != "auto":
+        poses = _by(way, images, names, facts, config, progress)
+        return replace(poses, chosen=f"by {_NAMES[way]}, as the settings say")
+    failed = []
+    for attempt in _ORDER:
+        try:
+            poses = _by(attempt, images, names, facts, config, progress)
+        except InputError as error:
+            failed.append(f"{_NAMES[attempt]}: {str(error).rstrip('.')}")
+            continue
+        why_not = f" (not by {'; nor by '.join(failed)})" if failed else ""
+        return replace(poses, chosen=f"by {_NAMES[attempt]}{why_not}")
+    raise InputError(f"no way to poses works: {'; '.join(failed)}.")
+
+
+_ORDER: tuple[Literal["markers", "colmap", "angles"], ...] = ("markers", "colmap", "angles")
+_NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
+
+
+def _by(
+    way: Literal["markers", "colmap", "angles"],
+    images: Images,
+    names: Sequence[str],
+    facts: SessionFacts,
+    config: FeatureConfig,
+    progress: bool,
+) -> TurntablePoses:
+    if way == "markers":
+        return estimate_turntable_poses(
+            images,
+            names,
+            dictionary=facts.marker_dictionary,
+            marker_side_m=facts.marker_side_m,
+            nominal_step_deg=facts.nominal_step_deg,
+            direction=facts.direction,
+            container_diameter_m=facts.container_diameter_m,
+            container_height_m=facts.container_height_m,
+            progress=progress,
+        )
+    if way == "colmap":
+        return poses_by_colmap(images, names, facts, config)
+    angles_deg = facts.angles_deg(len(names))
+    if angles_deg is None:
+        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    if facts.camera is None:
+        return poses_by_angles(images, names, angles_deg, facts, config)
+    height, width = images[0].shape
+    return poses_by_known_camera(
+        names,
+        (width, height),
+        angles_deg,
+        facts.camera,
+        nominal_step_deg=facts.nominal_step_deg,
+        direction=facts.direction,
+    )
