@@ -23,7 +23,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.losses import angular_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
-from hsi_sc_nerf.models.turntable_refinement import TurntableRefinement, TurntableRefinementConfig
+from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10
 
 ANGLE_PICTURE_MAX_RAD = 0.2
@@ -78,8 +78,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     """"torch" trains and loads everywhere, with or without a GPU."""
     eval_num_rays_per_chunk: int = 4096
     """Rays rendered at a time."""
-    camera_optimizer: TurntableRefinementConfig = field(default_factory=TurntableRefinementConfig)
-    """Refinement of the camera pose and the turntable's angles."""
+    camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
+    """Refinement of the measured poses."""
 
 
 class ChamberRenderer(RGBRenderer):
@@ -111,7 +111,7 @@ class SpectralModel(NerfactoModel):
 
     config: SpectralModelConfig
     field: SpectralField
-    camera_optimizer: TurntableRefinement
+    camera_optimizer: PoseRefinement
     renderer_rgb: ChamberRenderer
 
     def populate_modules(self) -> None:

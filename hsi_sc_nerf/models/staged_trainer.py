@@ -96,7 +96,7 @@ class StagedTrainer(Trainer):
             kept.mkdir(exist_ok=True)
             shutil.copy2(self._checkpoint_path(step - 1), kept)
         cast(SpectralDataManager, self.pipeline.datamanager).foreground_share = stage.config.foreground_share
-        cast(SpectralModel, self.pipeline.model).camera_optimizer.frozen = not stage.config.optimize_poses
+        cast(SpectralModel, self.pipeline.model).camera_optimizer.freeze(not stage.config.optimize_poses)
         self._stage = stage
 
     def _checkpoint_path(self, step: int) -> Path:

@@ -26,7 +26,8 @@ class StageConfig:
     foreground_share: float | None = None
     """Share of the rays that hit the foreground masks; the others keep empty space empty. None: whole frames."""
     optimize_poses: bool = True
-    """Refine the camera poses during this stage; otherwise what was learned so far is kept, frozen."""
+    """Refine the camera poses during this stage; otherwise what was learned so far is frozen, and kept unless the
+    refinement's mode says otherwise."""
     lr_start: float = 1.0
     """Factor on every learning rate at the start of the stage."""
     lr_end: float = 0.5
