@@ -19,7 +19,13 @@ from hsi_sc_nerf.poses.markers import marker_pattern
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
-_TEXELS = 8
+# A blur brings in what lies around the paper: the margin is narrower by so many standard deviations of it, down to a
+# least one.
+_BLUR_MARGIN = 1.5
+_LEAST_MARGIN_CELLS = 0.2
+# The pattern's edges are ramps one texel wide: half a pixel, where a cell has more than a few pixels.
+_TEXELS_A_PIXEL = 2.0
+_TEXELS_A_CELL = (8, 16, 32)
 _ITERATIONS = 12
 _CONVERGED_PX = 3e-3
 # A fit explains the pixels when what it leaves is below this share of their variance.
@@ -68,7 +74,7 @@ def fit_marker(
         None where the pattern does not explain the pixels or reaches outside the image.
     """
     cells = marker_pattern(dictionary, marker).shape[0]
-    window = _window(corners_px, cells, image.shape)
+    window = _window(corners_px, cells, blur_px, image.shape)
     if window is None:
         return None
     first, inside = window
@@ -79,12 +85,13 @@ def fit_marker(
     local = (np.stack([columns, rows], -1) + first + 0.5 - centre) / extent
     homography = _homography((corners_px - centre) / extent, cells)
     footprint = _Footprint.of(corners_px, cells, blur_px, first, inside.shape, centre, extent)
+    texture = _texture(dictionary, marker, _texels_a_cell(corners_px, cells))
     unit_corners = cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     corners = corners_px
     shading = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
     robust = np.ones(len(local))
     for _ in range(_ITERATIONS):
-        rendered, slope = (part[inside] for part in _render(footprint, homography, dictionary, marker))
+        rendered, slope = (part[inside] for part in _render(footprint, homography, texture))
         design = np.concatenate([shading, shading * rendered[:, None]], -1)
         root = np.sqrt(robust)[:, None]
         # Cholesky's factor of the 6 x 6 Gram matrix: as good as QR for these columns, and many times faster.
@@ -132,10 +139,12 @@ def quad_area(corners: Float[np.ndarray, "4 2"]) -> float:
     return 0.5 * abs(float(a[0] * b[1] - a[1] * b[0]))
 
 
-def _window(corners_px, cells, shape):
+def _window(corners_px, cells, blur_px, shape):
     """First pixel (x, y) of a box around the marker and which of its pixels the fit takes; None outside the image."""
     to_image = cv2.getPerspectiveTransform(_unit_square(cells), corners_px.astype(np.float32))
-    low, high = -_MARGIN_CELLS, cells + _MARGIN_CELLS
+    cell_px = np.sqrt(quad_area(corners_px)) / cells
+    margin = max(_LEAST_MARGIN_CELLS, _MARGIN_CELLS - _BLUR_MARGIN * blur_px / cell_px)
+    low, high = -margin, cells + margin
     outline = np.array([[[low, low], [high, low], [high, high], [low, high]]], np.float64)
     outline = cv2.perspectiveTransform(outline, to_image)[0]
     first, last = np.floor(outline.min(0)).astype(int), np.ceil(outline.max(0)).astype(int)
@@ -192,16 +201,21 @@ class _Footprint:
         return _Footprint(axes[0][0], axes[1][0], axes[0][1], axes[1][1])
 
 
+def _texels_a_cell(corners_px, cells):
+    wanted = _TEXELS_A_PIXEL * np.sqrt(quad_area(corners_px)) / cells
+    return min(_TEXELS_A_CELL, key=lambda texels: abs(np.log(texels / wanted)))
+
+
 @lru_cache(maxsize=64)
-def _texture(dictionary, marker):
+def _texture(dictionary, marker, texels):
     """The pattern with a white margin of three cells, and its slopes along u and v (a cell), as three channels."""
     pattern = np.pad(marker_pattern(dictionary, marker), 3, constant_values=1).astype(np.float32)
-    texture = np.kron(pattern, np.ones((_TEXELS, _TEXELS), np.float32))
-    slopes = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (_TEXELS / 2) for dx in (1, 0)]
-    return cv2.merge([texture, *slopes])
+    texture = np.kron(pattern, np.ones((texels, texels), np.float32))
+    slopes = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (texels / 2) for dx in (1, 0)]
+    return cv2.merge([texture, *slopes]), np.float32(texels)
 
 
-def _render(footprint, homography, dictionary, marker):
+def _render(footprint, homography, texture):
     """The pattern seen by each pixel of the window, in [0, 1], and its derivatives by the homography.
 
     Single precision is a millionth of a cell here.
@@ -212,11 +226,12 @@ def _render(footprint, homography, dictionary, marker):
     np.reciprocal(inverse_d, out=inverse_d)
     u *= inverse_d
     v *= inverse_d
-    to_texel = np.float32(3 * _TEXELS - 0.5)
+    picture, texels = texture
+    to_texel = 3 * texels - np.float32(0.5)
     seen = cv2.remap(
-        _texture(dictionary, marker),
-        u * np.float32(_TEXELS) + to_texel,
-        v * np.float32(_TEXELS) + to_texel,
+        picture,
+        u * texels + to_texel,
+        v * texels + to_texel,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
