@@ -44,7 +44,12 @@ def estimate_turntable_poses(
 
     Unknown and found: the focal length, the camera's pose, the axis, one angle a frame, where the markers sit, and
     the dictionary if it is not given. Radial lens distortion and small motions of a wobbling table are found where
-    the images call for them (``choose``). The principal point is the image's centre, and pixels are square.
+    the images call for them (``choose``). Pixels are square.
+
+    The principal point is taken to be the image's centre. One axis hardly tells it from the camera's direction: with
+    corners good to 0.03 px (24 frames of 512 x 512) it would be found to 0.1 px sideways and 0.8 px upright, and the
+    camera's direction then to 0.05 instead of 0.001 degrees, the focal length to 0.03 instead of 0.01 %. A centre that
+    is really 5 px off costs 0.3 degrees, which put the same points at the same pixels, 1 mm and 0.16 %.
 
     Args:
         images: one grey image a frame, all of one size, linear in reflectance (a gamma moves every edge).

@@ -13,13 +13,15 @@ from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 _ARROW_SHARE = 0.15
+_ABOVE_THE_BARS = 1.4
 
 
 def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
-    """Draw cameras and markers in space and from above, and the reprojection error by frame, into a picture file."""
+    """Draw cameras and markers in space and from above, and errors and steps by frame, into a picture file."""
     path = Path(path)
-    figure = Figure(figsize=(15, 5))
-    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.12, top=0.9, wspace=0.2)
+    figure = Figure(figsize=(16, 6))
+    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.1, top=0.86, wspace=0.2, hspace=0.35)
+    figure.suptitle(_summary(poses), fontsize=10)
     FigureCanvasAgg(figure)
     eyes = poses.camera_to_world[poses.used, :3, 3]
     arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_SHARE * np.linalg.norm(eyes[0])
@@ -45,14 +47,32 @@ def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
     top.set(xlabel="x (m)", ylabel="y (m)", title="From above")
     top.set_aspect("equal")
 
-    error = figure.add_subplot(1, 3, 3)
+    error = figure.add_subplot(2, 3, 3)
     index = np.arange(len(poses.names))
     error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color="tab:blue")
     left_out = index[~poses.used]
     error.plot(left_out, np.zeros(len(left_out)), "x", color="tab:red", label="left out", clip_on=False)
     error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
-    error.set(xlabel="frame", ylabel="reprojection error (px)", title=f"Overall {poses.overall_error_px:.3f} px")
-    error.legend()
+    # Far below the target, the frames are compared with each other.
+    error.set_ylim(0.0, _ABOVE_THE_BARS * float(np.nanmax(poses.reprojection_error_px)))
+    error.set(
+        ylabel="reprojection error (px)",
+        title=f"Overall {poses.overall_error_px:.3f} px (target {REPROJECTION_TARGET_PX:g} px)",
+    )
+    error.legend(loc="upper right", fontsize=8)
+
+    turn = figure.add_subplot(2, 3, 6, sharex=error)
+    used = index[poses.used]
+    steps = np.diff(poses.angles_deg[used])
+    turn.plot(used[1:], steps, ".", color="tab:blue", label="found")
+    if poses.nominal_step_deg is not None:
+        nominal = np.copysign(poses.nominal_step_deg, np.median(steps))
+        turn.axhline(nominal, color="black", linestyle="--", label="nominal")
+        # Steps that agree to a thousandth of a degree would fill the axis with noise.
+        turn.set_ylim(*(np.array([-1.0, 1.0]) * max(0.05, 1.2 * np.abs(steps - nominal).max()) + nominal))
+    turn.ticklabel_format(axis="y", useOffset=False)
+    turn.set(xlabel="frame", ylabel="step since the last (degrees)")
+    turn.legend(loc="upper right", fontsize=8)
 
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
@@ -60,3 +80,23 @@ def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _summary(poses: TurntablePoses) -> str:
+    """The figures that are not drawn, in two lines."""
+    report = poses.report()
+    parts = [
+        f"{poses.method}, {poses.model}",
+        f"{report['frames']['used']} of {report['frames']['total']} frames",
+        f"axis leans {report['axis_tilt_in_image_deg']:.2f}° in the image",
+        f"camera looks down {report['camera_looks_down_deg']:.2f}°",
+    ]
+    if report["loop_closure_deg"] is not None:
+        parts.append(f"loop closes to {report['loop_closure_deg']:.3f}°")
+    if poses.scale is not None:
+        parts.append(f"scale ± {100.0 * poses.scale.uncertainty:.3f} %")
+        if poses.scale.source == "markers" and poses.scale.disagreement_percent is not None:
+            parts.append(f"container {poses.scale.disagreement_percent:+.1f} %")
+    if poses.outliers:
+        parts.append(f"{len(poses.outliers)} markers thrown out")
+    return f"{', '.join(parts)}\n{len(report['warnings'])} warnings (see poses.json)"
