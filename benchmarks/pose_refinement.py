@@ -1,0 +1,282 @@
+"""What refining poses during training is worth, by mode, on a simulated session with known truth, as a table.
+
+    uv run python benchmarks/pose_refinement.py --output-dir /tmp/refinement --page README.md
+
+The same frames are trained on with the true poses, with the true poses disturbed by known errors, and with those that
+the markers gave. Held-out views keep the errors of their poses, as in a real session. What is left of the errors is
+told after the similarity that fits the training views best: no image shows where the object frame lies, or its scale.
+Rows that are already there are not run again.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.cli.demo import DEMO_TRAINING
+from hsi_sc_nerf.config import hsi_sc_nerf
+from hsi_sc_nerf.data.dataparser import scene_scaling
+from hsi_sc_nerf.data.packed import PackedDataset, open_packed, write_transforms
+from hsi_sc_nerf.data.process import process_session
+from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
+from hsi_sc_nerf.export.point_cloud import sample_surface_points
+from hsi_sc_nerf.models.staged_trainer import StagedTrainer, StagedTrainerConfig
+from hsi_sc_nerf.poses.geometry import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import Truth, load_truth
+
+TABLE_STARTS, TABLE_ENDS = "<!-- pose refinement -->", "<!-- end of pose refinement -->"
+COLUMNS = {
+    "poses": "{poses}",
+    "refinement": "{mode}",
+    "SAM, rad": "{sam:.4f}",
+    "RMSE": "{rmse:.4f}",
+    "SSIM": "{ssim:.3f}",
+    "PSNR, dB": "{psnr:.1f}",
+    "F-score at 2 mm, %": "{f_score:.1f}",
+    "training views, °": "{train_deg:.3f}",
+    "mm": "{train_mm:.2f}",
+    "held-out views, °": "{held_out_deg:.3f}",
+    "mm ": "{held_out_mm:.2f}",
+    "scale, %": "{scale_percent:+.2f}",
+    "train, s": "{seconds:.0f}",
+}
+Poses = Literal["true", "disturbed", "markers"]
+ROWS: tuple[tuple[Poses, str], ...] = (
+    ("true", "off"),
+    ("disturbed", "off"),
+    ("disturbed", "free-discarded"),
+    ("disturbed", "free"),
+    ("disturbed", "turntable"),
+    ("markers", "off"),
+    ("markers", "turntable"),
+)
+CLOUD_POINTS, REFERENCE_POINTS = 20_000, 50_000
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors to put into the true poses."""
+
+    camera_turn_deg: float = 0.3
+    """Turn of the camera about each of its three axes, the same in all frames."""
+    camera_shift_mm: float = 1.0
+    """Shift of the camera along each of its three axes, the same in all frames."""
+    angle_drift_deg: float = 0.3
+    """SD of the table's angle errors that come and go once a turn, as an eccentric drive makes them."""
+    angle_jitter_deg: float = 0.3
+    """SD of the angle errors of each frame by itself."""
+    focal_length_percent: float = 0.5
+    """Error of the focal length."""
+    seed: int = 0
+    """Seed of the angles."""
+
+    def disturb(self, camera_to_worlds: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+        """Poses with these errors."""
+        rng = np.random.default_rng(self.seed)
+        count = len(camera_to_worlds)
+        turn_once = np.sin(2 * np.pi * (np.arange(count) / count + rng.random()))
+        angles = np.sqrt(2.0) * self.angle_drift_deg * turn_once + rng.normal(0.0, self.angle_jitter_deg, count)
+        camera = np.eye(4)
+        camera[:3, :3] = Rotation.from_rotvec(np.full(3, self.camera_turn_deg), degrees=True).as_matrix()
+        camera[:3, 3] = self.camera_shift_mm / 1000
+        return np.stack(
+            [rotation_about_z(d) @ pose @ camera for d, pose in zip(angles, camera_to_worlds, strict=True)]
+        )
+
+
+@dataclass(frozen=True)
+class PoseRefinementBenchmark:
+    """Train with every mode of pose refinement and compare."""
+
+    output_dir: Path
+    """Folder for the session, the datasets and the runs."""
+    page: Path | None = None
+    """Markdown page whose table is replaced."""
+    errors: PoseErrors = PoseErrors()
+    """Errors of the disturbed poses."""
+    iterations: int = 500
+    """Training steps of each run, both stages together."""
+    scene: str = "pear"
+    """What stands on the turntable."""
+    frames: int = 36
+    """Frames of the session."""
+    size: int = 128
+    """Width and height of the images, pixels."""
+    bands: int = 48
+    """Spectral bands."""
+
+    def main(self) -> None:
+        """Train what is missing, print the table, write it into the page."""
+        datasets, truth = self._datasets()
+        shown, cells = Table(*COLUMNS), []
+        for poses, mode in ROWS:
+            path = self.output_dir / f"{poses}-{mode}.json"
+            if not path.exists():
+                row = {"poses": poses, "mode": mode, **self._row(datasets[poses], truth, mode)}
+                path.write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
+            row = json.loads(path.read_text(encoding="utf-8"))
+            cells.append([template.format(**row) for template in COLUMNS.values()])
+            shown.add_row(*cells[-1])
+        Console(width=160).print(shown)
+        if self.page is not None:
+            before, rest = self.page.read_text(encoding="utf-8").split(TABLE_STARTS)
+            lines = "\n".join(f"| {' | '.join(line)} |" for line in (COLUMNS, ["---"] * len(COLUMNS), *cells))
+            after = rest.split(TABLE_ENDS)[1]
+            self.page.write_text(f"{before}{TABLE_STARTS}\n{lines}\n{TABLE_ENDS}{after}", encoding="utf-8")
+
+    def _datasets(self) -> tuple[dict[Poses, Path], Truth]:
+        """The session's dataset with each kind of poses, and the truth; the pixels are linked, not copied."""
+        session, markers = self.output_dir / "session", self.output_dir / "markers"
+        scene = override(load_scene(self.scene), frames=self.frames, size_px=self.size, bands=self.bands)
+        if not session.exists():
+            simulate_session(scene, session)
+        process_session(session, markers)
+        truth = load_truth(session)
+        true_poses = np.stack(
+            [truth.camera_to_world[truth.captures.index(f.capture)] for f in open_packed(markers).frames]
+        )
+        focal = 1 + self.errors.focal_length_percent / 100
+        lens = truth.intrinsics
+        given: dict[Poses, tuple] = {
+            "true": (true_poses, lens),
+            "disturbed": (
+                self.errors.disturb(true_poses),
+                replace(lens, fl_x=focal * lens.fl_x, fl_y=focal * lens.fl_y),
+            ),
+        }
+        for name, (poses, intrinsics) in given.items():
+            folder = self.output_dir / name
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.copytree(markers, folder, copy_function=os.link)
+            dataset = open_packed(folder)
+            frames = tuple(replace(f, camera_to_world=p) for f, p in zip(dataset.frames, poses, strict=True))
+            write_transforms(replace(dataset, frames=frames, intrinsics=intrinsics))
+        return {
+            "true": self.output_dir / "true",
+            "disturbed": self.output_dir / "disturbed",
+            "markers": markers,
+        }, truth
+
+    def _row(self, data: Path, truth: Truth, mode: str) -> dict[str, float]:
+        trainer = self._trainer(data, mode)
+        started = time.perf_counter()
+        trainer.train()
+        seconds = time.perf_counter() - started
+        metrics = trainer.pipeline.get_average_eval_image_metrics()
+        trainer.pipeline.eval()
+        dataset = open_packed(data)
+        true_poses = np.stack([truth.camera_to_world[truth.captures.index(f.capture)] for f in dataset.frames])
+        refined = _refined_poses(trainer, dataset)
+        frames = np.arange(len(refined))
+        train = trainer.pipeline.datamanager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
+        held_out = np.setdiff1d(frames, train)
+        fit = Similarity.between(refined[train], true_poses[train])
+        aligned = fit.poses(refined)
+        degrees = np.array([rotation_angle_deg(a, b) for a, b in zip(aligned, true_poses, strict=True)])
+        mm = 1000 * np.linalg.norm(aligned[:, :3, 3] - true_poses[:, :3, 3], axis=1)
+        mesh = truth.mesh()
+        reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
+        return {
+            **{name: metrics[name] for name in ("sam", "rmse", "ssim", "psnr")},
+            "f_score": precision_recall_f_score(fit.points(_cloud_m(trainer)), reference).f_score,
+            "train_deg": float(degrees[train].mean()),
+            "train_mm": float(mm[train].mean()),
+            "held_out_deg": float(degrees[held_out].mean()),
+            "held_out_mm": float(mm[held_out].mean()),
+            "scale_percent": 100 * (1 / fit.scale - 1),
+            "seconds": seconds,
+        }
+
+    def _trainer(self, data: Path, mode: str) -> StagedTrainer:
+        words = [word for key, value in DEMO_TRAINING.items() for word in (f"--{key}", *value.split())]
+        config: StagedTrainerConfig = tyro.cli(
+            StagedTrainerConfig,
+            default=copy.deepcopy(hsi_sc_nerf.config),
+            args=[*words, "--max-num-iterations", str(self.iterations)],
+            config=(tyro.conf.FlagConversionOff,),
+        )
+        config.pipeline.datamanager.data = data
+        config.pipeline.model.camera_optimizer.mode = mode
+        config.experiment_name = "pose-refinement"
+        config.output_dir, config.timestamp = self.output_dir / "runs", f"{data.name}-{mode}"
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        return trainer
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Points x of one frame are ``scale * rotation @ x + shift`` in another."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    scale: float
+    shift: Float[np.ndarray, "3"]
+
+    @classmethod
+    def between(cls, poses: Float[np.ndarray, "n 4 4"], wanted: Float[np.ndarray, "n 4 4"]) -> Similarity:
+        """The one that brings poses closest to others: first their orientations, then their positions."""
+        left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", wanted[:, :3, :3], poses[:, :3, :3]))
+        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        turned, there = poses[:, :3, 3] @ rotation.T, wanted[:, :3, 3]
+        centred = turned - turned.mean(axis=0)
+        scale = float(np.sum(centred * there) / np.sum(centred**2))
+        return cls(rotation, scale, there.mean(axis=0) - scale * turned.mean(axis=0))
+
+    def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the one frame in the other."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+    def poses(self, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+        """Camera-to-world poses of the one frame in the other."""
+        moved = poses.copy()
+        moved[:, :3, :3] = self.rotation @ poses[:, :3, :3]
+        moved[:, :3, 3] = self.points(poses[:, :3, 3])
+        return moved
+
+
+@torch.no_grad()
+def _refined_poses(trainer: StagedTrainer, dataset: PackedDataset) -> Float[np.ndarray, "n 4 4"]:
+    """All poses of the session as the model sees them after training, metres."""
+    centre, scale = scene_scaling(dataset.scene_box_m)
+    poses = dataset.camera_to_worlds
+    poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
+    # Double precision, since micrometres and thousandths of a degree are asked for.
+    refinement = copy.deepcopy(trainer.pipeline.model.camera_optimizer).cpu().double()
+    refined = refinement.corrected(torch.arange(len(poses)), torch.from_numpy(poses)).numpy()
+    refined[:, :3, 3] = refined[:, :3, 3] / scale + centre
+    return refined
+
+
+def _cloud_m(trainer: StagedTrainer) -> Float[np.ndarray, "n 3"]:
+    """Points of the learned surface, metres."""
+    manager = trainer.pipeline.datamanager
+    scene = manager.train_dataparser_outputs
+    cloud = sample_surface_points(
+        trainer.pipeline.model,
+        manager.train_dataset.cameras,
+        manager.train_pixel_sampler.masks,
+        CLOUD_POINTS,
+        rays_per_batch=4096,
+        box=scene.metadata["object_box"],
+    )
+    return cloud.points / scene.dataparser_scale - scene.dataparser_transform[:, 3].numpy()
+
+
+if __name__ == "__main__":
+    tyro.cli(PoseRefinementBenchmark).main()
