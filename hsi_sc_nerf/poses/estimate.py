@@ -47,9 +47,9 @@ def estimate_turntable_poses(
     the images call for them (``choose``). Pixels are square.
 
     The principal point is taken to be the image's centre. One axis hardly tells it from the camera's direction: with
-    corners good to 0.03 px (24 frames of 512 x 512) it would be found to 0.1 px sideways and 0.8 px upright, and the
-    camera's direction then to 0.05 instead of 0.001 degrees, the focal length to 0.03 instead of 0.01 %. A centre that
-    is really 5 px off costs 0.3 degrees, which put the same points at the same pixels, 1 mm and 0.16 %.
+    corners good to 0.03 px (24 frames of 512 x 512) it would be found to 0.1 px sideways and 0.8 px upright, the
+    camera's direction then to 0.05 instead of 0.001 degrees, the focal length to 0.03 instead of 0.01 %. A centre
+    that is really 5 px off costs 0.3 degrees, by which the same points stay at the same pixels, 1 mm and 0.16 %.
 
     Args:
         images: one grey image a frame, all of one size, linear in reflectance (a gamma moves every edge).
@@ -102,7 +102,7 @@ def estimate_turntable_poses(
             direction=direction,
             container_diameter_m=container_diameter_m,
             container_height_m=container_height_m,
-            blur_px=observed.blur_px,
+            blur_px=float(np.median(observed.blur_px)),
             warnings=tuple(f"marker {m} stands still in the image and was left out" for m in still),
         ),
     )

@@ -24,6 +24,10 @@ _WORKERS = 2
 _BLURS_PX = (0.0, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0)
 _MARKERS_TO_TELL_THE_BLUR = 10
 _BLUR_TOLERANCE_PX = 0.02
+# A frame has a blur of its own if its patterns leave this many times the share of the variance that others leave, and
+# this share.
+_OUT_OF_FOCUS_MEDIANS = 2.0
+_LEAST_OUT_OF_FOCUS = 0.01
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
@@ -34,10 +38,10 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Observed:
-    """Markers of all frames; the blur that explains them best; and those where no pattern could be fitted."""
+    """Markers of all frames, the blur that explains each frame best, and markers whose pattern was not fitted."""
 
     observations: Observations
-    blur_px: float
+    blur_px: Float[np.ndarray, "frames"]
     unexplained: tuple[Rejected, ...]
 
 
@@ -50,13 +54,16 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
             len(images),
             progress,
         )
-        blur_px = find_blur(images, dictionary, detections)
+        blur_px = np.full(len(images), find_blur(images, dictionary, detections))
 
-        def refine(found: Detections, image: UInt8[np.ndarray, "h w"]) -> list[tuple[int, FittedMarker | None]]:
-            floats = image.astype(float)
-            return [(m, fit_marker(floats, dictionary, m, corners, blur_px)) for m, corners in sorted(found.items())]
+        def refine(i: int) -> list[tuple[int, FittedMarker | None]]:
+            image, found = images[i].astype(float), sorted(detections[i].items())
+            return [(m, fit_marker(image, dictionary, m, corners, blur_px[i])) for m, corners in found]
 
-        fitted = _all(pool.map(refine, detections, images), "Refining corners", len(images), progress)
+        fitted = _all(pool.map(refine, range(len(images))), "Refining corners", len(images), progress)
+    for i in _out_of_focus(fitted):
+        blur_px[i] = find_blur(images[i : i + 1], dictionary, detections[i : i + 1])
+        fitted[i] = refine(i)
     rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
     why = "its pattern does not explain the pixels: hidden, blurred or misread"
     unexplained = tuple(
@@ -65,8 +72,21 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
     return Observed(_observations(rows), blur_px, unexplained)
 
 
+def _out_of_focus(fitted: Sequence[Sequence[tuple[int, FittedMarker | None]]]) -> list[int]:
+    """Frames whose patterns explain their pixels far worse than the other frames' do."""
+    left = [[1.0 if fit is None else fit.unexplained for _, fit in found] for found in fitted]
+    of_frame = np.array([np.median(shares) if shares else np.nan for shares in left])
+    if np.isnan(of_frame).all():
+        return []
+    limit = max(_OUT_OF_FOCUS_MEDIANS * float(np.nanmedian(of_frame)), _LEAST_OUT_OF_FOCUS)
+    return np.flatnonzero(of_frame > limit).tolist()
+
+
 def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detections: Sequence[Detections]) -> float:
-    """Standard deviation of the blur, in pixels, with which the largest markers' patterns fit their pixels best."""
+    """Standard deviation of the blur, in pixels, with which the largest markers' patterns fit their pixels best.
+
+    Of the markers the median counts: a few may be hidden, or in frames that are blurred otherwise.
+    """
     seen = [(i, m, c) for i, found in enumerate(detections) for m, c in sorted(found.items())]
     seen.sort(key=lambda s: -quad_area(s[2]))
     # Spread over the larger half: neighbours in size are often the same marker in neighbouring frames.
@@ -81,7 +101,7 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
 
     def left(blur_px: float) -> float:
         with ThreadPoolExecutor(_WORKERS) as pool:
-            return float(np.mean(list(pool.map(lambda s: unexplained(blur_px, *s), seen))))
+            return float(np.median(list(pool.map(lambda s: unexplained(blur_px, *s), seen))))
 
     tried = [left(_BLURS_PX[0])]
     while len(tried) < len(_BLURS_PX) and (len(tried) < 3 or tried[-1] <= tried[-2]):
@@ -100,7 +120,7 @@ def observe_expected(
     seen: Observations,
     centre_px: tuple[float, float],
     side_m: float,
-    blur_px: float,
+    blur_px: Float[np.ndarray, "frames"],
 ) -> Observations:
     """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones."""
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
@@ -113,7 +133,7 @@ def observe_expected(
 
     def look(i: int, marker: int, start: Float[np.ndarray, "4 2"]) -> FittedMarker | None:
         image = images[i].astype(float)
-        return fit_marker(image, dictionary, marker, start, blur_px, largest_shift_px=_FARTHEST_FROM_EXPECTED_PX)
+        return fit_marker(image, dictionary, marker, start, blur_px[i], largest_shift_px=_FARTHEST_FROM_EXPECTED_PX)
 
     pairs = frame.tolist(), marker.tolist()
     with ThreadPoolExecutor(_WORKERS) as pool:
