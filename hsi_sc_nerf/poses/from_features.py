@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.late_frames import with_late_frames
 from hsi_sc_nerf.poses.markers import find_dictionary
@@ -24,6 +25,8 @@ from hsi_sc_nerf.poses.visible_markers import marker_corners, on_disc, side_leng
 
 LARGEST_SPLIT_HALF_DEG = 0.3
 """Halves of the points that differ by more than this deserve a warning: the target of poses without markers."""
+MOST_CONTRADICTING = 1 / 3
+"""Of COLMAP's poses; where more contradict one machine, it is not known which are right."""
 LOWEST_POINTS_PERCENTILE = 1.0
 """Without a marker on the disc the origin is at the height of the lowest points of what turns."""
 
@@ -60,6 +63,11 @@ def poses_by_colmap(images: Images, names: Sequence[str], known: Known, config: 
     """
     free = structure_from_motion(images, names, config.motion)
     fit = turntable_from_poses(free.world_to_camera)
+    if fit.contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
+        raise InputError(
+            f"{int(fit.contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
+            "turntable; take images of more pixels, show markers, or give the angles"
+        )
     start = fit.tracked(free.places, free.focal_px, free.centre_px)
     adjusted = adjust_tracks(start, free.tracks, config.adjustment)
     # Frames that COLMAP lost, or got wrong, come back by one angle each.

@@ -53,12 +53,13 @@ def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
     left_out = index[~poses.used]
     error.plot(left_out, np.zeros(len(left_out)), "x", color="tab:red", label="left out", clip_on=False)
     error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
-    # Far below the target, the frames are compared with each other.
-    error.set_ylim(0.0, _ABOVE_THE_BARS * float(np.nanmax(poses.reprojection_error_px)))
-    error.set(
-        ylabel="reprojection error (px)",
-        title=f"Overall {poses.overall_error_px:.3f} px (target {REPROJECTION_TARGET_PX:g} px)",
-    )
+    if np.isfinite(poses.overall_error_px):
+        # Far below the target, the frames are compared with each other.
+        error.set_ylim(0.0, _ABOVE_THE_BARS * float(np.nanmax(poses.reprojection_error_px)))
+        title = f"Overall {poses.overall_error_px:.3f} px (target {REPROJECTION_TARGET_PX:g} px)"
+    else:
+        title = "Poses as given: nothing was measured"
+    error.set(ylabel="reprojection error (px)", title=title)
     error.legend(loc="upper right", fontsize=8)
 
     turn = figure.add_subplot(2, 3, 6, sharex=error)

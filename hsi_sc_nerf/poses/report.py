@@ -55,7 +55,7 @@ def pose_report(poses: TurntablePoses) -> dict:
         "distortion": list(poses.distortion),
         "blur_px": poses.blur_px,
         "reprojection_error_px": {
-            "overall": poses.overall_error_px,
+            "overall": _number(poses.overall_error_px),
             "target": REPROJECTION_TARGET_PX,
             "above_target": poses.overall_error_px > REPROJECTION_TARGET_PX,
             "frames": {n: _number(e) for n, e in zip(poses.names, poses.reprojection_error_px, strict=True)},

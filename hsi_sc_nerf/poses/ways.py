@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
@@ -58,6 +59,14 @@ def find_poses(
     Raises:
         InputError: the way, or every way, fails; says why.
     """
+    # Its many small systems of equations are solved side by side: BLAS's own threads would only get in their way.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _find(images, names, facts, way, config, progress)
+
+
+def _find(
+    images: Images, names: Sequence[str], facts: SessionFacts, way: PoseWay, config: FeatureConfig, progress: bool
+) -> TurntablePoses:
     if way != "auto":
         poses = _by(way, images, names, facts, config, progress)
         return replace(poses, chosen=f"by {_NAMES[way]}, as the settings say")
