@@ -33,7 +33,7 @@ hsi_sc_nerf = MethodSpecification(
         steps_per_eval_image=5000,
         steps_per_eval_all_images=20_000,
         pipeline=SpectralPipelineConfig(datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()),
-        optimizers={"fields": _adam(1e-2), "proposal_networks": _adam(1e-2), "camera_opt": _adam(1e-4)},
+        optimizers={"fields": _adam(1e-2), "proposal_networks": _adam(1e-2), "camera_opt": _adam(3e-4)},
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         # The progress bar of the stages takes the place of nerfstudio's table of lines.
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),

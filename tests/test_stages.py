@@ -54,3 +54,12 @@ def test_learning_rate_falls_exponentially_within_the_stage():
 def test_warm_up_rises_from_nearly_nothing():
     stage = Stage(StageConfig("a", 1.0, lr_end=1.0, warmup_iterations=4), start=0, end=100)
     assert [stage.lr_factor(step) for step in (0, 1, 4, 50)] == pytest.approx([0.2, 0.4, 1.0, 1.0])
+
+
+def test_poses_move_once_the_scene_has_a_shape():
+    first = Stage(StageConfig("a", 1.0, poses_after=0.25), start=10, end=30)
+    assert [step for step in range(10, 30) if first.refines_poses(step)] == list(range(15, 30))
+    at_once = Stage(StageConfig("a", 1.0, poses_after=0.0), start=10, end=12)
+    assert [at_once.refines_poses(step) for step in (10, 11)] == [True, True]
+    never = Stage(StageConfig("b", 1.0, optimize_poses=False), start=30, end=50)
+    assert not any(never.refines_poses(step) for step in range(30, 50))

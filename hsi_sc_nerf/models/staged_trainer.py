@@ -74,6 +74,7 @@ class StagedTrainer(Trainer):
         stage = self.plan.at(step)
         if stage is not self._stage:
             self._enter(stage, step)
+        cast(SpectralModel, self.pipeline.model).camera_optimizer.freeze(not stage.refines_poses(step))
         factor = stage.lr_factor(step)
         for name, optimizer in self.optimizers.optimizers.items():
             for group in optimizer.param_groups:
@@ -96,7 +97,6 @@ class StagedTrainer(Trainer):
             kept.mkdir(exist_ok=True)
             shutil.copy2(self._checkpoint_path(step - 1), kept)
         cast(SpectralDataManager, self.pipeline.datamanager).foreground_share = stage.config.foreground_share
-        cast(SpectralModel, self.pipeline.model).camera_optimizer.freeze(not stage.config.optimize_poses)
         self._stage = stage
 
     def _checkpoint_path(self, step: int) -> Path:

@@ -28,6 +28,8 @@ class StageConfig:
     optimize_poses: bool = True
     """Refine the camera poses during this stage; otherwise what was learned so far is frozen, and kept unless the
     refinement's mode says otherwise."""
+    poses_after: float = 0.3
+    """Share of the stage's steps that pass before the poses move: fog tells nothing of where the camera is."""
     lr_start: float = 1.0
     """Factor on every learning rate at the start of the stage."""
     lr_end: float = 0.5
@@ -60,6 +62,11 @@ class Stage:
     config: StageConfig
     start: int
     end: int
+
+    def refines_poses(self, step: int) -> bool:
+        """Whether the poses may move at ``step``."""
+        waiting = int(self.config.poses_after * (self.end - self.start))
+        return self.config.optimize_poses and step >= self.start + waiting
 
     def lr_factor(self, step: int) -> float:
         """Factor on the learning rates at ``step``: exponential from ``lr_start`` to ``lr_end``, after a warm-up."""
