@@ -16,7 +16,7 @@ from hsi_sc_nerf.simulate.truth import load_truth
 
 pytestmark = pytest.mark.slow
 
-ITERATIONS = 400
+ITERATIONS = 500
 
 
 def command(*words):
