@@ -216,6 +216,7 @@ class PoseRefinementBenchmark:
         config.pipeline.model.camera_optimizer.mode = mode
         config.experiment_name = "pose-refinement"
         config.output_dir, config.timestamp = self.output_dir / "runs", f"{data.name}-{mode}"
+        torch.manual_seed(config.machine.seed)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer
