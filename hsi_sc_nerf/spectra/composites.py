@@ -1,0 +1,58 @@
+"""Named false-colour composites: three bands that make visible what the eye does not see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.spectra.bands import Spectra, require_bands
+
+
+@dataclass(frozen=True)
+class Composite:
+    """Three bands shown as red, green and blue."""
+
+    name: str
+    wavelengths_nm: tuple[float, float, float]
+    """Shown as red, green, blue."""
+    shows: str
+    """What it is good for."""
+
+
+COMPOSITES = {
+    composite.name: composite
+    for composite in (
+        Composite("pseudo-RGB", paper.PSEUDO_RGB_NM, "the paper's picture for the eye"),
+        # Paper, section "Example Applications" and its figures.
+        Composite("apple", (801.0, 708.0, 551.0), "bruises"),
+        Composite("maize", (850.0, 580.0, 490.0), "dryness and starch, carotenoids, pigments of kernels"),
+        Composite("pear", (980.0, 710.0, 550.0), "water status, maturity, peel colour"),
+        # The classical colour-infrared film: near infrared, red, green.
+        Composite("CIR", (800.0, 670.0, 550.0), "living green tissue, which appears red"),
+    )
+}
+"""By name."""
+
+
+def composite(
+    spectra: Float[Spectra, "*shape bands"],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    rgb_nm: Sequence[float],
+    name: str = "the composite",
+) -> Float[Spectra, "*shape 3"]:
+    """Reflectance at the bands nearest to three wavelengths, linear and not clipped.
+
+    Args:
+        spectra: reflectance, bands last.
+        wavelengths_nm: centres of the bands.
+        rgb_nm: what to show as red, green and blue.
+        name: of the composite, for the error's text.
+
+    Raises:
+        InputError: a wavelength has no band near it.
+    """
+    return spectra[..., require_bands(wavelengths_nm, rgb_nm, name).tolist()]

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+import torch
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.spectra.bands import covered, require_bands
+from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
+from hsi_sc_nerf.spectra.indices import INDICES, index_values
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+WAVELENGTHS_NM = np.linspace(397.32, 1003.58, 204)
+
+
+def a_line(shape=(5, 4)):
+    """Reflectance that grows linearly with the wavelength, a slope for each pixel: R = slope * nm."""
+    slopes = np.linspace(1e-4, 9e-4, int(np.prod(shape))).reshape(shape)
+    return slopes, slopes[..., None] * WAVELENGTHS_NM
+
+
+def nearest(target):
+    return WAVELENGTHS_NM[np.argmin([abs(centre - target) for centre in WAVELENGTHS_NM])]
+
+
+@pytest.mark.parametrize("device", ["numpy", *DEVICES])
+@pytest.mark.parametrize(
+    ("name", "bands", "of_a_line"),
+    [
+        ("NDVI", (800, 670), lambda a, b: (a - b) / (a + b)),
+        ("red-edge NDVI", (750, 705), lambda a, b: (a - b) / (a + b)),
+        ("water index", (900, 970), lambda a, b: a / b),
+    ],
+)
+def test_indices_of_a_line_do_not_depend_on_its_slope(device, name, bands, of_a_line):
+    _, spectra = a_line()
+    given = spectra if device == "numpy" else torch.from_numpy(spectra).to(device)
+    values = index_values(INDICES[name], given, WAVELENGTHS_NM)
+    assert type(values) is type(given)
+    expected = of_a_line(*(nearest(band) for band in bands))
+    np.testing.assert_allclose(values if device == "numpy" else values.cpu(), np.full((5, 4), expected), rtol=1e-12)
+    assert INDICES[name].wavelengths_nm == bands
+    assert all(f"R{band}" in INDICES[name].expression for band in bands)
+
+
+@pytest.mark.parametrize("name", INDICES)
+def test_a_black_spectrum_has_no_index(name):
+    spectra = np.zeros((2, 204))
+    spectra[1] = 0.3
+    for values in (
+        index_values(INDICES[name], spectra, WAVELENGTHS_NM),
+        index_values(INDICES[name], torch.from_numpy(spectra), WAVELENGTHS_NM).numpy(),
+    ):
+        assert np.isnan(values[0])
+        assert values[1] == (1.0 if name == "water index" else 0.0)
+
+
+@pytest.mark.parametrize("device", ["numpy", *DEVICES])
+@pytest.mark.parametrize(
+    ("name", "rgb_nm"),
+    [
+        ("pseudo-RGB", (598, 548, 449)),
+        ("apple", (801, 708, 551)),
+        ("maize", (850, 580, 490)),
+        ("pear", (980, 710, 550)),
+        ("CIR", (800, 670, 550)),
+    ],
+)
+def test_composites_show_their_wavelengths(device, name, rgb_nm):
+    slopes, spectra = a_line()
+    given = spectra if device == "numpy" else torch.from_numpy(spectra).to(device)
+    image = composite(given, WAVELENGTHS_NM, COMPOSITES[name].wavelengths_nm)
+    image = image if device == "numpy" else image.cpu().numpy()
+    np.testing.assert_allclose(image, slopes[..., None] * [nearest(nm) for nm in rgb_nm])
+    np.testing.assert_allclose(image / slopes[..., None], np.broadcast_to(rgb_nm, (5, 4, 3)), atol=1.6)
+
+
+def test_wavelengths_without_a_band_near_them_are_refused():
+    visible = np.arange(400.0, 701.0, 5.0)
+    assert covered(visible, (400.0, 551.0, 705.0, 710.0, 710.5)).tolist() == [True, True, True, True, False]
+    with pytest.raises(InputError, match="NDVI needs a band near 800 nm, and the 61 bands given, 400 to 700 nm"):
+        index_values(INDICES["NDVI"], np.ones((1, 61)), visible)
+    with pytest.raises(InputError, match="near 980, 850 nm"):
+        require_bands(visible, (980.0, 850.0, 550.0), "a picture")
+
+
+def test_a_gap_is_no_band_but_coarse_bands_are():
+    with_gap = np.concatenate([np.arange(400.0, 880.0, 3.0), np.arange(990.0, 1003.0, 3.0)])
+    assert covered(with_gap, (900.0, 970.0, 995.0)).tolist() == [False, False, True]
+    coarse = np.linspace(397.32, 1003.58, 12)
+    assert covered(coarse, tuple(np.arange(371.0, 1030.0))).all()
+    assert not covered(coarse, (365.0, 1035.0)).any()
