@@ -15,9 +15,10 @@ from hsi_sc_nerf.poses.adjust import reproject, whitening
 from hsi_sc_nerf.poses.choose import LOSS_SIGMAS, choose
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
 from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m
-from hsi_sc_nerf.poses.geometry import rotation_angle_deg
+from hsi_sc_nerf.poses.geometry import rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.initialise import Observations, Turntable
-from hsi_sc_nerf.poses.outliers import adjust_without_outliers, usable, well_known
+from hsi_sc_nerf.poses.knocked import frame_motions
+from hsi_sc_nerf.poses.outliers import KNOCKED, adjust_without_outliers, usable, well_known
 from hsi_sc_nerf.poses.picture import draw_poses
 from hsi_sc_nerf.poses.scale import apparent_sides, container_diameter, length_sigma, resized
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -157,14 +158,89 @@ def test_displaced_markers_are_thrown_out():
     assert adjusted.turntable.focal_px == pytest.approx(machine.focal_px, rel=2e-3)
 
 
-def test_a_bumped_camera_shows_as_one_frame_that_moved():
+def knocked(machine, frames, tilt_deg, shift_m, seed=0):
+    """The machine with some frames tilted and shifted."""
+    rng = np.random.default_rng(seed)
+    n = len(machine.frames)
+    tilts = np.zeros((n, 2)) if machine.tilts_rad is None else machine.tilts_rad.copy()
+    shifts = np.zeros((n, 3)) if machine.shifts_m is None else machine.shifts_m.copy()
+    for moved, size in ((tilts, np.deg2rad(tilt_deg)), (shifts, shift_m)):
+        directions = rng.normal(size=(len(frames), moved.shape[1]))
+        moved[list(frames)] += size * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return replace(machine, tilts_rad=tilts, shifts_m=shifts)
+
+
+@pytest.mark.parametrize(
+    ("frames", "which", "tilt_deg", "shift_m"),
+    [(14, [6], 0.2, 0.0002), (14, [0], 8.0, 0.015), (30, [4, 5, 19], 0.3, 0.0003), (30, [0, 11, 29], 2.0, 0.003)],
+)
+def test_a_few_knocked_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
+    machine = true_machine(MarkerScene(size_px=256, frames=frames))
+    observations = observed(knocked(machine, which, tilt_deg, shift_m))
+    adjusted, kept, rejected = adjust_without_outliers(machine, observations, CENTRE_PX, SIDE_M)
+    assert adjusted.turntable.tilts_rad is None
+    assert sorted(adjusted.knocked) == which
+    assert sorted({r.frame for r in rejected}) == which
+    assert all(r.why == KNOCKED and r.error_px > 3.0 * NOISE_PX for r in rejected)
+    np.testing.assert_array_equal(np.unique(kept.frame), adjusted.turntable.frames)
+    assert len(kept) + len(rejected) == len(observations)
+    rotation, position = relative_errors(
+        camera_to_world(adjusted.turntable, -0.1), camera_to_world(machine.restricted(kept), -0.1)
+    )
+    assert rotation < 0.05
+    assert position < 0.4
+
+
+@pytest.mark.parametrize("which", [[], [5]])
+def test_a_table_that_wobbles_is_not_taken_for_knocked_frames(which):
+    machine = knocked(wobbling(0.1, frames=24), which, 2.0, 0.003)
+    adjusted, _, rejected = adjust_without_outliers(machine, observed(machine), CENTRE_PX, SIDE_M)
+    assert adjusted.turntable.tilts_rad is not None
+    assert adjusted.knocked == {}
+    assert rejected == []
+
+
+def test_more_knocks_than_a_few_are_a_wobble():
+    machine = knocked(true_machine(MarkerScene(size_px=256, frames=20)), range(1, 20, 5), 1.0, 0.001)
+    assert solved(machine, observed(machine)).turntable.tilts_rad is not None
+
+
+def test_one_displaced_marker_is_no_knocked_frame():
     machine = true_machine(MarkerScene(size_px=256, frames=14))
     observations = observed(machine)
-    corners = observations.corners_px + np.where(observations.frame == 6, 4.0, 0.0)[:, None, None]
-    adjusted, _, _ = adjust_without_outliers(machine, replace(observations, corners_px=corners), CENTRE_PX, SIDE_M)
-    motion = np.abs(adjusted.problem.motions(adjusted.turntable)).max(axis=1)
-    assert motion.argmax() == 6
-    assert np.delete(motion, 6).max() < motion[6] / 5
+    corners = observations.corners_px + np.where(np.arange(len(observations)) == 33, 2.0, 0.0)[:, None, None]
+    weights = whitening(observations.covariance_px2)
+    found = frame_motions(machine, replace(observations, corners_px=corners), CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
+    assert found.chance.min() > 1e-4
+    moved = np.where(observations.frame == 3, 0.5, 0.0)[:, None, None] * [1.0, -1.0]
+    bumped = replace(observations, corners_px=corners + moved)
+    found = frame_motions(machine, bumped, CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
+    assert np.flatnonzero(found.chance < 1e-6).tolist() == [3]
+    assert 0.2 < found.away_px[3] < 0.75
+
+
+@pytest.mark.parametrize(("frames", "which"), [(12, (4,)), (30, (0, 13, 22))])
+def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames, which):
+    scene = MarkerScene(size_px=160, frames=frames, knocked=which)
+    names = scene.names()
+    poses = estimate_turntable_poses(scene.render(), names, marker_side_m=SIDE_M, progress=False)
+    assert poses.model == "turntable"
+    assert set(poses.dropped) == {names[i] for i in which}
+    assert all(KNOCKED in why for why in poses.dropped.values())
+    truth = rotation_about_z(scene.angles_deg[poses.used][0]) @ scene.camera_to_world[poses.used]
+    rotation, position = relative_errors(poses.camera_to_world[poses.used], truth)
+    assert rotation < 0.1
+    assert position < 1.5
+    (warning,) = [w for w in poses.report()["warnings"] if "left out" in w]
+    assert warning.startswith(f"{len(which)} of {frames} frames are left out: {', '.join(names[i] for i in which)} (")
+
+
+def test_a_session_on_a_wobbling_table_keeps_its_frames():
+    scene = MarkerScene(size_px=160, frames=16, wobble_deg=0.5)
+    poses = estimate_turntable_poses(scene.render(), scene.names(), marker_side_m=SIDE_M, progress=False)
+    assert poses.model == "free poses"
+    assert poses.used.all()
+    assert poses.wobble_deg == pytest.approx(0.5, abs=0.1)
 
 
 def test_markers_that_cannot_count_are_named_with_the_reason():

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, rotation_about_z
 
 CELLS = 7  # a 5 x 5 marker with its black border
 TEXELS = 16  # texels a cell
@@ -33,6 +34,8 @@ class MarkerScene:
     side_markers: int = 6
     disc_markers: int = 8
     turn_deg: float = 360.0
+    knocked: tuple[int, ...] = ()
+    wobble_deg: float = 0.0
     seed: int = 0
     dictionary: int = cv2.aruco.DICT_5X5_50
 
@@ -50,9 +53,14 @@ class MarkerScene:
         target = np.array([0.0, 0.0, self.target_height_m])
         eye = target + self.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)])
         self.first_camera_to_world = look_at(eye, target)
-        self.camera_to_world = np.stack(
-            [turntable_camera_to_world(self.first_camera_to_world, a) for a in self.angles_deg]
-        )
+        self.camera_to_world = np.zeros((len(self.angles_deg), 4, 4))
+        for i in range(len(self.angles_deg)):
+            phase = np.deg2rad(2.0 * self.angles_deg[i])
+            lean_deg = self.wobble_deg * np.array([np.cos(phase), np.sin(phase)])
+            shift_m = np.zeros(3)
+            if i in self.knocked:
+                lean_deg, shift_m = lean_deg + np.array([0.8, -0.5]), np.array([0.0005, 0.0015, -0.0005])
+            self.camera_to_world[i] = self._moved(i, lean_deg, shift_m)
         self.corners_m = {}
         half = self.marker_side_m / 2
         for k in range(self.side_markers):
@@ -66,6 +74,13 @@ class MarkerScene:
             right, up = np.array([-out[1], out[0], 0.0]), -out
             self.corners_m[self.side_markers + k] = 0.072 * out + _square(right, up, half)
         self.blanked = {keep.index(i) for i in self.blank}
+
+    def _moved(self, frame, lean_deg, shift_m):
+        """The frame's pose if the table leans about the disc's middle, and shifts, in the room."""
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.from_rotvec(np.deg2rad([*lean_deg, 0.0])).as_matrix()
+        motion[:3, 3] = shift_m
+        return rotation_about_z(-self.angles_deg[frame]) @ np.linalg.inv(motion) @ self.first_camera_to_world
 
     def render(self) -> list[np.ndarray]:
         rng = np.random.default_rng(self.seed + 1)

@@ -152,5 +152,5 @@ def _dropped(names, used, rejected):
     dropped = {}
     for f in np.flatnonzero(~used).tolist():
         why = reasons.get(f)
-        dropped[names[f]] = f"of its markers: {why.most_common(1)[0][0]}" if why else "no marker was found"
+        dropped[names[f]] = f"its markers do not count: {why.most_common(1)[0][0]}" if why else "no marker was found"
     return dropped

@@ -47,7 +47,7 @@ def estimate_turntable_poses(
 
     Unknown and found: the focal length, the camera's pose, the axis, one angle a frame, where the markers sit, and
     the dictionary if it is not given. Radial lens distortion and small motions of a wobbling table are found where
-    the images call for them (``choose``). Pixels are square.
+    the images call for them (``choose``). A few frames that were knocked are left out. Pixels are square.
 
     The principal point is taken to be the image's centre. One axis hardly tells it from the camera's direction: with
     corners good to 0.03 px (24 frames of 512 x 512) it would be found to 0.1 px sideways and 0.8 px upright, the
@@ -87,7 +87,10 @@ def estimate_turntable_poses(
             f"markers with others, {FEWEST_FRAMES} are needed; take smaller steps or show more markers"
         )
     start = first_adjustment(initialise(linked, centre_px, width, side_m), linked, centre_px, side_m)
-    start = adjust_without_outliers(start, linked, centre_px, side_m)[0].turntable
+    first, _, thrown_out = adjust_without_outliers(start, linked, centre_px, side_m)
+    start = first.turntable
+    rejected += [r for r in thrown_out if r.frame not in start.frames]
+    linked = linked.select(np.isin(linked.frame, start.frames))
     linked = observe_expected(images, dictionary, start, linked, centre_px, side_m, observed.blur_px)
     adjusted, kept, thrown_out = adjust_without_outliers(start, linked, centre_px, side_m)
     adjusted, kept, uncertain = well_known(adjusted, kept, centre_px, side_m)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,6 +14,7 @@ from hsi_sc_nerf.poses.choose import Adjusted, choose
 from hsi_sc_nerf.poses.initialise import Observations, Rejected, Turntable, linked_rows
 
 FEWEST_FRAMES = 3
+KNOCKED = "object, table or camera was knocked in this frame"
 # An observation is thrown out if its error is above this many pixels, this many times the median error, and this many
 # times what the covariance of its corners explains.
 _OUTLIER_PX = 0.2
@@ -62,17 +64,21 @@ def adjust_without_outliers(
 ) -> tuple[Adjusted, Observations, list[Rejected]]:
     """Choose a model and adjust it, throw out what does not fit, adjust again, until nothing changes.
 
-    What was thrown out comes back where a better model explains it.
+    What was thrown out comes back where a better model explains it; a frame that was knocked does not. Frames and
+    markers that the start lacks are thrown out.
 
     Raises:
         InputError: too few frames are left.
     """
-    good = np.ones(len(observations), bool)
-    turntable, errors = start, np.zeros(len(observations))
+    # A frame or a marker that the start lost has no place to begin at.
+    good = np.isin(observations.frame, start.frames) & np.isin(observations.marker, start.markers)
+    turntable, errors = start, np.full(len(observations), np.nan)
+    knocked: dict[int, float] = {}
     for _ in range(_ROUNDS):
-        kept = observations.select(good)
-        best = choose(start.restricted(kept), kept, centre_px, side_m, whitening(kept.covariance_px2))
+        best, kept = _chosen(turntable, observations.select(good), centre_px, side_m)
         turntable = best.turntable
+        knocked |= best.knocked
+        good &= ~np.isin(observations.frame, list(knocked))
         known = np.isin(observations.frame, kept.frame) & np.isin(observations.marker, kept.marker)
         errors = np.full(len(observations), np.nan)
         fits = np.zeros(len(observations), bool)
@@ -86,14 +92,17 @@ def adjust_without_outliers(
         if (fits == good).all():
             break
         good = fits
-    kept = observations.select(good)
-    best = choose(turntable.restricted(kept), kept, centre_px, side_m, whitening(kept.covariance_px2))
-    left = observations.select(~good)
+    else:
+        best, kept = _chosen(turntable, observations.select(good), centre_px, side_m)
+        knocked |= best.knocked
+        good &= ~np.isin(observations.frame, list(knocked))
+    bumped = np.isin(observations.frame, list(knocked))
+    left = ~good & ~bumped
     rejected = [
         Rejected(r.frame, r.marker, float(e) if np.isfinite(e) else None, r.why)
-        for r, e in zip(_rejected(left, "it does not fit the others"), errors[~good], strict=True)
+        for r, e in zip(_rejected(observations.select(left), "it does not fit the others"), errors[left], strict=True)
     ]
-    return best, kept, rejected
+    return best, kept, rejected + _knocked(observations.select(bumped), knocked)
 
 
 def well_known(
@@ -116,9 +125,23 @@ def well_known(
             "them, larger or sharper"
         )
     kept = observations.select(keep)
-    better = choose(adjusted.turntable.restricted(kept), kept, centre_px, side_m, whitening(kept.covariance_px2))
-    why = f"it tells the angle worse than to {_LARGEST_ANGLE_SIGMA_DEG} degrees"
-    return better, kept, _rejected(observations.select(~keep), why)
+    better, certain = _chosen(adjusted.turntable, kept, centre_px, side_m)
+    rejected = _rejected(
+        observations.select(~keep), f"it tells the angle worse than to {_LARGEST_ANGLE_SIGMA_DEG} degrees"
+    )
+    bumped = np.isin(kept.frame, list(better.knocked))
+    return better, certain, rejected + _knocked(kept.select(bumped), better.knocked)
+
+
+def _chosen(start, observations, centre_px, side_m) -> tuple[Adjusted, Observations]:
+    """The machine that the observations call for, and those that it rests on."""
+    weights = whitening(observations.covariance_px2)
+    best = choose(start.restricted(observations), observations, centre_px, side_m, weights)
+    return best, observations.select(~np.isin(observations.frame, list(best.knocked)))
+
+
+def _knocked(observations, away_px: dict[int, float]) -> list[Rejected]:
+    return [replace(r, error_px=away_px[r.frame]) for r in _rejected(observations, KNOCKED)]
 
 
 def _fits(best, observations, good, centre_px, side_m) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:

@@ -20,6 +20,8 @@ _LARGEST_DISAGREEMENT_PERCENT = 2.0
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # Warn where the focal length, or the camera's distance, is known worse than this share.
 _LARGEST_SIGMA = 0.005
+# Of the frames that are left out for one reason so many are named; the report has all.
+_MOST_NAMES = 8
 
 
 def pose_report(poses: TurntablePoses) -> dict:
@@ -41,7 +43,7 @@ def pose_report(poses: TurntablePoses) -> dict:
     if deviation is not None and deviation > 0.25 * abs(poses.nominal_step_deg or np.inf):
         warnings.append(f"an angle departs from the nominal steps by {deviation:.1f} degrees")
     if poses.dropped:
-        warnings.append(f"{len(poses.dropped)} of {len(poses.names)} frames could not be posed and are left out")
+        warnings.append(_left_out(poses))
     warnings += [*_model_warnings(poses), *_scale_warnings(poses)]
     # The mean axis in the camera's axes: right, up, backwards.
     axis = poses.camera_to_world[poses.used, 2, :3].mean(axis=0)
@@ -95,6 +97,18 @@ def is_full_turn(angles_deg: np.ndarray) -> bool:
     """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""
     widest_step = np.abs(np.diff(angles_deg)).max()
     return bool(abs(angles_deg[-1] - angles_deg[0]) >= 360.0 - _STEPS_SHORT_OF_A_TURN * widest_step)
+
+
+def _left_out(poses: TurntablePoses) -> str:
+    """Which frames are left out and why, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for name, why in sorted(poses.dropped.items()):
+        by_reason.setdefault(why, []).append(name)
+    groups = []
+    for why, names in by_reason.items():
+        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+        groups.append(f"{', '.join(names[:_MOST_NAMES])}{more} ({why})")
+    return f"{len(poses.dropped)} of {len(poses.names)} frames are left out: {'; '.join(groups)}"
 
 
 def _model_warnings(poses: TurntablePoses) -> list[str]:
