@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 from rich.console import Console
@@ -14,8 +17,9 @@ from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.data.frames import FramePaths
 from hsi_sc_nerf.data.packed import Container, PackedDataset, PackedFrame
 from hsi_sc_nerf.data.session import Session
+from hsi_sc_nerf.data.session_pictures import GRAY, SessionPictures, read_frames
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.from_features import PSEUDO_RGB, FeatureConfig, group_of_most_variance
 from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
 from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.picture import draw_poses
@@ -74,22 +78,42 @@ def pose_frames(
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
+    marker_range_nm: tuple[float, float] = (450.0, 700.0),
 ) -> TurntablePoses:
     """Find the poses, write ``poses.json`` and its picture, and say what was found.
+
+    Args:
+        session: the session, whose frames are packed under ``output_dir``.
+        images: of each frame the mean over ``marker_range_nm``.
+        facts: what else is known.
+        way: how poses are found.
+        config: settings of poses from features.
+        output_dir: the dataset.
+        console: where to say it.
+        find_poses: finds the poses.
+        marker_range_nm: range in which markers are printed to be seen.
 
     Raises:
         InputError: no way to poses works, or the operating system refused to write.
     """
     names = [capture.name for capture in session.frames]
+    # Known angles before a known camera: nothing is measured.
+    measured = way != "angles" or facts.camera is None
+    pictures = _read_pictures(names, images, config, output_dir, marker_range_nm) if measured else None
     try:
-        poses = find_poses(images, names, facts=facts, way=way, config=config, progress=not console.quiet)
+        poses = find_poses(pictures or images, names, facts=facts, way=way, config=config, progress=not console.quiet)
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
-    report = poses.report()
+    report = poses.report() | {"pictures": None if pictures is None else _pictures_report(names, pictures, poses)}
     write_json(output_dir / "poses.json", report)
     draw_poses(poses, output_dir / "report" / "poses.png")
     error_px = f", {poses.overall_error_px:.2f} px" if np.isfinite(poses.overall_error_px) else ""
     console.print(f"Poses: {poses.used.sum()} of {len(names)} frames{error_px}, {poses.chosen}.", highlight=False)
+    if pictures is not None and poses.method == "markers":
+        best = Counter(frame.ranking[0] for frame in pictures.frames)
+        if best.keys() != {GRAY}:
+            seen_in = ", ".join(f"{name} ({count} frames)" for name, count in best.most_common())
+            console.print(f"Markers stand out best in {seen_in}.", highlight=False)
     for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
         console.print(f"Warning: {warning}.", highlight=False)
     for name in np.array(names)[~poses.used]:
@@ -125,6 +149,44 @@ def container_under(session: Session, poses: TurntablePoses) -> Container | None
     if diameter_m is None or height_m is None or not poses.metric or not feet_known:
         return None
     return Container(diameter_m, height_m)
+
+
+def _read_pictures(
+    names: Sequence[str],
+    images: Sequence[UInt8[np.ndarray, "h w"]],
+    config: FeatureConfig,
+    output_dir: Path,
+    marker_range_nm: tuple[float, float],
+) -> SessionPictures:
+    """Pictures of all packed frames, for markers and for features."""
+    paths = [FramePaths.of(output_dir, name) for name in names]
+    band = {} if config.band_nm is None else {f"{config.band_nm:g} nm": config.band_nm}
+    frames = read_frames([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm, band)
+    if band:
+        return SessionPictures(frames, *band)
+    if config.picture == "foreground-variance":
+        pictures = SessionPictures(frames)
+        return SessionPictures(frames, group_of_most_variance(pictures, config.motion.background))
+    if config.picture == "pseudo-rgb":
+        shown = [np.asarray(cv2.imread(str(p.image), cv2.IMREAD_GRAYSCALE)) for p in paths]
+        more = [
+            replace(frame, pictures={**frame.pictures, PSEUDO_RGB: image})
+            for frame, image in zip(frames, shown, strict=True)
+        ]
+        return SessionPictures(more, PSEUDO_RGB)
+    return SessionPictures(frames)
+
+
+def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: TurntablePoses) -> dict:
+    """Where features were looked for, and of each frame how well each picture tells its edges, best first."""
+    return {
+        "features": None if poses.method == "markers" else pictures.features,
+        "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},
+        "edge_precision_per_px": {
+            name: {picture: round(score, 1) for picture, score in frame.scores.items()}
+            for name, frame in zip(names, pictures.frames, strict=True)
+        },
+    }
 
 
 def _camera(earlier: PackedDataset) -> KnownCamera:

@@ -22,27 +22,40 @@ def layout(turntable: Turntable, side_m: float) -> Float[np.ndarray, "m 4 3"]:
 
 
 def on_disc(turntable: Turntable, side_m: float) -> Bool[np.ndarray, "m"]:
-    """Which markers lie on the disc: the lowest group that faces up and shares one height."""
-    up = turntable.marker_poses[:, 2, 2] > _FACES_UP_COSINE
+    """Which of the turntable's markers lie on the disc."""
+    return lie_on_disc(layout(turntable, side_m))
+
+
+def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:
+    """Which markers lie on the disc: the lowest group that faces up along z, the axis, and shares one height.
+
+    Args:
+        corners: of each marker, in any unit, clockwise seen from its front.
+    """
+    right, down = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+    normal = np.cross(down, right)
+    up = normal[:, 2] > _FACES_UP_COSINE * np.linalg.norm(normal, axis=-1)
     if not up.any():
         return up
-    height = turntable.marker_poses[:, 2, 3]
-    return up & (height < height[up].min() + _COPLANAR_SIDES * side_m)
+    height = corners[..., 2].mean(axis=1)
+    side = np.linalg.norm(right, axis=-1).mean()
+    return up & (height < height[up].min() + _COPLANAR_SIDES * side)
 
 
 def disc_height_m(turntable: Turntable, side_m: float) -> float:
     """Height of the disc in the turntable's frame; without markers on a disc that of the lowest marker corner."""
     corners = layout(turntable, side_m)
-    flat = on_disc(turntable, side_m)
+    flat = lie_on_disc(corners)
     return float(np.median(corners[flat, :, 2].mean(-1)) if flat.any() else corners[..., 2].min())
 
 
 def disc_tilt_deg(turntable: Turntable, side_m: float) -> float | None:
     """Angle between the axis and the normal of the plane through the disc's markers; None below three markers."""
-    flat = on_disc(turntable, side_m)
+    corners = layout(turntable, side_m)
+    flat = lie_on_disc(corners)
     if flat.sum() < 3:
         return None
-    points = layout(turntable, side_m)[flat].reshape(-1, 3)
+    points = corners[flat].reshape(-1, 3)
     normal = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
     return float(np.rad2deg(np.arctan2(np.hypot(normal[0], normal[1]), abs(normal[2]))))
 

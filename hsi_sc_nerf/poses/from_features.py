@@ -9,7 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hsi_sc_nerf.data.session_pictures import BAND_GROUPS_NM, GRAY, SessionPictures
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.frame import lie_on_disc
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.late_frames import with_late_frames
 from hsi_sc_nerf.poses.markers import find_dictionary
@@ -17,11 +19,12 @@ from hsi_sc_nerf.poses.observe import observe
 from hsi_sc_nerf.poses.outliers import usable
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.scale import Scale
+from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import StructureFromMotionConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks, split_half_error_deg
 from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
-from hsi_sc_nerf.poses.visible_markers import marker_corners, on_disc, side_lengths
+from hsi_sc_nerf.poses.visible_markers import marker_corners, side_lengths
 
 LARGEST_SPLIT_HALF_DEG = 0.3
 """Halves of the points that differ by more than this deserve a warning: the target of poses without markers."""
@@ -30,13 +33,23 @@ MOST_CONTRADICTING = 1 / 3
 LOWEST_POINTS_PERCENTILE = 1.0
 """Without a marker on the disc the origin is at the height of the lowest points of what turns."""
 
+PSEUDO_RGB = "pseudo-RGB"
+"""Name of a frame's pseudo-RGB picture in gray."""
+
 Images = Sequence[UInt8[np.ndarray, "h w"]]
+"""One picture a frame, or ``SessionPictures``."""
 
 
 @dataclass(frozen=True)
 class FeatureConfig:
     """Settings of poses from features."""
 
+    picture: Literal["gray", "pseudo-rgb", "foreground-variance"] = "gray"
+    """The picture that features are found in: the mean of the bands in which markers are looked for (gray), the
+    pseudo-RGB picture turned gray (pseudo-rgb), or the group of bands that differs most over what turns
+    (foreground-variance)."""
+    band_nm: float | None = None
+    """Find features in the band nearest to this wavelength instead, nm: one in which the object shows patterns."""
     motion: StructureFromMotionConfig = field(default_factory=StructureFromMotionConfig)
     """Features, matching and mapping by COLMAP."""
     adjustment: TrackAdjustConfig = field(default_factory=TrackAdjustConfig)
@@ -61,7 +74,8 @@ def poses_by_colmap(images: Images, names: Sequence[str], known: Known, config: 
     Raises:
         InputError: too little texture, or poses that do not turn about one axis.
     """
-    free = structure_from_motion(images, names, config.motion)
+    pictures = SessionPictures.of(images)
+    free = structure_from_motion(pictures.named(pictures.features), names, config.motion)
     fit = turntable_from_poses(free.world_to_camera)
     if fit.contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
         raise InputError(
@@ -94,7 +108,8 @@ def poses_by_angles(
     Raises:
         InputError: too little texture, or features that contradict the angles.
     """
-    tracks = matched_tracks(images, names, config.motion)
+    pictures = SessionPictures.of(images)
+    tracks = matched_tracks(pictures.named(pictures.features), names, config.motion)
     height, width = images[0].shape
     frames = np.unique(tracks.frame)
     start = turntable_from_angles(
@@ -107,6 +122,20 @@ def poses_by_angles(
     adjustment = replace(config.adjustment, free_angles=False)
     adjusted = adjust_tracks(start, tracks, adjustment)
     return _in_object_frame(adjusted, images, names, known, replace(config, adjustment=adjustment), "angles")
+
+
+def group_of_most_variance(pictures: SessionPictures, background: StaticBackgroundConfig | None = None) -> str:
+    """Name of the group of bands whose brightness differs most over the pixels that show what turns.
+
+    The variance is taken over these pixels within a frame, and its mean over the frames; the broad mean where nothing
+    turns.
+    """
+    moving = moving_pixels(pictures.named(GRAY), background)
+    if not moving.any():
+        return GRAY
+    groups = [name for name in (GRAY, *BAND_GROUPS_NM) if name in pictures.frames[0].pictures]
+    variance = {name: np.mean([image[moving].var() for image in pictures.named(name)]) for name in groups}
+    return max(variance, key=variance.__getitem__)
 
 
 def _in_object_frame(
@@ -132,7 +161,9 @@ def _in_object_frame(
     places = machine.places @ turn[:3, :3].T
 
     corners, dictionary, per_frame = _markers(images, known, poses, intrinsics)
-    disc = on_disc(corners)
+    markers = np.array(sorted(corners), dtype=int)
+    flat = lie_on_disc(np.array([corners[m] for m in markers.tolist()]).reshape(-1, 4, 3))
+    disc = tuple(markers[flat].tolist())
     floor = float(np.percentile(places[:, 2], LOWEST_POINTS_PERCENTILE))
     if disc:
         floor = float(np.median([corners[m][:, 2].mean() for m in disc]))

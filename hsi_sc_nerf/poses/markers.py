@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hsi_sc_nerf.data.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.errors import InputError
 
 Detections: TypeAlias = dict[int, Float[np.ndarray, "4 2"]]
@@ -84,22 +85,32 @@ def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detectio
 
 
 def find_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
-    """The dictionary whose markers are seen most often in a few of the images; None if there are none.
+    """The dictionary whose markers are seen most often in a few of the frames; None if there are none.
 
-    Of a family the smallest dictionary that holds the ids is taken: it tolerates the most misread cells.
+    Of a family the smallest dictionary that holds the ids is taken: it tolerates the most misread cells. Where the
+    frames' best pictures show no marker, the broad mean is looked at too: sharp edges need not be ink's.
     """
-    take = np.unique(np.linspace(0, len(images) - 1, _FRAMES_TO_TELL_THE_DICTIONARY).astype(int))
+    session = SessionPictures.of(images)
+    take = np.unique(np.linspace(0, len(session) - 1, _FRAMES_TO_TELL_THE_DICTIONARY).astype(int)).tolist()
+    found = _most_seen_dictionary([session[i] for i in take])
+    if found is None and any(session.frames[i].ranking[0] != GRAY for i in take):
+        grays = session.named(GRAY)
+        found = _most_seen_dictionary([grays[i] for i in take])
+    return found
+
+
+def _most_seen_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
     best, best_score = None, 0
     for family, parts in _FAMILIES.items():
-        seen = Counter(marker for i in take for marker in detect_markers(images[i], family))
+        seen = Counter(marker for image in images for marker in detect_markers(image, family))
         # A misreading rarely repeats, a marker of a turntable does.
-        steady = {marker: n for marker, n in seen.items() if n > 1} if len(take) > 2 else dict(seen)
+        steady = {marker: n for marker, n in seen.items() if n > 1} if len(images) > 2 else dict(seen)
         score = sum(steady.values())
         if score > best_score:
             best_score = score
             largest = max(steady)
             best = next(p for p in parts if largest < dictionary_by_name(p).bytesList.shape[0])
-        if score >= _CLEAR_MARKERS_PER_FRAME * len(take):
+        if score >= _CLEAR_MARKERS_PER_FRAME * len(images):
             break
     return best
 

@@ -1,4 +1,8 @@
-"""All markers of all frames: detection, refinement, and a second look where the adjusted turntable expects them."""
+"""All markers of all frames: detection, refinement, and a second look where the adjusted turntable expects them.
+
+A frame may be shown in several pictures (``SessionPictures``). Its best one goes first; a marker that is missing
+there is taken from the next one that shows it.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from jaxtyping import Float, UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
+from hsi_sc_nerf.data.session_pictures import FramePictures, SessionPictures
 from hsi_sc_nerf.poses.adjust import reproject
 from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.frame import layout
@@ -28,6 +33,9 @@ _BLUR_TOLERANCE_PX = 0.02
 # this share.
 _OUT_OF_FOCUS_MEDIANS = 2.0
 _LEAST_OUT_OF_FOCUS = 0.01
+# With fewer markers in its best picture a frame is searched in the others too. Where more are seen, the adjustment
+# knows where to look for the rest.
+_FEW_MARKERS = 4
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
@@ -38,7 +46,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Observed:
-    """Markers of all frames, the blur that explains each frame best, and markers whose pattern was not fitted."""
+    """Markers of all frames, the blur of each frame's best picture, and markers whose pattern was not fitted."""
 
     observations: Observations
     blur_px: Float[np.ndarray, "frames"]
@@ -47,29 +55,49 @@ class Observed:
 
 def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progress: bool) -> Observed:
     """Detect and refine the markers of every frame."""
+    session = SessionPictures.of(images)
+    frames = session.frames
     with ThreadPoolExecutor(_WORKERS) as pool:
         detections = _all(
-            pool.map(lambda image: detect_markers(image, dictionary), images),
-            "Finding markers",
-            len(images),
-            progress,
+            pool.map(lambda frame: _detect(frame, dictionary), frames), "Finding markers", len(frames), progress
         )
-        blur_px = np.full(len(images), find_blur(images, dictionary, detections))
+        # What lenses blur, they blur by wavelength: each name has a blur of its own.
+        names = sorted({name for found in detections for name in found})
+        of_name = {name: [found.get(name, {}) for found in detections] for name in names}
+        typical = {name: find_blur(session.named(name), dictionary, seen) for name, seen in of_name.items()}
+        blurs_px = [{frame.ranking[0]: 0.0, **typical} for frame in frames]
 
         def refine(i: int) -> list[tuple[int, FittedMarker | None]]:
-            image, found = images[i].astype(float), sorted(detections[i].items())
-            return [(m, fit_marker(image, dictionary, m, corners, blur_px[i])) for m, corners in found]
+            fitted: dict[int, FittedMarker | None] = {}
+            for name, found in detections[i].items():
+                image = frames[i].pictures[name].astype(float)
+                for marker, corners in sorted(found.items()):
+                    if fitted.get(marker) is None:
+                        fitted[marker] = fit_marker(image, dictionary, marker, corners, blurs_px[i][name])
+            return sorted(fitted.items())
 
-        fitted = _all(pool.map(refine, range(len(images))), "Refining corners", len(images), progress)
+        fitted = _all(pool.map(refine, range(len(frames))), "Refining corners", len(frames), progress)
     for i in _out_of_focus(fitted):
-        blur_px[i] = find_blur(images[i : i + 1], dictionary, detections[i : i + 1])
+        for name, found in detections[i].items():
+            blurs_px[i][name] = find_blur([frames[i].pictures[name]], dictionary, [found])
         fitted[i] = refine(i)
     rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
     why = "its pattern does not explain the pixels: hidden, blurred or misread"
     unexplained = tuple(
         Rejected(i, m, None, why) for i, found in enumerate(fitted) for m, fit in found if fit is None
     )
-    return Observed(_observations(rows), blur_px, unexplained)
+    of_best = np.array([blur[frame.ranking[0]] for blur, frame in zip(blurs_px, frames, strict=True)])
+    return Observed(_observations(rows), of_best, unexplained)
+
+
+def _detect(frame: FramePictures, dictionary: str) -> dict[str, Detections]:
+    """Markers by the picture's name, best picture first; the others only where it shows few."""
+    found: dict[str, Detections] = {}
+    for name in frame.ranking:
+        found[name] = detect_markers(frame.pictures[name], dictionary)
+        if len(found) == 1 and len(found[name]) >= _FEW_MARKERS:
+            break
+    return {name: seen for name, seen in found.items() if seen}
 
 
 def _out_of_focus(fitted: Sequence[Sequence[tuple[int, FittedMarker | None]]]) -> list[int]:
@@ -122,26 +150,54 @@ def observe_expected(
     side_m: float,
     blur_px: Float[np.ndarray, "frames"],
 ) -> Observations:
-    """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones."""
+    """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones.
+
+    Args:
+        images: of all frames.
+        dictionary: of the markers.
+        turntable: adjusted to the seen markers.
+        seen: markers so far.
+        centre_px: the principal point.
+        side_m: of the markers.
+        blur_px: of each frame's best picture; what the other pictures' is, is found.
+    """
+    session = SessionPictures.of(images)
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
-    expected = [pair for pair in _facing(turntable, side_m) if pair not in have]
-    if not expected:
+    missing = [pair for pair in _facing(turntable, side_m) if pair not in have]
+    if not missing:
         return seen
-    frame, marker = np.array(expected).T
+    frame, marker = np.array(missing).T
     blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
-    corners = reproject(turntable, blank, centre_px, side_m)
+    expected = dict(zip(missing, reproject(turntable, blank, centre_px, side_m), strict=True))
+    found: dict[tuple[int, int], FittedMarker] = {}
+    blurs_px: dict[str, float] = {}
+    for rank in range(max(len(frame.ranking) for frame in session.frames)):
+        missing = [(i, m) for i, m in missing if (i, m) not in found and rank < len(session.frames[i].ranking)]
+        names = {i: session.frames[i].ranking[rank] for i, _ in missing}
+        if rank > 0:
+            for name in sorted(set(names.values()) - blurs_px.keys()):
+                blurs_px[name] = find_blur(session.named(name), dictionary, _by_frame(seen, len(session)))
 
-    def look(i: int, marker: int, start: Float[np.ndarray, "4 2"]) -> FittedMarker | None:
-        image = images[i].astype(float)
-        return fit_marker(image, dictionary, marker, start, blur_px[i], largest_shift_px=_FARTHEST_FROM_EXPECTED_PX)
+        def look(pair: tuple[int, int], rank=rank, names=names) -> FittedMarker | None:
+            i, marker = pair
+            image = session.frames[i].pictures[names[i]].astype(float)
+            blur = float(blur_px[i]) if rank == 0 else blurs_px[names[i]]
+            return fit_marker(image, dictionary, marker, expected[pair], blur, _FARTHEST_FROM_EXPECTED_PX)
 
-    pairs = frame.tolist(), marker.tolist()
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        fitted = list(pool.map(look, *pairs, corners))
-    more = _observations([(i, m, fit) for i, m, fit in zip(*pairs, fitted, strict=True) if fit is not None])
+        with ThreadPoolExecutor(_WORKERS) as pool:
+            fitted = zip(missing, pool.map(look, missing), strict=True)
+            found |= {pair: fit for pair, fit in fitted if fit is not None}
+    more = _observations([(*pair, found[pair]) for pair in expected if pair in found])
     return Observations(
         *(np.concatenate([getattr(seen, k), getattr(more, k)]) for k in Observations.__dataclass_fields__)
     )
+
+
+def _by_frame(seen: Observations, frames: int) -> list[Detections]:
+    by_frame: list[Detections] = [{} for _ in range(frames)]
+    for i, marker, corners in zip(seen.frame.tolist(), seen.marker.tolist(), seen.corners_px, strict=True):
+        by_frame[i][marker] = corners
+    return by_frame
 
 
 def _facing(turntable, side_m):

@@ -11,9 +11,6 @@ from hsi_sc_nerf.poses.initialise import Observations
 # A marker that is seen in fewer frames, or whose rays do not come from different sides, has no certain place.
 _FEWEST_FRAMES = 2
 _LEAST_SPREAD = 1e-3
-# A marker lies on the disc if its normal is this near to the axis, and it is this near to the lowest such marker.
-_FACES_UP_COSINE = 0.97
-_COPLANAR_SIDES = 0.2
 
 
 def marker_corners(
@@ -47,16 +44,3 @@ def marker_corners(
 def side_lengths(corners: dict[int, Float[np.ndarray, "4 3"]]) -> dict[int, float]:
     """Mean length of each marker's four sides."""
     return {m: float(np.linalg.norm(c - np.roll(c, 1, axis=0), axis=-1).mean()) for m, c in corners.items()}
-
-
-def on_disc(corners: dict[int, Float[np.ndarray, "4 3"]]) -> tuple[int, ...]:
-    """Markers of the lowest group that faces along z and shares one height."""
-    flat = {}
-    for marker, c in corners.items():
-        normal = np.cross(c[1] - c[0], c[3] - c[0])
-        if abs(normal[2]) > _FACES_UP_COSINE * np.linalg.norm(normal):
-            flat[marker] = float(c[:, 2].mean())
-    if not flat:
-        return ()
-    side = float(np.mean(list(side_lengths(corners).values())))
-    return tuple(sorted(m for m, z in flat.items() if z < min(flat.values()) + _COPLANAR_SIDES * side))
