@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
 from hsi_sc_nerf.cli.process import ProcessCommand
 from hsi_sc_nerf.cli.simulate import SimulateCommand
@@ -18,12 +19,15 @@ Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
+    | Annotated[BenchmarkCommand, tyro.conf.subcommand("benchmark")]
 )
 
 
 def main() -> None:
     """Run the command that the user asked for; bad input ends in one sentence and status 2."""
-    command: DemoCommand | SimulateCommand | ProcessCommand = tyro.cli(Commands, description=__doc__)
+    command: DemoCommand | SimulateCommand | ProcessCommand | BenchmarkCommand = tyro.cli(
+        Commands, description=__doc__
+    )
     try:
         command.main()
     except InputError as error:

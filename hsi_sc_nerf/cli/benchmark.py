@@ -1,0 +1,228 @@
+"""``hsi-sc-nerf benchmark``: what accuracy costs in time, by configuration."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf.cli.steps import run_step
+from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.data.packed import TRANSFORMS_NAME, is_packed, open_packed
+from hsi_sc_nerf.data.session import is_session
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.benchmark.configurations import (
+    CONFIGURATIONS,
+    Configuration,
+    named_configuration,
+    own_configuration,
+    split_words,
+    training_config,
+)
+from hsi_sc_nerf.evaluation.benchmark.machine import available_cores, describe_machine
+from hsi_sc_nerf.evaluation.benchmark.report import (
+    TrainedRun,
+    screen_table,
+    write_csv,
+    write_page,
+    write_results,
+)
+from hsi_sc_nerf.evaluation.benchmark.run import Checkpoint, Job
+
+
+@dataclass(frozen=True)
+class BenchmarkCommand:
+    """Train several configurations on one session and compare how accurate they are after which time.
+
+    Each trains in a process of its own. What is finished is not trained again; a run that was stopped starts anew.
+    """
+
+    data: tyro.conf.Positional[Path]
+    """A dataset made by `hsi-sc-nerf process`, or a capture session, which is processed first."""
+    output_dir: Path
+    """Folder for the runs and for benchmark.csv, .md, .json and .png."""
+    configurations: tuple[str, ...] = tuple(CONFIGURATIONS)
+    """Which of the known configurations to train: paper is the published recipe, ours is this package's, and
+    the others are ours with one departure from the paper taken away."""
+    sets: tuple[str, ...] = ()
+    """Configurations of your own, each "NAME=BASE WORDS": the words change BASE (ours where it is left out) as they
+    would behind `ns-train METHOD`, for example "fine=paper --pipeline.model.max-res 1024"."""
+    common: str = ""
+    """Words that every configuration gets, joined to the option by an equals sign, for example
+    --common="--pipeline.datamanager.train-num-rays-per-batch 1024"."""
+    train_seconds: float = 600.0
+    """Time for training each configuration; how many iterations fill it is found by a rehearsal."""
+    iterations: int | None = None
+    """The same number of iterations for each configuration instead of the same time."""
+    checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
+    """Shares of a run at which held-out views are evaluated; the end of each stage always is."""
+    held_out_views: int | None = None
+    """Evaluate this many of the held-out views, evenly spread, instead of all."""
+    threads: int | None = None
+    """CPU threads of each run; all cores where it is not given."""
+
+    def main(self) -> None:
+        """Train what is missing, write the results, show the table.
+
+        Raises:
+            InputError: a name, a word, a number or the data cannot be used, or a run failed.
+        """
+        chosen = [*map(named_configuration, self.configurations), *map(own_configuration, self.sets)]
+        runs = train_all(chosen, self)
+        Console().print(screen_table(runs))
+
+
+def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[TrainedRun]:
+    """Train the configurations that are not finished and write the results of all after each.
+
+    Raises:
+        InputError: a setting cannot be used, or runs failed; the others' results are written all the same.
+    """
+    _check(configurations, command)
+    console = Console(stderr=True)
+    data = _packed(command.data)
+    machine = describe_machine()
+    # What a finished run must agree in to count as this one's.
+    identity = {"machine": machine, "data_sha256": hashlib.sha256((data / TRANSFORMS_NAME).read_bytes()).hexdigest()}
+    jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}
+    runs: list[TrainedRun] = []
+    failures: list[str] = []
+    trained, started = 0, time.perf_counter()
+    for number, (name, job) in enumerate(jobs.items(), start=1):
+        folder = command.output_dir / name
+        content = _finished(folder / "result.json", job, identity)
+        state = "already trained" if content is not None else job.method
+        if content is None and trained:
+            waiting = sum(_finished(command.output_dir / n / "result.json", jobs[n], identity) is None for n in jobs)
+            minutes = waiting * (time.perf_counter() - started) / trained / 60
+            state += f", about {minutes:.0f} min left in all"
+        console.print(f"[bold]{number}/{len(jobs)} {name}[/bold] ({escape(state)})")
+        if content is None:
+            try:
+                content = _train(folder, job, identity)
+            except InputError as error:
+                failures.append(str(error))
+                console.print(f"[yellow]{escape(str(error))}")
+                continue
+            trained += 1
+        checkpoints = tuple(Checkpoint(**c) for c in content["checkpoints"])
+        runs.append(TrainedRun(name, job.method, job.words, content["setup_seconds"], checkpoints))
+        _write(runs, command, machine)
+    if failures:
+        raise InputError(f"{len(failures)} of {len(jobs)} configurations failed; the first: {failures[0]}")
+    return runs
+
+
+def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -> None:
+    """Refuse now what would fail after hours."""
+    names = [configuration.name for configuration in configurations]
+    twice = {name for name in names if names.count(name) > 1}
+    if not names or twice:
+        raise InputError(
+            f"--configurations and --sets name {' and '.join(sorted(twice))} twice; each needs a name of its own."
+            if twice
+            else "nothing to train: --configurations and --sets are both empty; name one configuration at least."
+        )
+    given = {
+        "--train-seconds": command.train_seconds,
+        "--iterations": command.iterations,
+        "--held-out-views": command.held_out_views,
+        "--threads": command.threads,
+    }
+    for option, value in given.items():
+        if value is not None and value <= 0:
+            raise InputError(f"{option} is {value}; it must be more than 0.")
+    if not all(0 < share <= 1 for share in command.checkpoints):
+        raise InputError(f"--checkpoints are shares of a run, more than 0 and at most 1, not {command.checkpoints}.")
+    for configuration in configurations:
+        training_config(configuration.method, (*split_words(command.common), *configuration.words))
+
+
+def _packed(data: Path) -> Path:
+    """The packed dataset that training will read; a session is processed as ``ns-train`` would."""
+    from hsi_sc_nerf.data.dataparser import processed_dir
+    from hsi_sc_nerf.data.process import process_session
+
+    if not is_packed(data) and is_session(data):
+        data = process_session(data, processed_dir(data.resolve()))
+    return open_packed(data).root.resolve()
+
+
+def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) -> Job:
+    return Job(
+        method=configuration.method,
+        words=(*split_words(command.common), *configuration.words),
+        data=str(data),
+        output_dir=str((command.output_dir / configuration.name).resolve()),
+        iterations=command.iterations,
+        train_seconds=None if command.iterations else command.train_seconds,
+        checkpoints=command.checkpoints,
+        threads=command.threads or available_cores(),
+        held_out_views=command.held_out_views,
+    )
+
+
+def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
+    """Rehearse where the time is given, then train; what either finds is kept with the job that it belongs to."""
+    shutil.rmtree(folder / "benchmark", ignore_errors=True)
+    iterations = job.iterations
+    if iterations is None:
+        found = _finished(folder / "rehearsal.json", job, identity)
+        if found is None:
+            found = _process(folder, "rehearsal", job, job, identity)
+        iterations = found["iterations"]
+    return _process(folder, "result", replace(job, iterations=iterations), job, identity)
+
+
+def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str, Any]) -> dict[str, Any]:
+    folder.mkdir(parents=True, exist_ok=True)
+    job_path, result_path = folder / f".{name}-job.json", folder / f"{name}.json"
+    found_path = folder / f".{name}-found.json"
+    write_json(job_path, asdict(doing))
+    module = "hsi_sc_nerf.evaluation.benchmark.run"
+    run_step(
+        f"{name} of {folder.name}",
+        [sys.executable, "-m", module, str(job_path), str(found_path)],
+        folder / f"{name}.log",
+    )
+    found = json.loads(found_path.read_text(encoding="utf-8"))
+    write_json(result_path, {"job": asdict(asked), **identity, **found})
+    job_path.unlink()
+    found_path.unlink()
+    return found
+
+
+def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """What an earlier call found for the same job on the same machine and data; None if there is no such thing."""
+    if not path.is_file():
+        return None
+    content = json.loads(path.read_text(encoding="utf-8"))
+    wanted = json.loads(json.dumps({"job": asdict(job), **identity}))
+    return content if wanted.items() <= content.items() else None
+
+
+def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
+    from hsi_sc_nerf.evaluation.benchmark.plot import draw_accuracy_and_time
+
+    settings = {
+        "data": command.data.name,
+        "length": f"{command.iterations} iterations" if command.iterations else f"{command.train_seconds:g} s",
+        "checkpoints": ", ".join(f"{share:g}" for share in command.checkpoints),
+        "held-out views": command.held_out_views or "all",
+        "threads": command.threads or available_cores(),
+    }
+    out = command.output_dir / "benchmark"
+    write_csv(out.with_suffix(".csv"), runs)
+    write_results(out.with_suffix(".json"), runs, settings, machine)
+    write_page(out.with_suffix(".md"), runs, settings, machine)
+    draw_accuracy_and_time(out.with_suffix(".png"), runs)

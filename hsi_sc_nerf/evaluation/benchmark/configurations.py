@@ -1,0 +1,121 @@
+"""The configurations that the benchmark knows by name, and those that its user adds."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hsi_sc_nerf.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+OURS = "hsi-sc-nerf"
+PAPER = "hsi-sc-nerf-paper"
+
+# name: (method, words as after `ns-train METHOD`). After `ours`: ours with one departure from the paper taken away.
+CONFIGURATIONS: dict[str, tuple[str, str]] = {
+    "paper": (PAPER, ""),
+    "ours": (OURS, ""),
+    "ours-no-normals": (OURS, "--pipeline.model.predict-normals False"),
+    "ours-foreground-only": (OURS, "--masked.foreground-share 1.0"),
+    "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
+    "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
+}
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A method and what is changed of it.
+
+    Attributes:
+        name: what tables and folders call it.
+        method: nerfstudio method of this package.
+        words: as after ``ns-train METHOD``.
+    """
+
+    name: str
+    method: str
+    words: tuple[str, ...]
+
+
+def named_configuration(name: str) -> Configuration:
+    """The configuration that the table has under a name.
+
+    Raises:
+        InputError: it has none.
+    """
+    if name not in CONFIGURATIONS:
+        raise InputError(f"no configuration is named '{name}'; there are {', '.join(CONFIGURATIONS)}.")
+    method, words = CONFIGURATIONS[name]
+    return Configuration(name, method, split_words(words))
+
+
+def own_configuration(text: str) -> Configuration:
+    """A configuration from ``NAME=WORDS`` (changes of ours) or ``NAME=BASE WORDS`` (of a named one).
+
+    Raises:
+        InputError: there is no name that can be a folder's, or no such base.
+    """
+    name, equals, rest = text.partition("=")
+    if not equals or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+        raise InputError(
+            f"'{text}' is no configuration; write NAME=WORDS, the name of letters, digits, dots and dashes, such as "
+            "fine=--pipeline.model.max-res 1024."
+        )
+    words = split_words(rest)
+    based = bool(words) and not words[0].startswith("-")
+    base = named_configuration(words[0] if based else "ours")
+    return Configuration(name, base.method, base.words + words[1 if based else 0 :])
+
+
+def split_words(text: str) -> tuple[str, ...]:
+    """Words as a shell would split them.
+
+    Raises:
+        InputError: a quotation mark is left open.
+    """
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise InputError(f"'{text}' cannot be split into words ({error}); close the quotation mark.") from error
+
+
+def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
+    """What ``ns-train METHOD WORDS`` would train with.
+
+    Raises:
+        InputError: the package has no such method, or it does not take these words.
+    """
+    import tyro
+    from nerfstudio.plugins.types import MethodSpecification
+
+    from hsi_sc_nerf import config as plugin
+
+    methods = {
+        str(m.config.method_name): m.config for m in vars(plugin).values() if isinstance(m, MethodSpecification)
+    }
+    if method not in methods:
+        raise InputError(f"no method is named '{method}'; there are {', '.join(methods)}.")
+    default = copy.deepcopy(methods[method])
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(complaint):
+            return tyro.cli(type(default), default=default, args=words, config=(tyro.conf.FlagConversionOff,))
+    except SystemExit as error:
+        raise InputError(
+            f"'{shlex.join(words)}' is not what {method} takes ({_gist(complaint.getvalue())}); "
+            f"ns-train {method} --help lists the words."
+        ) from error
+
+
+def _gist(complaint: str) -> str:
+    """The first sentence of tyro's framed message."""
+    lines = [line.strip("╭╮╰╯│─ ") for line in complaint.splitlines()]
+    return next((line for line in lines if line and not line.endswith("error")), "they only ask for help")
