@@ -1,7 +1,8 @@
 """Nerfacto's field with a spectrum instead of a colour: the variant C1, sigma0 of HS-NeRF that the paper follows.
 
 One density that does not depend on wavelength (paper, section "Model Formulation"), and an n-channel radiance that
-depends on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid.
+depends on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid; or
+the channels are coefficients of a spectral basis, linear so that they can be composited before they are decoded.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.activations import trunc_exp
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.mlp import MLP
+from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import get_normalized_directions
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
@@ -20,22 +22,40 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
+COEFFICIENT_START_SPREAD = 0.1
+"""The weights behind the coefficients begin at this share of their usual size: the field begins at the mean."""
 
-def _positions_in_box(
-    ray_samples: RaySamples, aabb: Float[Tensor, "2 3"]
-) -> tuple[Float[Tensor, "*bs 3"], Float[Tensor, "*bs 1"]]:
-    """Sample positions in [0, 1]^3 of the scene box, and 1 inside it, 0 outside (where positions are zeroed)."""
-    positions = SceneBox.get_normalized_positions(ray_samples.frustums.get_positions(), aabb)
+
+def grid_positions(
+    positions: Float[Tensor, "*bs 3"], aabb: Float[Tensor, "2 3"], spatial_distortion: SpatialDistortion | None
+) -> Float[Tensor, "*bs 3"]:
+    """Scene positions in the hash grid's unit cube: the scene box, or all of space as the distortion contracts it.
+
+    Args:
+        positions: scene units.
+        aabb: scene box; what lies outside it lies outside the unit cube.
+        spatial_distortion: into a ball or cube of radius 2, as nerfstudio's `SceneContraction`; None for the box.
+    """
+    if spatial_distortion is None:
+        return SceneBox.get_normalized_positions(positions, aabb)
+    return (spatial_distortion(positions) + 2.0) / 4.0
+
+
+def _zeroed_outside(positions: Float[Tensor, "*bs 3"]) -> tuple[Float[Tensor, "*bs 3"], Float[Tensor, "*bs 1"]]:
+    """Grid positions, 0 outside the unit cube, and 1 inside it, 0 outside."""
     inside = ((positions > 0.0) & (positions < 1.0)).all(dim=-1, keepdim=True)
     return positions * inside, inside.to(positions)
 
 
 class SpectralField(NerfactoField):
-    """Nerfacto's field whose radiance head has one channel a band; bounded by the scene box, no contraction.
+    """Nerfacto's field whose radiance head has one channel a band, or one a coefficient of a spectral basis.
 
     Args:
-        aabb: scene box, (2, 3), scene units.
-        num_bands: channels of the radiance.
+        aabb: scene box, (2, 3), scene units; it bounds the field unless a ``spatial_distortion`` is given.
+        num_bands: bands of the spectra, the channels of the direct head.
+        coefficient_start: coefficients of the mean spectrum in a basis (`SpectralSubspace.mean_coefficients`): the
+            head has a linear channel for each and begins near these values. None: the direct head, whose channels
+            end in a sigmoid.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         **nerfacto: everything else that `NerfactoField` takes.
@@ -45,6 +65,7 @@ class SpectralField(NerfactoField):
         self,
         aabb: Float[Tensor, "2 3"],
         num_bands: int,
+        coefficient_start: Float[Tensor, "rank"] | None = None,
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
         **nerfacto,
@@ -54,24 +75,44 @@ class SpectralField(NerfactoField):
             in_dim=self.direction_encoding.get_out_dim() + self.geo_feat_dim + self.appearance_embedding_dim,
             num_layers=num_layers_color,
             layer_width=hidden_dim_color,
-            out_dim=num_bands,
+            out_dim=num_bands if coefficient_start is None else len(coefficient_start),
             activation=nn.ReLU(),
-            out_activation=nn.Sigmoid(),
+            out_activation=nn.Sigmoid() if coefficient_start is None else None,
             implementation="torch",
         )
+        if coefficient_start is not None:
+            last = self.mlp_head.layers[-1]
+            assert isinstance(last, nn.Linear)
+            with torch.no_grad():
+                last.weight *= COEFFICIENT_START_SPREAD
+                last.bias.copy_(coefficient_start)
         fuse_hash_encodings(self)
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
         """Density and geometry features; positions carry a gradient only where normals are asked for."""
-        positions, inside = _positions_in_box(ray_samples, self.aabb)
+        hidden, inside = self._hidden(ray_samples)
+        return self._density(hidden[..., :1], inside), hidden[..., 1:]
+
+    def _hidden(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs hidden"], Float[Tensor, "*bs 1"]]:
+        """What the base network says of the samples, and which of them (1) lie inside the scene."""
+        positions = ray_samples.frustums.get_positions()
         if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
             positions.requires_grad_()
+        # nerfacto takes grid positions here, and its normals are skewed where the grid is.
         self._sample_locations = positions  # type: ignore[assignment]
-        hidden = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
-        before_activation, features = torch.split(hidden, [1, self.geo_feat_dim], dim=-1)
-        self._density_before_activation = before_activation  # type: ignore[assignment]
-        density = self.average_init_density * trunc_exp(before_activation.to(positions)) * inside
-        return density, features
+        in_grid, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
+        hidden = self.mlp_base(in_grid.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
+        self._density_before_activation = self._log_density(hidden)  # type: ignore[assignment]
+        return hidden, inside
+
+    def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
+        """Logarithm of the density up to a constant: what normals are gradients of."""
+        return hidden[..., :1]
+
+    def _density(
+        self, before_activation: Float[Tensor, "*bs channels"], inside: Float[Tensor, "*bs 1"]
+    ) -> Float[Tensor, "*bs channels"]:
+        return self.average_init_density * trunc_exp(before_activation.to(inside)) * inside
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
@@ -105,12 +146,11 @@ class SpectralField(NerfactoField):
 
     def density_gradient(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Gradient of the log density at points in scene units; its negative points out of the surface."""
-        extent = self.aabb[1] - self.aabb[0]
         with torch.enable_grad():
-            normalised = ((positions - self.aabb[0]) / extent).detach().requires_grad_()
-            log_density = self.mlp_base(normalised)[:, 0]
-            (gradient,) = torch.autograd.grad(log_density.sum(), normalised)
-        return gradient / extent
+            positions = positions.detach().requires_grad_()
+            hidden = self.mlp_base(grid_positions(positions, self.aabb, self.spatial_distortion))
+            (gradient,) = torch.autograd.grad(self._log_density(hidden).sum(), positions)
+        return gradient
 
 
 class SpectralProposalField(HashMLPDensityField):
@@ -125,6 +165,7 @@ class SpectralProposalField(HashMLPDensityField):
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], None]:  # type: ignore[override]
         """Density at the samples."""
-        positions, inside = _positions_in_box(ray_samples, self.aabb)
-        before_activation = self.mlp_base(positions.detach().view(-1, 3)).view(*ray_samples.frustums.shape, -1)
+        positions = ray_samples.frustums.get_positions().detach()
+        positions, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
+        before_activation = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
         return self.average_init_density * trunc_exp(before_activation.to(positions)) * inside, None

@@ -1,0 +1,210 @@
+"""The few directions that hold the spectra of a session, found by singular values above the noise.
+
+A sample of the field then needs a few coefficients instead of a value in every band, and the rank says what that
+costs. Spectra are taken as they are, without their mean: black is a spectrum too, and so is any mixture of spectra
+with weights below 1, which is what a ray collects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.data.packed import PackedFrame
+from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.errors import InputError
+
+FEWEST_SPECTRA = 64
+"""Below this, neither noise nor rank can be told."""
+NOISE_DRAWS = 3
+"""How often noise is simulated to find its largest singular value; more hardly move it."""
+NEIGHBOUR_BANDS = 12
+"""Bands on each side that predict a band where its noise is estimated from the spectra alone."""
+ROUNDING_NOISE = 1.0 / (REFLECTANCE_SCALE * np.sqrt(12.0))
+"""Standard deviation of what rounding to the packed cubes' numbers adds to a reflectance."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralSubspace:
+    """An orthonormal basis of a session's spectra, and what is lost outside it.
+
+    Attributes:
+        basis: orthonormal columns, by falling share of the spectra.
+        coefficient_rms: root mean square of the spectra's coefficients.
+        mean_spectrum: of the spectra, projected.
+        rank_above_noise: how many directions stand out of the noise; ``basis`` has no more columns than was allowed.
+        noise_rmse: root mean square of the noise over spectra and bands.
+        noise_estimated: whether the noise was told from the spectra themselves.
+        projection_rmse: root mean square of what the projection takes off spectra, noise included.
+        projection_sam_rad: mean spectral angle between spectra and their projections, noise included.
+        excess_rmse: the part of ``projection_rmse`` that noise does not explain: what the rank costs.
+        excess_sam_rad: the same of the root mean square angle.
+    """
+
+    basis: Float[np.ndarray, "bands rank"]
+    coefficient_rms: Float[np.ndarray, "rank"]
+    mean_spectrum: Float[np.ndarray, "bands"]
+    rank_above_noise: int
+    noise_rmse: float
+    noise_estimated: bool
+    projection_rmse: float
+    projection_sam_rad: float
+    excess_rmse: float
+    excess_sam_rad: float
+
+    @property
+    def scaled_basis(self) -> Float[np.ndarray, "bands rank"]:
+        """The basis whose coefficients have a root mean square of 1: what a network should emit."""
+        return self.basis * self.coefficient_rms
+
+    @property
+    def mean_coefficients(self) -> Float[np.ndarray, "rank"]:
+        """Coefficients of the mean spectrum in ``scaled_basis``."""
+        return self.mean_spectrum @ self.basis / self.coefficient_rms
+
+
+def find_subspace(
+    spectra: Float[np.ndarray, "n bands"],
+    noise: Float[np.ndarray, "*n bands"] | None = None,
+    valid: Bool[np.ndarray, "n bands"] | None = None,
+    *,
+    rank: int | None = None,
+    max_rank: int = 32,
+) -> SpectralSubspace:
+    """The subspace of spectra that stands out of their noise.
+
+    Spectra are divided by the noise of their bands and by that of their rows. A direction counts if its singular
+    value exceeds the largest one of noise alone with the same standard deviations, which is simulated (parallel
+    analysis, Horn 1965; for even noise that is the edge of Marchenko and Pastur, ``sqrt(n) + sqrt(bands)``).
+
+    Args:
+        spectra: reflectance.
+        noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
+        valid: which values are measurements; spectra with any other are left out. All without it.
+        rank: number of directions to take, whatever the noise.
+        max_rank: most directions to take otherwise.
+
+    Raises:
+        InputError: too few spectra are whole.
+        ValueError: the noise is not above 0, or a rank is out of 1 to bands.
+    """
+    whole = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
+    if whole.sum() < FEWEST_SPECTRA:
+        raise InputError(
+            f"only {whole.sum()} of {len(spectra)} sampled spectra are free of flagged values, and a spectral basis "
+            f"needs {FEWEST_SPECTRA}; sample more pixels, or train with the direct head."
+        )
+    bands = spectra.shape[1]
+    if not 1 <= (max_rank if rank is None else rank) <= bands:
+        raise ValueError(f"the rank of a basis of {bands} bands is 1 to {bands}")
+    sample = spectra[whole].astype(np.float64)
+    deviation = estimate_noise(sample) if noise is None else np.broadcast_to(noise, spectra.shape)[whole]
+    deviation = np.broadcast_to(deviation, sample.shape).astype(np.float64)
+    if not (deviation > 0.0).all():
+        raise ValueError("the standard deviation of the noise is not above 0 everywhere")
+
+    of_band = np.sqrt(np.mean(deviation**2, axis=0))
+    even = of_band * np.sqrt(np.mean((deviation / of_band) ** 2, axis=1, keepdims=True))
+    # The triangle of a QR decomposition has the singular values and directions of the whole.
+    _, singular, directions = np.linalg.svd(np.linalg.qr(sample / even, mode="r"))
+    above = int((singular > _largest_of_noise(deviation / even)).sum())
+    chosen = rank or min(max(above, 1), max_rank)
+
+    span, _ = np.linalg.qr((directions[:chosen] * of_band).T)
+    _, energy, turn = np.linalg.svd(sample @ span, full_matrices=False)
+    basis = span @ turn.T
+    basis *= np.where((sample @ basis).sum(axis=0) < 0.0, -1.0, 1.0)
+    return SpectralSubspace(
+        basis=basis,
+        coefficient_rms=energy / np.sqrt(len(sample)),
+        mean_spectrum=basis @ (basis.T @ sample.mean(axis=0)),
+        rank_above_noise=above,
+        noise_rmse=float(np.sqrt(np.mean(deviation**2))),
+        noise_estimated=noise is None,
+        **_projection_errors(sample, deviation, basis),
+    )
+
+
+def _largest_of_noise(deviation: Float[np.ndarray, "n bands"]) -> float:
+    """Largest singular value that noise of these standard deviations reaches."""
+    rng = np.random.default_rng(0)
+    draws = [deviation * rng.standard_normal(deviation.shape) for _ in range(NOISE_DRAWS)]
+    return float(max(np.sqrt(np.linalg.eigvalsh(draw.T @ draw)[-1]) for draw in draws))
+
+
+def _projection_errors(
+    sample: Float[np.ndarray, "n bands"], deviation: Float[np.ndarray, "n bands"], basis: Float[np.ndarray, "bands k"]
+) -> dict[str, float]:
+    """What the projection takes off, and how much of it is more than the noise that lies outside the subspace."""
+    coefficients = sample @ basis
+    squared = np.square(sample - coefficients @ basis.T).sum(axis=1)
+    length = np.square(coefficients).sum(axis=1)
+    outside = 1.0 - np.square(basis).sum(axis=1)
+    of_noise = deviation**2 @ outside
+    lit = length > 0.0
+    angle = np.arctan2(np.sqrt(squared), np.sqrt(length))
+    noise_angle = np.arctan2(np.sqrt(of_noise[lit]), np.sqrt(length[lit]))
+    bands = sample.shape[1]
+    return {
+        "projection_rmse": float(np.sqrt(squared.mean() / bands)),
+        "projection_sam_rad": float(angle.mean()),
+        "excess_rmse": float(np.sqrt(max(0.0, (squared - of_noise).mean() / bands))),
+        "excess_sam_rad": float(np.sqrt(max(0.0, np.mean(angle[lit] ** 2 - noise_angle**2)))),
+    }
+
+
+def estimate_noise(spectra: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "bands"]:
+    """Standard deviation of each band's noise, told from the spectra alone.
+
+    Each band is predicted from its neighbours by linear regression (Roger and Arnold 1996). What is left is its own
+    noise and, by the squares of the regression's coefficients, that of the neighbours: a linear system for the
+    variances. Noise that neighbouring bands share is not seen, and signal that one band has alone is taken for noise.
+    """
+    count, bands = spectra.shape
+    reach = max(1, min(NEIGHBOUR_BANDS, count // 8, (bands - 1) // 2))
+    mixing = np.eye(bands)
+    left = np.empty(bands)
+    for band in range(bands):
+        start = min(max(band - reach, 0), max(bands - 2 * reach - 1, 0))
+        others = np.setdiff1d(np.arange(start, min(start + 2 * reach + 1, bands)), [band])
+        weights, _, _, _ = np.linalg.lstsq(spectra[:, others], spectra[:, band], rcond=None)
+        residual = spectra[:, band] - spectra[:, others] @ weights
+        left[band] = residual @ residual / (count - len(others))
+        mixing[band, others] = weights**2
+    variance = np.linalg.solve(mixing, left)
+    # The system may leave next to nothing where neighbours are much noisier.
+    return np.sqrt(np.clip(variance, 0.01 * left, left) + ROUNDING_NOISE**2)
+
+
+def pixel_noise(
+    uncertainty: ReflectanceUncertainty, spectra: Float[np.ndarray, "n bands"]
+) -> Float[np.ndarray, "n bands"]:
+    """Standard deviation by which a pixel's reflectance differs from another's of the same material.
+
+    The white reference's share is left out, one error that all pixels have in common, and the packed cubes' rounding
+    is added.
+    """
+    lit = np.maximum(spectra, 0.0)
+    return np.sqrt(uncertainty.constant + uncertainty.linear * lit + ROUNDING_NOISE**2)
+
+
+def sample_training_spectra(
+    frames: Sequence[PackedFrame], count: int = 4096, foreground_share: float | None = 0.5, seed: int = 0
+) -> tuple[Float[np.ndarray, "count bands"], Bool[np.ndarray, "count bands"]]:
+    """Reflectance at random pixels of the frames, and which values are measurements (0 where they are not).
+
+    Args:
+        frames: of a packed dataset.
+        count: number of pixels; only these are read.
+        foreground_share: share drawn from the foreground; None for pixels of whole frames.
+        seed: of the choice.
+    """
+    reader = PixelReader([frame.cube() for frame in frames])
+    masks = np.stack([frame.mask() for frame in frames])
+    batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_share)
+    return batch["spectral"], batch["valid"]

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import Frustums, RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.field_components.spatial_distortions import SceneContraction
+
+from hsi_sc_nerf.fields.band_groups import BandGroupField, composite_band_groups, group_sizes, weights_of_depths
+from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
+from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])
+SIZE = {
+    "num_images": 3,
+    "appearance_embedding_dim": 0,
+    "num_levels": 4,
+    "max_res": 32,
+    "log2_hashmap_size": 10,
+    "implementation": "torch",
+}
+BANDS = 7
+
+
+def contraction() -> SceneContraction:
+    return SceneContraction(order=float("inf"))
+
+
+def rays(count: int = 5, samples: int = 6, reach: float = 1.0, device: str = "cpu") -> RaySamples:
+    """Evenly spaced samples along random rays through the box."""
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.nn.functional.normalize(torch.randn(count, 1, 3, generator=generator), dim=-1)
+    edges = torch.linspace(0.05, reach, samples + 1)[:, None].expand(count, -1, -1)
+    frustums = Frustums(
+        origins=torch.full((count, samples, 3), -0.1),
+        directions=directions.expand(-1, samples, -1),
+        starts=edges[:, :-1],
+        ends=edges[:, 1:],
+        pixel_area=torch.ones(count, samples, 1),
+    )
+    return RaySamples(frustums, deltas=frustums.ends - frustums.starts).to(device)
+
+
+def field(kind: type[SpectralField] = SpectralField, **options) -> SpectralField:
+    """A field whose hash grid is not nearly constant, as it is when it is new."""
+    torch.manual_seed(0)
+    made = kind(BOX, BANDS, **{**SIZE, **options})
+    with torch.no_grad():
+        made.mlp_base.model[0].hash_table *= 1e4
+    return made
+
+
+def test_the_direct_head_has_a_reflectance_a_band():
+    spectra = field()(rays())[FieldHeadNames.RGB]
+    assert spectra.shape == (5, 6, BANDS)
+    assert ((spectra > 0) & (spectra < 1)).all()
+
+
+def test_coefficients_start_at_the_mean_and_are_not_bounded():
+    start = torch.tensor([1.4, -0.8, 0.0])
+    made = field(coefficient_start=start)
+    coefficients = made(rays())[FieldHeadNames.RGB]
+    assert coefficients.shape == (5, 6, 3)
+    torch.testing.assert_close(coefficients, start.expand_as(coefficients), atol=0.1, rtol=0)
+    assert coefficients.std(dim=(0, 1)).min() > 0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_decoding_commutes_with_compositing(device):
+    generator = torch.Generator().manual_seed(0)
+    decoder = BasisDecoder(torch.randn(204, 8, generator=generator), learnable=True).to(device)
+    torch.nn.init.normal_(decoder.correction, std=0.1, generator=None)
+    coefficients = torch.randn(16, 24, 8, generator=generator).to(device)
+    weights = torch.rand(16, 24, 1, generator=generator).softmax(1).to(device)
+    once = decoder((weights * coefficients).sum(-2))
+    torch.testing.assert_close(once, (weights * decoder(coefficients)).sum(-2), rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_projection_is_nearest(device):
+    generator = torch.Generator().manual_seed(0)
+    decoder = BasisDecoder(torch.rand(20, 3, generator=generator)).to(device)
+    coefficients = torch.randn(4, 5, 3, generator=generator).to(device)
+    torch.testing.assert_close(decoder.project(decoder(coefficients)), coefficients, rtol=1e-4, atol=1e-4)
+    spectra = torch.rand(9, 20, generator=generator).to(device)
+    left = spectra - decoder(decoder.project(spectra))
+    assert (left @ decoder.matrix()).abs().max() < 1e-5
+
+
+def test_only_a_learnable_basis_learns():
+    basis = torch.tensor([[1.0, 1e-3], [1.0, -1e-3], [1.0, 0.0]])
+    assert not list(BasisDecoder(basis).parameters())
+    decoder = BasisDecoder(basis, learnable=True)
+    torch.testing.assert_close(decoder.matrix(), basis)
+    with torch.no_grad():
+        decoder.correction += 0.01
+    change = (decoder.matrix() - basis) / basis.square().mean(0).sqrt()
+    torch.testing.assert_close(change, torch.full((3, 2), 0.01), rtol=1e-3, atol=0)
+    decoder(torch.ones(2)).sum().backward()
+    assert decoder.correction.grad is not None
+
+
+@pytest.mark.parametrize("distortion", [None, contraction()])
+@pytest.mark.parametrize("kind", ["one density", "band groups"])
+def test_density_gradient_is_that_of_the_log_density(distortion, kind):
+    groups = {} if kind == "one density" else {"kind": BandGroupField, "num_groups": 3}
+    made = field(**groups, spatial_distortion=distortion).double()
+    points = torch.tensor([[0.31, 0.22, -0.61], [-0.43, -0.17, 0.03], [0.52, -0.33, 0.11]], dtype=torch.double)
+    if distortion is not None:
+        points[0] *= 4.0  # in the contracted part
+    step = 1e-6
+    shifted = points[:, None] + step * torch.eye(3, dtype=torch.double)
+    difference = (made.density_fn(shifted).log() - made.density_fn(points[:, None]).log())[..., 0] / step
+    torch.testing.assert_close(made.density_gradient(points), difference, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("distortion", [None, contraction()])
+def test_normals_are_those_of_the_scene(distortion):
+    made = field(use_pred_normals=True, spatial_distortion=distortion)
+    samples = rays(reach=0.4 if distortion is None else 4.0)
+    normals = made(samples, compute_normals=True)[FieldHeadNames.NORMALS]
+    gradient = made.density_gradient(samples.frustums.get_positions().reshape(-1, 3)).view_as(normals)
+    torch.testing.assert_close(normals, -torch.nn.functional.normalize(gradient, dim=-1), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("reach", [3.0, 1e4])
+def test_the_box_ends_the_scene_unless_space_is_contracted(reach):
+    far = torch.tensor([[[reach, 0.0, 0.0]]])
+    for kind in (SpectralField, SpectralProposalField):
+        options = SIZE if kind is SpectralField else {"implementation": "torch"}
+        arguments = (BOX, BANDS) if kind is SpectralField else (BOX,)
+        assert kind(*arguments, **options).density_fn(far) == 0
+        assert kind(*arguments, **options, spatial_distortion=contraction()).density_fn(far) > 0
+
+
+def test_groups_are_neighbours_and_even():
+    assert group_sizes(204, 3) == (68, 68, 68)
+    assert group_sizes(7, 3) == (2, 2, 3)
+    assert group_sizes(7, 1) == (7,)
+    for groups in (0, 8):
+        with pytest.raises(ValueError, match="7 bands"):
+            group_sizes(7, groups)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_densities_give_the_slab_its_two_transmittances(device):
+    # A slab of reflectance r in front of nothing sends r (1 - exp(-sigma d)), however it is sampled.
+    density, reflectance, thickness, samples = torch.tensor([0.7, 9.0]), torch.tensor([0.2, 0.6, 0.9]), 0.5, 40
+    lengths = torch.rand(4, samples, 1, generator=torch.Generator().manual_seed(0))
+    lengths *= thickness / lengths.sum(1, keepdim=True)
+    channels = torch.cat([reflectance.expand(4, samples, 3), lengths * density], -1).to(device)
+    spectra, opacity = composite_band_groups(channels, (1, 2))
+    stopped = (1 - torch.exp(-density * thickness))[[0, 1, 1]]
+    torch.testing.assert_close(opacity.cpu(), stopped.expand(4, 3), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(spectra.cpu(), (reflectance * stopped).expand(4, 3), rtol=1e-5, atol=1e-6)
+
+
+def test_weights_are_nerfstudios():
+    samples = rays()
+    densities = torch.rand(5, 6, 1, generator=torch.Generator().manual_seed(0)) * 20
+    torch.testing.assert_close(weights_of_depths(densities * samples.deltas), samples.get_weights(densities))
+
+
+def test_one_group_is_the_usual_field():
+    usual, grouped, samples = field(), field(BandGroupField, num_groups=1), rays()
+    grouped.load_state_dict(usual.state_dict())
+    outputs, of_groups = usual(samples), grouped(samples)
+    density = outputs[FieldHeadNames.DENSITY]
+    torch.testing.assert_close(of_groups[FieldHeadNames.DENSITY], density)
+    expected = (samples.get_weights(density) * outputs[FieldHeadNames.RGB]).sum(-2)
+    spectra, opacity = composite_band_groups(of_groups[FieldHeadNames.RGB], grouped.group_sizes)
+    torch.testing.assert_close(spectra, expected)
+    torch.testing.assert_close(opacity, samples.get_weights(density).sum(-2).expand(-1, BANDS))
+
+
+def test_groups_have_their_own_densities_and_share_a_mean():
+    made, samples = field(BandGroupField, num_groups=3), rays(reach=0.3)
+    outputs = made(samples)
+    channels = outputs[FieldHeadNames.RGB]
+    depths = channels[..., BANDS:]
+    assert depths.shape == (5, 6, 3)
+    assert depths.std(dim=-1).min() > 0
+    torch.testing.assert_close((depths / samples.deltas).mean(-1, keepdim=True), outputs[FieldHeadNames.DENSITY])
+    composited, _ = composite_band_groups(channels, made.group_sizes)
+    (of_last_band,) = torch.autograd.grad(composited[:, -1].sum(), channels)
+    assert (of_last_band[..., BANDS : BANDS + 2] == 0).all()
+    assert (of_last_band[..., BANDS + 2] != 0).any()
