@@ -62,7 +62,7 @@ def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()
     kept = first.base_dir / "stage-full-frame"
-    assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
+    assert {path.name for path in kept.iterdir()} == {"step-000000002.ckpt", "step-000000002.json"}
 
     second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
     assert second._start_step == 3

@@ -1,7 +1,16 @@
 import pytest
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.models.stages import Stage, StageConfig, full_frame_stage, masked_stage, plan_stages
+from hsi_sc_nerf.models.stages import (
+    Stage,
+    StageConfig,
+    exponential_decay,
+    full_frame_stage,
+    masked_stage,
+    plan_after,
+    plan_stages,
+    step_seed,
+)
 
 
 def lengths(plan):
@@ -46,20 +55,80 @@ def test_every_step_belongs_to_the_stage_that_covers_it():
 
 def test_learning_rate_falls_exponentially_within_the_stage():
     stage = Stage(StageConfig("a", 1.0, lr_start=0.5, lr_end=0.005), start=10, end=111)
-    assert stage.lr_factor(10) == pytest.approx(0.5)
-    assert stage.lr_factor(60) == pytest.approx(0.05)
-    assert stage.lr_factor(110) == pytest.approx(0.005)
+    assert [stage.lr_factor(step, "fields") for step in (10, 60, 110)] == pytest.approx([0.5, 0.05, 0.005])
+
+
+def test_a_group_may_have_learning_rates_of_its_own():
+    stage = Stage(StageConfig("a", 1.0, lr_end=1.0, group_lr={"camera_opt": (2.0, 0.02)}), start=10, end=111)
+    assert [stage.lr_factor(step, "camera_opt") for step in (10, 60, 110)] == pytest.approx([2.0, 0.2, 0.02])
+    assert stage.lr_factor(110, "fields") == 1.0
+
+
+def test_released_schedule_hardly_decays_over_the_stages():
+    """nerfacto's exponential decay to 1e-4 of 1e-2 over 200k steps, of which the paper runs 20k, then 20k again."""
+    ends = [exponential_decay(0.01, 200_000, step) for step in (0, 20_000, 40_000)]
+    assert ends == pytest.approx([1.0, 0.630957, 0.398107], rel=1e-5)
+    first = Stage(StageConfig("a", 1.0, lr_start=ends[0], lr_end=ends[1]), start=0, end=20_001)
+    assert first.lr_factor(7_000, "fields") == pytest.approx(exponential_decay(0.01, 200_000, 7_000))
+    assert exponential_decay(0.01, 200_000, 300_000) == 0.01
 
 
 def test_warm_up_rises_from_nearly_nothing():
     stage = Stage(StageConfig("a", 1.0, lr_end=1.0, warmup_iterations=4), start=0, end=100)
-    assert [stage.lr_factor(step) for step in (0, 1, 4, 50)] == pytest.approx([0.2, 0.4, 1.0, 1.0])
+    assert [stage.lr_factor(step, "fields") for step in (0, 1, 4, 50)] == pytest.approx([0.2, 0.4, 1.0, 1.0])
 
 
 def test_poses_move_once_the_scene_has_a_shape():
-    first = Stage(StageConfig("a", 1.0, poses_after=0.25), start=10, end=30)
-    assert [step for step in range(10, 30) if first.refines_poses(step)] == list(range(15, 30))
-    at_once = Stage(StageConfig("a", 1.0, poses_after=0.0), start=10, end=12)
-    assert [at_once.refines_poses(step) for step in (10, 11)] == [True, True]
-    never = Stage(StageConfig("b", 1.0, optimize_poses=False), start=30, end=50)
-    assert not any(never.refines_poses(step) for step in range(30, 50))
+    first = Stage(StageConfig("a", 1.0, learn_after={"camera_opt": 0.25}), start=10, end=30)
+    assert [step for step in range(10, 30) if first.learns("camera_opt", step)] == list(range(15, 30))
+    assert all(first.learns("fields", step) for step in range(10, 30))
+    at_once = Stage(StageConfig("a", 1.0, learn_after={}), start=10, end=12)
+    assert [at_once.learns("camera_opt", step) for step in (10, 11)] == [True, True]
+
+
+def test_any_group_can_be_frozen():
+    stage = Stage(StageConfig("b", 1.0, frozen_groups=("camera_opt", "background")), start=30, end=50)
+    assert [stage.learns(group, 49) for group in ("camera_opt", "background", "fields")] == [False, False, True]
+    assert Stage(masked_stage(), 0, 2).learns("camera_opt", 1) is False
+
+
+def test_a_stage_sets_the_loss_weights_that_it_names():
+    assert StageConfig("a", 1.0).loss_weights() == {}
+    assert StageConfig("a", 1.0, angular_loss_mult=0.0).loss_weights() == {"angular_loss_mult": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"foreground_share": 1.2}, "foreground-share 1.2"),
+        ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
+        ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
+        ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),
+        ({"learn_after": {"table": 0.1}}, "named 'table'"),
+    ],
+)
+def test_impossible_stages_are_refused(fields, sentence):
+    with pytest.raises(ValueError, match=f"late: .*{sentence}"):
+        StageConfig("late", 1.0, **({"learn_after": {}} | fields)).check(("fields", "camera_opt"))
+    StageConfig("late", 1.0, foreground_share=1.0).check(("fields", "camera_opt"))
+
+
+def test_a_completed_stage_is_followed_by_the_next_however_long_it_was():
+    plan = plan_stages((StageConfig("a", 1.0), StageConfig("b", 1.0), StageConfig("c", 1.0)), 30)
+    for next_step in (4, 10, 25):
+        after = plan_after(plan, "a", next_step)
+        assert [(stage.config.name, stage.end) for stage in after.stages] == [
+            ("a", next_step),
+            ("b", next_step + 10),
+            ("c", next_step + 20),
+        ]
+        assert after.at(next_step).config.name == "b"
+    assert plan_after(plan, "a", 10) == plan
+    assert plan_after(plan, "c", 12) == plan
+    assert plan_after(plan, "gone", 12) == plan
+
+
+def test_every_step_has_random_numbers_of_its_own():
+    seeds = {step_seed(seed, step) for seed in (0, 1) for step in range(1000)}
+    assert len(seeds) == 2000
+    assert step_seed(3, 7) == step_seed(3, 7)

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler, spread_over
 
 
 @dataclass
@@ -64,20 +64,28 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )
-        self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
+        # Pictures in the logs show the same view every time, so that they can be compared.
+        self.eval_dataloader = FixedIndicesEvalDataloader(  # type: ignore[assignment]
+            input_dataset=self.eval_dataset, image_indices=(0,), device=self.device
+        )
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """The training batch of ``step``: always the same for the same step, stage and seed."""
         self.train_count += 1
-        return self._rays(self.train_pixel_sampler, self.train_ray_generator, step, self.foreground_share)
+        batch = self.train_pixel_sampler.sample(step, self.foreground_share)
+        return self._with_rays(batch, self.train_ray_generator)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Random pixels of held-out views."""
         self.eval_count += 1
-        return self._rays(self.eval_pixel_sampler, self.eval_ray_generator, step, None)
+        return self._with_rays(self.eval_pixel_sampler.sample(step), self.eval_ray_generator)
 
-    def _rays(
-        self, pixels: PixelSampler, generator: RayGenerator, step: int, foreground_share: float | None
-    ) -> tuple[RayBundle, dict]:
-        batch = {key: torch.from_numpy(value) for key, value in pixels.sample(step, foreground_share).items()}
+    def fixed_eval_pixels(self, count: int = 4) -> tuple[RayBundle, dict]:
+        """Some pixels of the object in the first held-out view (of all of it, where it has none), always the same."""
+        mask = self.eval_pixel_sampler.masks[:1]
+        indices = spread_over(mask if mask.any() else ~mask, count)
+        return self._with_rays(self.eval_pixel_sampler.at(indices), self.eval_ray_generator)
+
+    def _with_rays(self, pixels: dict[str, np.ndarray], generator: RayGenerator) -> tuple[RayBundle, dict]:
+        batch = {key: torch.from_numpy(value) for key, value in pixels.items()}
         return generator(batch["indices"]), batch

@@ -105,13 +105,14 @@ class PixelSampler:
 
         Args:
             step: training step.
-            foreground_share: share of the pixels drawn from the foreground, the others from the rest of the
-                frames; ``None`` draws evenly from whole frames.
+            foreground_share: share of the pixels drawn from the foreground, in [0, 1], the others from the rest of
+                the frames; ``None`` draws evenly from whole frames.
 
         Returns:
-            ``indices`` (count, 3) int64: frame, line, sample; ``spectral`` (count, bands) float32 reflectance;
-            ``mask`` (count, 1) bool: foreground; where the cubes have flagged values also ``valid`` (count, bands)
-            bool: which of ``spectral`` were measured (0 otherwise).
+            What `at` returns.
+
+        Raises:
+            InputError: pixels of the foreground are asked for, and there are none.
         """
         rng = np.random.default_rng((self.seed, step))
         count = self.num_rays_per_batch
@@ -119,6 +120,11 @@ class PixelSampler:
             flat = rng.integers(0, self.masks.size, count)
         else:
             in_foreground = round(count * foreground_share)
+            if in_foreground > 0 and len(self._foreground) == 0:
+                raise InputError(
+                    "the masks of all training frames are empty, so that there is no object to train on; look at "
+                    "report/ in the dataset and process again."
+                )
             num_rest = self.masks.size - len(self._foreground)
             flat = np.concatenate(
                 [
@@ -126,10 +132,20 @@ class PixelSampler:
                     self._rest(rng.integers(0, num_rest, count - in_foreground)),
                 ]
             )
-        indices = np.stack(np.unravel_index(flat, self.masks.shape), axis=1)
+        return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
+
+    def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
+        """Given pixels (frame, line, sample).
+
+        Returns:
+            ``indices`` (count, 3) int64: frame, line, sample; ``spectral`` (count, bands) float32 reflectance;
+            ``mask`` (count, 1) bool: foreground; where the cubes have flagged values also ``valid`` (count, bands)
+            bool: which of ``spectral`` were measured (0 otherwise).
+        """
+        frame, line, sample = indices.T
         return {
             "indices": indices,
-            "mask": self.masks.reshape(-1)[flat, None],
+            "mask": self.masks[frame, line, sample, None],
             **self._values(self.reader.read(indices)),
         }
 
@@ -140,6 +156,14 @@ class PixelSampler:
         more of the rest before them than it has.
         """
         return ranks + np.searchsorted(self._rest_before, ranks, side="right")
+
+
+def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:
+    """Pixels (frame, line, sample) evenly spread over the foreground in reading order, fewer where it is smaller."""
+    foreground = np.flatnonzero(masks)
+    count = min(count, len(foreground))
+    chosen = foreground[((np.arange(count) + 0.5) / max(count, 1) * len(foreground)).astype(int)]
+    return np.stack(np.unravel_index(chosen, masks.shape), axis=1)
 
 
 def _values(counts: UInt16[np.ndarray, "count bands"]) -> dict[str, np.ndarray]:

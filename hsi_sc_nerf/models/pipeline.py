@@ -1,11 +1,19 @@
-"""nerfstudio's pipeline, with an evaluation that also holds for a single held-out view."""
+"""nerfstudio's pipeline, whose evaluation uses averaged weights where there are any and holds for a single view."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch import Tensor
+
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.models.training_log import draw_spectra
+from hsi_sc_nerf.models.weight_average import WeightAverage
 
 
 @dataclass
@@ -16,7 +24,44 @@ class SpectralPipelineConfig(VanillaPipelineConfig):
 
 
 class SpectralPipeline(VanillaPipeline):
-    """Differs from nerfstudio's only in the spread over one view."""
+    """Data and model of a run, and how the model is evaluated.
+
+    Attributes:
+        weight_average: what is evaluated in place of the weights; the trainer sets it. None: the weights.
+    """
+
+    datamanager: SpectralDataManager
+    weight_average: WeightAverage | None = None
+
+    def averaged(self) -> AbstractContextManager[None]:
+        """The model has its averaged weights within this context, where there are any."""
+        return nullcontext() if self.weight_average is None else self.weight_average.in_use()
+
+    def get_eval_loss_dict(self, step: int) -> tuple[dict, dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs, losses and metrics of random pixels of held-out views."""
+        with self.averaged():
+            return super().get_eval_loss_dict(step)
+
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics and pictures of one held-out view, and the spectra of some of its pixels."""
+        with self.averaged():
+            metrics, images = super().get_eval_image_metrics_and_images(step)
+            images["spectra"] = self._spectra_picture()
+        return metrics, images
+
+    def _spectra_picture(self) -> Float[Tensor, "h w 3"]:
+        rays, batch = self.datamanager.fixed_eval_pixels()
+        self.eval()
+        with torch.no_grad():
+            rendered = self.model(rays)["spectral"].cpu()
+        self.train()
+        return draw_spectra(
+            self.datamanager.eval_dataset.metadata["wavelengths_nm"],
+            batch["spectral"],
+            rendered,
+            [f"line {line}, sample {sample}" for _, line, sample in batch["indices"].tolist()],
+            batch.get("valid"),
+        )
 
     def get_average_image_metrics(
         self,
@@ -30,7 +75,8 @@ class SpectralPipeline(VanillaPipeline):
 
         nerfstudio's is NaN there, which no JSON reader takes.
         """
-        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
+        with self.averaged():
+            metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
         if get_std and len(data_loader) == 1:
             metrics |= dict.fromkeys((name for name in metrics if name.endswith("_std")), 0.0)
         return metrics

@@ -1,22 +1,43 @@
-"""Both stages of training in one run, guarded against steps that turn non-finite."""
+"""Both stages of training in one run, which goes on where it was killed and skips steps that turn non-finite."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
 
+import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.checkpoints import (
+    checkpoint_path,
+    find_checkpoint,
+    link_checkpoint,
+    read_checkpoint,
+    write_checkpoint,
+)
 from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
-from hsi_sc_nerf.models.spectral_model import SpectralModel
-from hsi_sc_nerf.models.stages import Stage, StageConfig, full_frame_stage, masked_stage, plan_stages
+from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
+from hsi_sc_nerf.models.stages import (
+    Stage,
+    StageConfig,
+    full_frame_stage,
+    masked_stage,
+    plan_after,
+    plan_stages,
+    step_seed,
+)
+from hsi_sc_nerf.models.training_log import flush_logs, log_learning_rates, stage_summary
 from hsi_sc_nerf.models.training_progress import TrainingProgress
+from hsi_sc_nerf.models.weight_average import WeightAverage
 
 
 @dataclass
@@ -28,29 +49,63 @@ class StagedTrainerConfig(TrainerConfig):
     """First stage: whole frames."""
     masked: StageConfig = field(default_factory=masked_stage)
     """Second stage: the masked object."""
+    ema_decay: float | None = None
+    """Evaluate, save and export the average of the weights over the last steps instead of the last step's weights,
+    which still jitter with the random pixels. 0.99 averages over about 100 steps, beginning anew in each stage. None:
+    the last step's weights."""
+    evaluate_stages: bool = True
+    """Evaluate the held-out views at the end of each stage and keep the result beside the stage's checkpoint."""
     max_nonfinite_steps: int = 20
     """Stop the run after this many skipped steps in a row."""
 
 
 class StagedTrainer(Trainer):
-    """Trains stage after stage; stage, learning rate and batches of a step depend on the step alone."""
+    """Trains stage after stage.
+
+    What a step does follows from the step, the configuration and what a checkpoint holds: a run that was killed and
+    resumed comes to the same weights.
+    """
 
     config: StagedTrainerConfig
     optimizers: GuardedOptimizers
+    pipeline: SpectralPipeline
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as nerfstudio does, then place the stages."""
+        stages = (self.config.full_frame, self.config.masked)
         try:
-            self.plan = plan_stages((self.config.full_frame, self.config.masked), self.config.max_num_iterations)
+            for stage in stages:
+                stage.check(self.config.optimizers)
+            if self.config.ema_decay is not None and not 0.0 < self.config.ema_decay < 1.0:
+                raise ValueError(f"--ema-decay {self.config.ema_decay} is not between 0 and 1")
+            self.plan = plan_stages(stages, self.config.max_num_iterations)
         except ValueError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         self._stage: Stage | None = None
+        self._frozen: set[str] | None = None
+        self._steps_since_update = 0
+        self._saved_step: int | None = None
         self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
-        super().setup(test_mode)
+        try:
+            super().setup(test_mode)
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
     def setup_optimizers(self) -> GuardedOptimizers:
-        """Optimisers that skip non-finite steps."""
-        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        """Optimisers that skip non-finite steps, and the average of what they change."""
+        optimizers = GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        self._trainable = {
+            group: [parameter for parameter in parameters if parameter.requires_grad]
+            for group, parameters in optimizers.parameters.items()
+        }
+        if self.config.ema_decay is not None:
+            learned = {name: value for name, value in self.pipeline.named_parameters() if value.requires_grad}
+            self.pipeline.weight_average = WeightAverage(learned, self.config.ema_decay)
+        return optimizers
+
+    @property
+    def _model(self) -> SpectralModel:
+        return cast(SpectralModel, self.pipeline.model)
 
     def train(self) -> None:
         """Train what is left of the plan: nerfstudio would add ``max_num_iterations`` to a resumed run."""
@@ -62,63 +117,167 @@ class StagedTrainer(Trainer):
             )
         self.config = dataclasses.replace(self.config, max_num_iterations=left)
         try:
+            before = self.plan.at(self._start_step - 1)
+            if self._start_step == before.end and not checkpoint_path(self._kept_in(before), before.end - 1).exists():
+                self._keep(before)  # killed right at the switch, or begun from another run's stage
             with TrainingProgress(self.plan.num_iterations, self._start_step) as self._progress:
                 super().train()
         except TrainingDivergedError as error:
             # Skipped steps leave the weights as they were: these are the last good ones.
             self.save_checkpoint(self.step)
             raise SystemExit(f"hsi-sc-nerf: {error}. The last good checkpoint is in {self.checkpoint_dir}") from error
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        finally:
+            flush_logs()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One guarded step of the stage that it belongs to."""
         stage = self.plan.at(step)
         if stage is not self._stage:
-            self._enter(stage, step)
-        cast(SpectralModel, self.pipeline.model).camera_optimizer.freeze(not stage.refines_poses(step))
-        factor = stage.lr_factor(step)
-        for name, optimizer in self.optimizers.optimizers.items():
-            for group in optimizer.param_groups:
-                group["lr"] = self.config.optimizers[name]["optimizer"].lr * factor
+            self._enter(stage)
+        self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
+        rates = self._set_learning_rates(stage, step)
+        torch.manual_seed(step_seed(self.config.machine.seed, step))
+        sampler = self._model.proposal_sampler
+        # Evaluations and the viewer move these counters, too, and no checkpoint of nerfstudio's holds them.
+        sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
         loss, loss_dict, metrics_dict = super().train_iteration(step)
 
+        self._steps_since_update = sampler._steps_since_update + 1
+        if self.pipeline.weight_average is not None:
+            self.pipeline.weight_average.update(step - stage.start + 1)
         complaint = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
         if complaint is not None:
             CONSOLE.print(f"[yellow]{complaint}")
-        metrics_dict["lr_factor"] = factor  # type: ignore[assignment]
+        if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+            log_learning_rates(rates, step)
         self._progress.update(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
 
-    def _enter(self, stage: Stage, step: int) -> None:
-        """Begin ``stage``; the stage before it, if it ran here, leaves its last checkpoint behind."""
-        if self._stage is not None:
-            self.save_checkpoint(step - 1)
-            kept = self.base_dir / f"stage-{self._stage.config.name}"
-            kept.mkdir(exist_ok=True)
-            shutil.copy2(self._checkpoint_path(step - 1), kept)
-        cast(SpectralDataManager, self.pipeline.datamanager).foreground_share = stage.config.foreground_share
+    def _enter(self, stage: Stage) -> None:
+        """Begin, or go on with, ``stage``."""
+        self.pipeline.datamanager.foreground_share = stage.config.foreground_share
+        self._model.config = dataclasses.replace(
+            cast(SpectralModelConfig, self.config.pipeline.model), **stage.config.loss_weights()
+        )
         self._stage = stage
 
-    def _checkpoint_path(self, step: int) -> Path:
-        return self.checkpoint_dir / f"step-{step:09d}.ckpt"
+    def _freeze(self, frozen: set[str]) -> None:
+        """Let all parameter groups learn but these."""
+        if frozen == self._frozen:
+            return
+        for group, parameters in self._trainable.items():
+            for parameter in parameters:
+                parameter.requires_grad_(group not in frozen)
+                parameter.grad = None
+        # Some modes of refinement throw away what was learned.
+        self._model.camera_optimizer.freeze("camera_opt" in frozen)
+        self._frozen = frozen
 
+    def _set_learning_rates(self, stage: Stage, step: int) -> dict[str, float]:
+        rates = {
+            name: self.config.optimizers[name]["optimizer"].lr * stage.lr_factor(step, name)
+            for name in self.optimizers.optimizers
+        }
+        for name, optimizer in self.optimizers.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = rates[name]
+        return rates
+
+    def eval_iteration(self, step: int) -> None:
+        """nerfstudio's evaluations; after the last step of a stage, what the stage leaves behind."""
+        super().eval_iteration(step)
+        stage = self.plan.at(step)
+        if step == stage.end - 1:
+            self._keep(stage)
+
+    def _kept_in(self, stage: Stage) -> Path:
+        return self.base_dir / f"stage-{stage.config.name}"
+
+    def _keep(self, stage: Stage) -> None:
+        """Keep the last checkpoint of a finished stage, and what it gives on the held-out views."""
+        step = stage.end - 1
+        kept = checkpoint_path(self._kept_in(stage), step)
+        self.save_checkpoint(step)
+        if self.config.evaluate_stages:
+            metrics = self.pipeline.get_average_eval_image_metrics(step=step, get_std=True)
+            writer.put_dict(name="Eval Images Metrics Dict (all images)", scalar_dict=metrics, step=step)
+            CONSOLE.print(stage_summary(stage.config.name, metrics))
+            results = {"stage": stage.config.name, "step": step, "checkpoint": kept.name, "results": metrics}
+            write_json(kept.with_suffix(".json"), results)
+        link_checkpoint(checkpoint_path(self.checkpoint_dir, step), kept.parent)
+        flush_logs()
+
+    def _after_train(self) -> None:
+        """Save, then finish as nerfstudio does, with the averaged weights where there are any."""
+        self.save_checkpoint(self.step)
+        if self.pipeline.weight_average is not None:
+            self.pipeline.weight_average.swap()
+            self.pipeline.weight_average = None
+        super()._after_train()
+
+    @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint whole or not at all, then delete the older ones where the configuration says so."""
-        final_dir = self.checkpoint_dir
-        self.checkpoint_dir = final_dir.with_name(f".{final_dir.name}-writing")
+        """Write a checkpoint whole or not at all, then delete the older ones where the configuration says so.
+
+        ``pipeline`` holds the averaged weights, where there are any: nerfstudio's commands take them from there.
+        ``training`` holds what else a resumed run needs to come to the same result.
+        """
+        if step == self._saved_step:
+            return
+        stage, average = self.plan.at(step), self.pipeline.weight_average
+        with self.pipeline.averaged():
+            pipeline = self.pipeline.state_dict()
+        state = {
+            "step": step,
+            "pipeline": pipeline,
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {},
+            "scalers": self.grad_scaler.state_dict(),
+            "training": {
+                "completed_stage": stage.config.name if step == stage.end - 1 else None,
+                "steps_since_update": self._steps_since_update,
+                "weights": {} if average is None else average.weights(),
+            },
+        }
+        path = checkpoint_path(self.checkpoint_dir, step)
         try:
-            super().save_checkpoint(step)
-            final_dir.mkdir(parents=True, exist_ok=True)
-            os.replace(self._checkpoint_path(step), final_dir / self._checkpoint_path(step).name)
-        except (OSError, RuntimeError) as error:
-            raise SystemExit(
-                f"hsi-sc-nerf: the checkpoint of step {step} could not be written to {final_dir} ({error}); free "
-                "some space and resume with --load-dir from the checkpoint before it"
-            ) from error
-        finally:
-            shutil.rmtree(self.checkpoint_dir, ignore_errors=True)
-            self.checkpoint_dir = final_dir
+            write_checkpoint(path, state)
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        self._saved_step = step
         if self.config.save_only_latest_checkpoint:
-            for older in final_dir.glob("*.ckpt"):
-                if older != self._checkpoint_path(step):
+            for older in self.checkpoint_dir.glob("*.ckpt"):
+                if older != path:
                     older.unlink()
+
+    def _load_checkpoint(self) -> None:
+        """Load what ``save_checkpoint`` wrote; nerfstudio's own method knows nothing of ``training``."""
+        if self.config.load_dir is not None:
+            path = find_checkpoint(self.config.load_dir, self.config.load_step)
+        elif self.config.load_checkpoint is not None:
+            path = self.config.load_checkpoint
+        else:
+            return
+        state = read_checkpoint(path)
+        unlike = set(state["pipeline"]) ^ set(self.pipeline.state_dict())
+        if unlike or set(state["optimizers"]) != set(self.optimizers.optimizers):
+            raise InputError(
+                f"{path}: was made with other settings of the model ({', '.join(sorted(unlike)[:3])}); take those of "
+                "the config.yml beside it."
+            )
+        self._start_step = state["step"] + 1
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        if self.pipeline.weight_average is not None:
+            self.pipeline.weight_average.restart()
+        self.optimizers.load_optimizers(state["optimizers"])
+        self.grad_scaler.load_state_dict(state["scalers"])
+        training = state.get("training", {})
+        if training.get("weights"):
+            self.pipeline.load_state_dict(training["weights"], strict=False)
+        self._steps_since_update = training.get("steps_since_update", 0)
+        if training.get("completed_stage") is not None:
+            self.plan = plan_after(self.plan, training["completed_stage"], self._start_step)
+        CONSOLE.print(f"Going on from {path}")

@@ -2,20 +2,23 @@
 
 The paper (section "Training Protocol") trains on full frames with pose optimisation, then on the masked object with
 the camera optimiser off. Everything that differs between the stages is a field of `StageConfig`; which stage a step
-belongs to, and its learning rate, follow from the step alone, so a resumed run continues as if never interrupted.
+belongs to, its learning rates and its random numbers follow from the step alone, so a resumed run continues as if
+never interrupted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from hsi_sc_nerf import paper
 
 
 @dataclass
 class StageConfig:
-    """One stage of training."""
+    """One stage of training. Parameter groups are those of --optimizers: fields, proposal_networks, camera_opt."""
 
     name: str
     """Shown in the progress bar, and the name of the stage's checkpoint folder."""
@@ -24,18 +27,51 @@ class StageConfig:
     num_iterations: int | None = None
     """Length of this stage on its own; where it is given it goes before the share."""
     foreground_share: float | None = None
-    """Share of the rays that hit the foreground masks; the others keep empty space empty. None: whole frames."""
-    optimize_poses: bool = True
-    """Refine the camera poses during this stage; otherwise what was learned so far is frozen, and kept unless the
-    refinement's mode says otherwise."""
-    poses_after: float = 0.3
-    """Share of the stage's steps that pass before the poses move: fog tells nothing of where the camera is."""
+    """Share of the rays that hit the foreground masks; the others keep empty space empty. 1: the object's pixels
+    alone, as in the paper. None: whole frames."""
+    angular_loss_mult: float | None = None
+    """Weight of the spectral angle's loss in this stage. None: the model's."""
+    hsi_loss_mult: float | None = None
+    """Weight of the squared error in this stage. None: the model's."""
+    frozen_groups: tuple[str, ...] = ()
+    """Parameter groups that this stage does not change: what they learned so far stays in force (camera_opt: unless
+    the pose refinement's mode says otherwise)."""
+    learn_after: dict[str, float] = field(default_factory=lambda: {"camera_opt": 0.3})
+    """Share of the stage's steps that pass before a parameter group begins to learn. Poses wait by default: fog tells
+    nothing of where the camera is."""
     lr_start: float = 1.0
     """Factor on every learning rate at the start of the stage."""
     lr_end: float = 0.5
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
+    group_lr: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Both factors for single parameter groups, in place of those above."""
     warmup_iterations: int = 0
     """Steps over which the learning rate rises linearly from nothing at the start of the stage."""
+
+    def loss_weights(self) -> dict[str, float]:
+        """Loss weights of the model that this stage sets, by their names in the model's configuration."""
+        weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
+        return {name: weight for name, weight in weights.items() if weight is not None}
+
+    def check(self, groups: Collection[str]) -> None:
+        """Refuse what cannot be trained with.
+
+        Args:
+            groups: names of all parameter groups that have an optimiser.
+
+        Raises:
+            ValueError: one sentence that names the stage and its field.
+        """
+        if self.foreground_share is not None and not 0.0 <= self.foreground_share <= 1.0:
+            raise ValueError(f"{self.name}: foreground-share {self.foreground_share} is not between 0 and 1")
+        factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
+        factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
+        for option, factor in factors.items():
+            if factor <= 0.0:
+                raise ValueError(f"{self.name}: {option} {factor} is not above 0; frozen-groups stops a group")
+        for group in (*self.frozen_groups, *self.learn_after, *self.group_lr):
+            if group not in groups:
+                raise ValueError(f"{self.name}: no parameter group is named {group!r}; there are {', '.join(groups)}")
 
 
 def full_frame_stage() -> StageConfig:
@@ -49,10 +85,24 @@ def masked_stage() -> StageConfig:
         name="masked",
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
-        optimize_poses=False,
+        frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,
     )
+
+
+def exponential_decay(final_factor: float, schedule_steps: int, step: int) -> float:
+    """Factor on a learning rate at ``step`` of a schedule that falls to ``final_factor`` over ``schedule_steps``.
+
+    A schedule that is longer than the run, as the paper's released settings have it (to 0.01 over 200,000 steps, of
+    which 20,000 are run), is expressed by its values at the ends of the stages.
+    """
+    return final_factor ** min(1.0, step / schedule_steps)
+
+
+def step_seed(seed: int, step: int) -> int:
+    """Seed of the random numbers of one training step, unlike those of all other steps and seeds."""
+    return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0])
 
 
 @dataclass(frozen=True)
@@ -63,16 +113,17 @@ class Stage:
     start: int
     end: int
 
-    def refines_poses(self, step: int) -> bool:
-        """Whether the poses may move at ``step``."""
-        waiting = int(self.config.poses_after * (self.end - self.start))
-        return self.config.optimize_poses and step >= self.start + waiting
+    def learns(self, group: str, step: int) -> bool:
+        """Whether the parameters of ``group`` change at ``step``."""
+        waiting = int(self.config.learn_after.get(group, 0.0) * (self.end - self.start))
+        return group not in self.config.frozen_groups and step >= self.start + waiting
 
-    def lr_factor(self, step: int) -> float:
-        """Factor on the learning rates at ``step``: exponential from ``lr_start`` to ``lr_end``, after a warm-up."""
+    def lr_factor(self, step: int, group: str) -> float:
+        """Factor on the learning rate of ``group`` at ``step``: exponential between its two, after a warm-up."""
+        first, last = self.config.group_lr.get(group, (self.config.lr_start, self.config.lr_end))
         done = step - self.start
         progress = done / max(1, self.end - self.start - 1)
-        decayed = self.config.lr_start * (self.config.lr_end / self.config.lr_start) ** min(1.0, progress)
+        decayed = first * (last / first) ** min(1.0, progress)
         return decayed * min(1.0, (done + 1) / (self.config.warmup_iterations + 1))
 
 
@@ -93,6 +144,24 @@ class StagePlan:
             if step < stage.end:
                 return stage
         return self.stages[-1]
+
+
+def plan_after(plan: StagePlan, completed: str, next_step: int) -> StagePlan:
+    """The plan of a run that goes on at ``next_step`` from the end of the stage named ``completed``.
+
+    The stages after it follow at once, with the lengths that ``plan`` gives them, however long the completed one was.
+    Where it is the last stage, or none of the plan's, the plan stays as it is.
+    """
+    names = [stage.config.name for stage in plan.stages]
+    if completed not in names[:-1]:
+        return plan
+    position = names.index(completed)
+    done = plan.stages[position]
+    shift = next_step - done.end
+    later = (
+        replace(stage, start=stage.start + shift, end=stage.end + shift) for stage in plan.stages[position + 1 :]
+    )
+    return StagePlan((replace(done, start=min(done.start, next_step - 1), end=next_step), *later))
 
 
 def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> StagePlan:
