@@ -219,9 +219,9 @@ def test_one_displaced_marker_is_no_knocked_frame():
     assert 0.2 < found.away_px[3] < 0.75
 
 
-@pytest.mark.parametrize(("frames", "which"), [(12, (4,)), (30, (0, 13, 22))])
+@pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
 def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames, which):
-    scene = MarkerScene(size_px=160, frames=frames, knocked=which)
+    scene = MarkerScene(size_px=128, frames=frames, knocked=which)
     names = scene.names()
     poses = estimate_turntable_poses(scene.render(), names, marker_side_m=SIDE_M, progress=False)
     assert poses.model == "turntable"
@@ -236,7 +236,7 @@ def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames
 
 
 def test_a_session_on_a_wobbling_table_keeps_its_frames():
-    scene = MarkerScene(size_px=160, frames=16, wobble_deg=0.5)
+    scene = MarkerScene(size_px=128, frames=10, wobble_deg=0.5)
     poses = estimate_turntable_poses(scene.render(), scene.names(), marker_side_m=SIDE_M, progress=False)
     assert poses.model == "free poses"
     assert poses.used.all()
