@@ -203,7 +203,7 @@ def quieten(
 
     mean = local_mean(image)
     # About the mean of each band, which keeps single precision from cancelling.
-    offset = np.nanmean(image, axis=(0, 1)) if measured.any() else 0.0
+    offset = np.where(measured, image, 0.0).sum(axis=(0, 1)) / np.maximum(measured.sum(axis=(0, 1)), 1)
     varies = local_mean((image - offset) ** 2) - (mean - offset) ** 2
     kept = np.maximum(1.0 - local_mean(variance) / np.maximum(varies, np.finfo(np.float32).tiny), 0.0)
     return np.where(measured, mean + kept * (image - mean), np.nan).astype(np.float32)
@@ -225,9 +225,9 @@ def fill_in(
     # Bands that miss the same cells, nearly always all of them, share their system of equations.
     bands_by_pattern: dict[bytes, list[int]] = {}
     for band in np.flatnonzero(missing.any(axis=0) & ~nowhere):
-        bands_by_pattern.setdefault(missing[:, band].tobytes(), []).append(band)
+        bands_by_pattern.setdefault(missing[:, band].tobytes(), []).append(int(band))
     laplacian = _grid_laplacian(*image.shape[:2])
-    for bands in bands_by_pattern.values():
+    for bands in map(np.array, bands_by_pattern.values()):
         unknown = missing[:, bands[0]]
         rows = laplacian[unknown]
         pull = rows[:, ~unknown] @ flat[np.ix_(~unknown, bands)].astype(float)
