@@ -23,12 +23,14 @@ from rich.table import Table
 
 from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.estimate import TurntablePoses, estimate_turntable_poses
+from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.geometry import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 
-TABLE_STARTS, TABLE_ENDS = "<!-- markers table -->", "<!-- end of markers table -->"
+TABLE = "markers table"
 COLUMNS = (
     "case",
     "frames",
@@ -174,18 +176,16 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
     images = grey_images(simulation)
     if case.alter is not None:
         images = case.alter(images)
-    started = time.perf_counter()
-    poses = estimate_turntable_poses(
-        images,
-        simulation.captures,
-        dictionary=scene.markers.dictionary,
+    facts = SessionFacts(
+        marker_dictionary=scene.markers.dictionary,
         marker_side_m=scene.markers.side_m,
         nominal_step_deg=simulation.plan.nominal_step_deg,
         direction=simulation.plan.direction,
         container_diameter_m=scene.container.diameter_m,
         container_height_m=scene.container.height_m,
-        progress=False,
     )
+    started = time.perf_counter()
+    poses = find_poses(images, simulation.captures, facts, "markers", FeatureConfig(), progress=False)
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
@@ -228,7 +228,7 @@ class PoseHardCases:
             shown.add_row(*cells)
         console.print(shown)
         if self.page is not None:
-            write_table(self.page, rows)
+            write_table(self.page, TABLE, COLUMNS, rows)
 
     def _measure(self, case: Case) -> tuple[str, ...]:
         try:
@@ -247,12 +247,13 @@ class PoseHardCases:
         )
 
 
-def write_table(page: Path, rows: Sequence[tuple[str, ...]]) -> None:
-    """Put the rows between the page's two marks."""
-    before, rest = page.read_text(encoding="utf-8").split(TABLE_STARTS)
-    after = rest.split(TABLE_ENDS)[1]
-    table = "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows))
-    page.write_text(f"{before}{TABLE_STARTS}\n{table}\n{TABLE_ENDS}{after}", encoding="utf-8")
+def write_table(page: Path, name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Put the rows between the page's two marks ``<!-- NAME -->`` and ``<!-- end of NAME -->``."""
+    starts, ends = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    before, rest = page.read_text(encoding="utf-8").split(starts)
+    after = rest.split(ends)[1]
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in (columns, ["---"] * len(columns), *rows))
+    page.write_text(f"{before}{starts}\n{table}\n{ends}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -27,12 +27,9 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.data.pseudo_rgb import bands_within, to_8_bit
 from hsi_sc_nerf.data.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
+from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL
-from hsi_sc_nerf.poses.late_frames import with_late_frames
-from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
-from hsi_sc_nerf.poses.track_adjust import adjust_tracks
-from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
+from hsi_sc_nerf.poses.ways import PoseWay, SessionFacts, find_poses
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -93,15 +90,14 @@ class PosesSpeed:
 
     def _ways(self, truth: Truth) -> dict[str, tuple[Callable[[Images, list[str]], Poses], bool]]:
         side_m = float(np.linalg.norm(np.diff(next(iter(truth.marker_layout.values()))[:2], axis=0)))
-        ways: dict[str, tuple[Callable[[Images, list[str]], Poses], bool]] = {
-            "markers": (
-                lambda images, names: estimate_turntable_poses(
-                    images, names, marker_side_m=side_m, progress=False
-                ).camera_to_world,
-                True,
-            ),
-            "features": (from_features, False),
-        }
+        facts = SessionFacts(marker_side_m=side_m)
+
+        def by(way: PoseWay) -> Callable[[Images, list[str]], Poses]:
+            return lambda images, names: find_poses(
+                images, names, facts, way, FeatureConfig(), progress=False
+            ).camera_to_world
+
+        ways = {"markers": (by("markers"), True), "features": (by("colmap"), False)}
         plain = partial(from_colmap_defaults, limit_s=self.plain_limit_s)
         return {**ways, "COLMAP's defaults": (plain, False)} if self.plain else ways
 
@@ -117,17 +113,6 @@ def gray_images(session: Session) -> list[UInt8[np.ndarray, "h w"]]:
     middle = tarp[lines // 4 : 3 * lines // 4, samples // 4 : 3 * samples // 4]
     white = middle.mean(axis=(0, 1)) - dark
     return [to_8_bit(((f.cube.memmap()[..., bands] - dark) / white).mean(axis=-1)) for f in session.frames]
-
-
-def from_features(images: Images, names: list[str]) -> Poses:
-    """Our way without markers: masks, neighbours in the turn, one machine."""
-    free = structure_from_motion(images, names)
-    start = turntable_from_poses(free.world_to_camera).tracked(free.places, free.focal_px, free.centre_px)
-    adjusted = adjust_tracks(start, free.tracks).turntable
-    turntable = adjust_tracks(with_late_frames(adjusted, free.tracks), free.tracks).turntable
-    poses = np.full((len(images), 4, 4), np.nan)
-    poses[turntable.frames] = turntable.camera_to_world()
-    return poses
 
 
 def from_colmap_defaults(images: Images, names: list[str], *, limit_s: int) -> Poses:

@@ -103,6 +103,32 @@ def test_auto_says_why_not(pear, monkeypatch):
     assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
 
 
+def test_where_colmap_fails_known_angles_are_a_start(pear, monkeypatch):
+    images, names, truth, _ = pear
+    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    given = np.arange(FRAMES) * 360.0 / FRAMES + np.where(np.arange(FRAMES) % 5 == 2, 1.5, 0.0)
+    poses = find_poses(images, names, facts(frame_angles_deg=tuple(given)), "colmap", CONFIG, progress=False)
+    assert poses.method == "angles"
+    assert poses.chosen.startswith(
+        "by features, from known angles that were adjusted (not by features (COLMAP): it f"
+    )
+    assert any("known angles were taken to start from" in warning for warning in poses.report()["warnings"])
+    assert poses.used.all()
+    away = poses.angles_deg - np.arange(FRAMES) * 360.0 / FRAMES
+    assert np.abs(away - away.mean()).max() < 0.3
+    assert largest_errors(poses, truth)[0] < 0.5
+
+
+def test_where_colmap_fails_and_no_angle_is_known_it_says_why(pear, monkeypatch):
+    images, names, _, _ = pear
+    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    with pytest.raises(InputError, match=r"^it fails\.$"):
+        find_poses(images, names, facts(nominal_step_deg=None), "colmap", CONFIG, progress=False)
+    monkeypatch.setattr(ways, "poses_by_freed_angles", fails)
+    with pytest.raises(InputError, match="it fails; nor do features suit the known angles: it fails"):
+        find_poses(images, names, facts(), "colmap", CONFIG, progress=False)
+
+
 def test_no_way_works(pear, monkeypatch):
     images, names, _, _ = pear
     for way in ("estimate_turntable_poses", "poses_by_colmap", "poses_by_angles"):

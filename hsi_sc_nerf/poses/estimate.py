@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.assemble import Session, poses_of
@@ -29,8 +28,6 @@ __all__ = ["TurntablePoses", "estimate_turntable_poses"]
 _SIDE_WITHOUT_SCALE_M = 0.03
 
 
-# Many small systems, two frames at a time: BLAS's own threads would only wait for each other.
-@threadpool_limits.wrap(limits=1, user_api="blas")
 def estimate_turntable_poses(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     names: Sequence[str],

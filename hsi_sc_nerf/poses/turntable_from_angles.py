@@ -15,6 +15,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.late_frames import with_late_frames
+from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks
 from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project
 
 # Cameras that are tried: how far they look down, and their focal lengths in image widths.
@@ -95,6 +97,41 @@ def turntable_from_angles(
             "take markers"
         )
     return best
+
+
+def adjusted_from_angles(
+    tracks: Tracks,
+    angles_deg: Float[np.ndarray, "n"],
+    size_px: tuple[int, int],
+    config: TrackAdjustConfig,
+    *,
+    direction_known: bool,
+) -> AdjustedTracks:
+    """The camera before known angles, adjusted; and then the angles too, where ``config.free_angles`` says so.
+
+    Free angles make good uneven steps, but what creeps over the object then bends the turn: of a pear of 160 px in 36
+    frames whose steps were uneven by 0.5 degrees (standard deviation) rotations were wrong by up to 1.1 degrees with
+    held and 0.4 with free angles; with even steps by 0.5 and 0.9.
+
+    Args:
+        tracks: points seen in frames.
+        angles_deg: of every frame, also of those without tracks.
+        size_px: width and height of the images.
+        config: of the adjustment.
+        direction_known: as in ``turntable_from_angles``.
+
+    Raises:
+        InputError: as ``turntable_from_angles`` and ``adjust_tracks``.
+    """
+    frames = np.unique(tracks.frame)
+    angles_rad = np.deg2rad(angles_deg[frames])
+    start = turntable_from_angles(tracks, frames, angles_rad, size_px, direction_known=direction_known)
+    held = adjust_tracks(start, tracks, replace(config, free_angles=False))
+    if not config.free_angles:
+        return held
+    freed = adjust_tracks(held.turntable, tracks, config)
+    # Frames that the held angles made useless come back by the angle that suits their points.
+    return adjust_tracks(with_late_frames(freed.turntable, tracks), tracks, config)
 
 
 def _pairs(tracks, frames, angles_rad):

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
+from hsi_sc_nerf.poses.freed_angles import poses_by_freed_angles
 from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, poses_by_angles, poses_by_colmap
 from hsi_sc_nerf.poses.known_camera import KnownCamera, poses_by_known_camera
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -67,9 +68,11 @@ def find_poses(
 def _find(
     images: Images, names: Sequence[str], facts: SessionFacts, way: PoseWay, config: FeatureConfig, progress: bool
 ) -> TurntablePoses:
+    if way == "colmap":
+        return _by_colmap_or_freed_angles(images, names, facts, config)
     if way != "auto":
         poses = _by(way, images, names, facts, config, progress)
-        return replace(poses, chosen=f"by {_NAMES[way]}, as the settings say")
+        return replace(poses, chosen=f"by {_NAMES[way]}, {_AS_SET}")
     failed = []
     for attempt in _ORDER:
         try:
@@ -82,6 +85,32 @@ def _find(
     raise InputError(f"no way to poses works: {'; '.join(failed)}.")
 
 
+def _by_colmap_or_freed_angles(
+    images: Images, names: Sequence[str], facts: SessionFacts, config: FeatureConfig
+) -> TurntablePoses:
+    """By COLMAP; where that fails, as it may at low resolution, from the known angles, adjusted on features."""
+    try:
+        return replace(poses_by_colmap(images, names, facts, config), chosen=f"by {_NAMES['colmap']}, {_AS_SET}")
+    except InputError as error:
+        angles_deg, failed = facts.angles_deg(len(names)), str(error).rstrip(".")
+        if angles_deg is None:
+            raise
+    try:
+        poses = poses_by_freed_angles(images, names, angles_deg, facts, config)
+    except InputError as error:
+        raise InputError(f"{failed}; nor do features suit the known angles: {error}") from error
+    warning = (
+        f"features gave no poses by themselves ({failed}), so the known angles were taken to start from and "
+        "adjusted; compare them with the nominal steps"
+    )
+    return replace(
+        poses,
+        chosen=f"by features, from known angles that were adjusted (not by {_NAMES['colmap']}: {failed})",
+        warnings=(warning, *poses.warnings),
+    )
+
+
+_AS_SET = "as the settings say"
 _ORDER: tuple[Literal["markers", "colmap", "angles"], ...] = ("markers", "colmap", "angles")
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
 

@@ -1,0 +1,47 @@
+"""Where COLMAP's mapping fails: poses from features that start at the turntable's nominal angles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.data.session_pictures import SessionPictures
+from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, _in_object_frame
+from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.poses.structure_from_motion import matched_tracks
+from hsi_sc_nerf.poses.turntable_from_angles import adjusted_from_angles
+
+
+def poses_by_freed_angles(
+    images: Images,
+    names: Sequence[str],
+    angles_deg: Float[np.ndarray, "n"],
+    known: Known,
+    config: FeatureConfig,
+) -> TurntablePoses:
+    """Poses from features alone; the angles that are given are where each frame's angle starts, no more.
+
+    A turntable whose steps are uneven by a degree is within reach; steps that are wrong by more let the features
+    contradict the angles, and nothing is guessed.
+
+    Args:
+        images: one gray image a frame.
+        names: the frames' names.
+        angles_deg: of each frame, relative to the first; positive counter-clockwise where the direction is known.
+        known: what else is known.
+        config: settings.
+
+    Raises:
+        InputError: too little texture, or features that contradict the angles.
+    """
+    pictures = SessionPictures.of(images)
+    tracks = matched_tracks(pictures.named(pictures.features), names, config.motion)
+    height, width = images[0].shape
+    config = replace(config, adjustment=replace(config.adjustment, free_angles=True))
+    adjusted = adjusted_from_angles(
+        tracks, angles_deg, (width, height), config.adjustment, direction_known=known.direction is not None
+    )
+    return _in_object_frame(adjusted, images, names, known, config, "angles")
