@@ -23,7 +23,7 @@ from hsi_sc_nerf.data.masks import (
 )
 from hsi_sc_nerf.data.packed import Container
 from hsi_sc_nerf.data.report import mask_picture
-from hsi_sc_nerf.data.scene_box import focus_point, object_box, scene_box
+from hsi_sc_nerf.data.scene_box import DISC_OVER_CONTAINER, assumed_disc, focus_point, object_box, scene_box
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
 
@@ -212,11 +212,23 @@ def test_scene_box_holds_all_that_turns():
     np.testing.assert_allclose(
         scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
     )
-    np.testing.assert_allclose(
-        scene_box(obj, {}, CONTAINER, margin_m=0.0), [[-0.045, -0.045, 0.0], [0.045, 0.045, 0.2]]
-    )
     wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
     np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
+
+
+def test_without_markers_the_scene_box_holds_a_disc_as_wide_as_the_container_suggests():
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    reach = DISC_OVER_CONTAINER * CONTAINER.diameter_m / 2.0
+    assert reach > 0.205 / 2.0  # the simulator's disc
+    expected = [[-reach, -reach, 0.0], [reach, reach, 0.2]]
+    np.testing.assert_allclose(scene_box(obj, {}, CONTAINER, margin_m=0.0), expected)
+    np.testing.assert_allclose(
+        scene_box(obj, {}, None, margin_m=0.0, container_diameter_m=CONTAINER.diameter_m), expected
+    )
+    np.testing.assert_allclose(scene_box(obj, {}, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.02, 0.02, 0.2]])
+    assert assumed_disc(True, 0.09) is None
+    assert "207 mm" in assumed_disc(False, 0.09)
+    assert "masks' hull" in assumed_disc(False, None)
 
 
 def test_mask_picture_draws_each_outline(tmp_path):

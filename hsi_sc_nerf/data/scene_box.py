@@ -16,6 +16,9 @@ from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
 
 DISC_OVERHANG = 1.1
 """How far the turntable's disc reaches beyond its outermost marker corner, as a factor on the radius."""
+DISC_OVER_CONTAINER = 2.3
+"""How much wider than the container the disc is taken to be where no marker shows its reach: the simulator's has
+205 mm under a container of 90 mm."""
 
 
 def focus_point(camera_to_worlds: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, "3"]:
@@ -101,19 +104,46 @@ def scene_box(
     marker_corners_m: dict[int, Float[np.ndarray, "4 3"]],
     container: Container | None,
     margin_m: float = 0.005,
+    container_diameter_m: float | None = None,
 ) -> Float[np.ndarray, "2 3"]:
     """Minimum and maximum of all that turns: object, container, markers and the disc that they lie on.
 
-    The disc is round, so the box is square about the axis; it is widened by ``margin_m``. The disc is taken to reach
-    ``DISC_OVERHANG`` times as far as the outermost marker corner.
+    The disc is round, so the box is square about the axis; it is widened by ``margin_m``. How far the disc reaches is
+    assumed, in this order (``assumed_disc`` says which):
+
+    - ``DISC_OVERHANG`` times as far as the outermost marker corner;
+    - without markers, ``DISC_OVER_CONTAINER`` times as far as the container's wall;
+    - with neither, no farther than the masks' hull (``object_box_m``), which holds all that differs from the
+      background: a disc as dark as the chamber is outside.
+
+    Args:
+        object_box_m: minimum and maximum of the masks' hull.
+        marker_corners_m: corners of the markers by their id; may be empty.
+        container: where its size is known and it stands on z = 0.
+        margin_m: the box is widened by this.
+        container_diameter_m: of a container whose height over the disc is not known, where lengths are metres.
     """
     corners = np.concatenate([np.zeros((1, 3)), *marker_corners_m.values()])
+    width_m = container_diameter_m or 0.0 if container is None else container.diameter_m
     radii = [
         DISC_OVERHANG * np.hypot(corners[:, 0], corners[:, 1]).max(),
         np.abs(object_box_m[:, :2]).max(),
-        0.0 if container is None else container.diameter_m / 2.0,
+        width_m / 2.0 if marker_corners_m else DISC_OVER_CONTAINER * width_m / 2.0,
     ]
     lowest = min(corners[:, 2].min(), object_box_m[0, 2])
     highest = max(corners[:, 2].max(), object_box_m[1, 2], 0.0 if container is None else container.height_m)
     reach = max(radii) + margin_m
     return np.array([[-reach, -reach, lowest - margin_m], [reach, reach, highest + margin_m]])
+
+
+def assumed_disc(has_markers: bool, container_diameter_m: float | None) -> str | None:
+    """What ``scene_box`` assumes of a disc that no marker shows, as a sentence's end; None with markers."""
+    if has_markers:
+        return None
+    if container_diameter_m is None:
+        return "nothing shows how far the disc reaches: what turns is taken to end where the masks' hull ends"
+    diameter_mm = 1e3 * DISC_OVER_CONTAINER * container_diameter_m
+    return (
+        f"no marker shows how far the disc reaches: its diameter is taken to be {diameter_mm:.0f} mm, "
+        f"{DISC_OVER_CONTAINER} times the container's"
+    )
