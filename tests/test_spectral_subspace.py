@@ -58,14 +58,17 @@ def test_noise_alone_has_no_rank():
     assert find_subspace(noise, deviation).rank_above_noise == 0
 
 
-def test_the_basis_is_orthonormal_and_its_coefficients_are_of_order_one():
+def test_the_basis_is_orthonormal_and_keeps_squared_errors():
     _, spectra, deviation = noisy(1500, 4)
     subspace = find_subspace(spectra, deviation)
     np.testing.assert_allclose(subspace.basis.T @ subspace.basis, np.eye(4), atol=1e-12)
     coefficients = spectra @ np.linalg.pinv(subspace.scaled_basis).T
-    np.testing.assert_allclose(np.sqrt(np.mean(coefficients**2, axis=0)), 1.0)
+    np.testing.assert_allclose(np.sqrt(np.mean(coefficients**2, axis=0)), subspace.coefficient_rms)
+    projected = coefficients @ subspace.scaled_basis.T
+    np.testing.assert_allclose((projected**2).mean(axis=1), (coefficients**2).sum(axis=1))
     np.testing.assert_allclose(coefficients.mean(axis=0), subspace.mean_coefficients, atol=1e-12)
     assert (subspace.mean_coefficients > 0).all()
+    assert 0.1 < subspace.coefficient_rms[0] < 1.0
     assert (np.diff(subspace.coefficient_rms) < 0).all()
 
 

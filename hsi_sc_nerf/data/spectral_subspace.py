@@ -35,7 +35,7 @@ class SpectralSubspace:
 
     Attributes:
         basis: orthonormal columns, by falling share of the spectra.
-        coefficient_rms: root mean square of the spectra's coefficients.
+        coefficient_rms: root mean square of the spectra's coefficients in ``scaled_basis``.
         mean_spectrum: of the spectra, projected.
         rank_above_noise: how many directions stand out of the noise; ``basis`` has no more columns than was allowed.
         noise_rmse: root mean square of the noise over spectra and bands.
@@ -59,13 +59,18 @@ class SpectralSubspace:
 
     @property
     def scaled_basis(self) -> Float[np.ndarray, "bands rank"]:
-        """The basis whose coefficients have a root mean square of 1: what a network should emit."""
-        return self.basis * self.coefficient_rms
+        """The basis with columns of root mean square 1, for a network to emit the coefficients.
+
+        The first coefficient is of the order of a reflectance, and the squared error's mean over the bands is the sum
+        of the coefficients' squared errors: none is learned at another's cost. (Coefficients that are all of order 1
+        leave the shape of a spectrum to gradients that drown in those of its brightness.)
+        """
+        return self.basis * np.sqrt(len(self.basis))
 
     @property
     def mean_coefficients(self) -> Float[np.ndarray, "rank"]:
         """Coefficients of the mean spectrum in ``scaled_basis``."""
-        return self.mean_spectrum @ self.basis / self.coefficient_rms
+        return self.mean_spectrum @ self.basis / np.sqrt(len(self.basis))
 
 
 def find_subspace(
@@ -74,7 +79,7 @@ def find_subspace(
     valid: Bool[np.ndarray, "n bands"] | None = None,
     *,
     rank: int | None = None,
-    max_rank: int = 32,
+    max_rank: int = 16,
 ) -> SpectralSubspace:
     """The subspace of spectra that stands out of their noise.
 
@@ -121,7 +126,7 @@ def find_subspace(
     basis *= np.where((sample @ basis).sum(axis=0) < 0.0, -1.0, 1.0)
     return SpectralSubspace(
         basis=basis,
-        coefficient_rms=energy / np.sqrt(len(sample)),
+        coefficient_rms=energy / np.sqrt(sample.size),
         mean_spectrum=basis @ (basis.T @ sample.mean(axis=0)),
         rank_above_noise=above,
         noise_rmse=float(np.sqrt(np.mean(deviation**2))),

@@ -22,9 +22,6 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
-COEFFICIENT_START_SPREAD = 0.1
-"""The weights behind the coefficients begin at this share of their usual size: the field begins at the mean."""
-
 
 def grid_positions(
     positions: Float[Tensor, "*bs 3"], aabb: Float[Tensor, "2 3"], spatial_distortion: SpatialDistortion | None
@@ -84,7 +81,6 @@ class SpectralField(NerfactoField):
             last = self.mlp_head.layers[-1]
             assert isinstance(last, nn.Linear)
             with torch.no_grad():
-                last.weight *= COEFFICIENT_START_SPREAD
                 last.bias.copy_(coefficient_start)
         fuse_hash_encodings(self)
 
