@@ -177,7 +177,7 @@ def test_outline_of_the_turntable_is_where_rays_meet_it(tmp_path):
     outline = turning_outline(turning_solids(dataset), pose, lens, dataset.distortion)
     y, x = np.mgrid[: lens.h, : lens.w] + 0.5
     origin, directions = pixel_rays(lens, pose, np.stack([x, y], -1))
-    steps = np.linspace(0.3, 0.9, 1500)
+    steps = np.linspace(0.35, 0.8, 450)
     met = np.zeros_like(outline)
     for t in steps:
         p = origin + t * directions
