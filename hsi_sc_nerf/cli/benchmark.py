@@ -31,6 +31,7 @@ from hsi_sc_nerf.evaluation.benchmark.configurations import (
 )
 from hsi_sc_nerf.evaluation.benchmark.machine import available_cores, describe_machine
 from hsi_sc_nerf.evaluation.benchmark.report import (
+    TABLE_WIDTH,
     TrainedRun,
     screen_table,
     write_csv,
@@ -79,7 +80,11 @@ class BenchmarkCommand:
         """
         chosen = [*map(named_configuration, self.configurations), *map(own_configuration, self.sets)]
         runs = train_all(chosen, self)
-        Console().print(screen_table(runs))
+        console = Console()
+        # Broken numbers cannot be read: rather let the terminal wrap.
+        console.width = max(console.width, TABLE_WIDTH)
+        console.print(screen_table(runs))
+        console.print(f"Everything, and the picture: {self.output_dir / 'benchmark.md'}", soft_wrap=True)
 
 
 def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[TrainedRun]:
@@ -174,18 +179,22 @@ def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) ->
 
 def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
     """Rehearse where the time is given, then train; what either finds is kept with the job that it belongs to."""
-    shutil.rmtree(folder / "benchmark", ignore_errors=True)
     iterations = job.iterations
     if iterations is None:
         found = _finished(folder / "rehearsal.json", job, identity)
         if found is None:
-            found = _process(folder, "rehearsal", job, job, identity)
+            rehearsed_in = folder / "rehearsal"
+            found = _process(folder, "rehearsal", replace(job, output_dir=str(rehearsed_in.resolve())), job, identity)
+            shutil.rmtree(rehearsed_in)
         iterations = found["iterations"]
+    shutil.rmtree(folder / "benchmark", ignore_errors=True)
     return _process(folder, "result", replace(job, iterations=iterations), job, identity)
 
 
 def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str, Any]) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
+    log = folder.parent / "logs" / f"{folder.name}-{name}.log"
+    log.parent.mkdir(exist_ok=True)
     job_path, result_path = folder / f".{name}-job.json", folder / f"{name}.json"
     found_path = folder / f".{name}-found.json"
     write_json(job_path, asdict(doing))
@@ -193,7 +202,7 @@ def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str
     run_step(
         f"{name} of {folder.name}",
         [sys.executable, "-m", module, str(job_path), str(found_path)],
-        folder / f"{name}.log",
+        log,
     )
     found = json.loads(found_path.read_text(encoding="utf-8"))
     write_json(result_path, {"job": asdict(asked), **identity, **found})

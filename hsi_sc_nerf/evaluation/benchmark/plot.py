@@ -39,7 +39,7 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(ScalarFormatter())
             axes.yaxis.set_minor_formatter(ScalarFormatter())
-            axes.tick_params(which="minor", labelsize=7)
+            axes.tick_params(axis="y", which="both", labelsize=8)
         axes.set_title(f"{title}, {'lower' if metric in _LOGARITHMIC else 'higher'} is better")
     for axes in panels[1]:
         axes.set_xlabel("training (wall seconds)")
@@ -51,9 +51,9 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
     memory = [run.checkpoints[-1].gpu_memory_mib or run.checkpoints[-1].peak_memory_mib for run in runs]
     on_gpu = any(run.checkpoints[-1].gpu_memory_mib for run in runs)
     places = np.arange(len(runs))
-    axes.barh(places, memory, color=colours, height=0.5)
+    axes.barh(places, memory, color=colours, height=0.36)
     for place, run, amount in zip(places, runs, memory, strict=True):
-        axes.annotate(f"{run.name}: {amount:.0f}", (0, place - 0.28), va="bottom", fontsize=8)
+        axes.annotate(f"{run.name}: {amount:.0f}", (0, place - 0.2), va="bottom", fontsize=8)
     axes.set(yticks=[], ylim=(len(runs) - 0.5, -0.8), xlabel="MiB", title=f"Peak {'GPU ' if on_gpu else ''}memory")
     axes.grid(axis="y", visible=False)
     _save(figure, path)

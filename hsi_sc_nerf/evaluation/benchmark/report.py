@@ -13,10 +13,11 @@ from rich.table import Table
 from hsi_sc_nerf.data.atomic import atomic_write, write_json
 from hsi_sc_nerf.evaluation.benchmark.run import Checkpoint
 
-COLUMNS = {
+_COLUMNS = {
     "configuration": "{name}",
     "stage": "{stage}",
     "iterations": "{iteration}",
+    "set up, s": "{setup_seconds:.0f}",
     "train, s": "{train_seconds:.0f}",
     "CPU, s": "{cpu_seconds:.0f}",
     "SAM, rad": "{sam:.4f}",
@@ -24,10 +25,12 @@ COLUMNS = {
     "SSIM": "{ssim:.3f}",
     "PSNR, dB": "{psnr:.2f}",
     "whole frame: SAM": "{full_sam:.4f}",
-    "PSNR": "{full_psnr:.2f}",
+    "PSNR, dB ": "{full_psnr:.2f}",
     "memory, MiB": "{peak_memory_mib:.0f}",
-    "GPU, MiB": "{gpu_memory_mib:.0f}",
 }
+_GPU_COLUMN = {"GPU memory, MiB": "{gpu_memory_mib:.0f}"}
+TABLE_WIDTH = 150
+"""Characters that the table needs on a terminal."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +57,28 @@ class TrainedRun:
         return tuple(checkpoint for checkpoint in self.checkpoints if checkpoint.ends_stage)
 
 
-def table_rows(runs: Sequence[TrainedRun]) -> list[list[str]]:
-    """A row for each run's stage, as `COLUMNS` says: what held-out views were like at the stage's end."""
-    return [
-        [column.format(**{"name": run.name, **asdict(end), **end.metrics}) for column in COLUMNS.values()]
+def table(runs: Sequence[TrainedRun]) -> tuple[list[str], list[list[str]]]:
+    """Titles, and a row for each stage of each run: what held-out views were like at the stage's end."""
+    on_gpu = any(checkpoint.gpu_memory_mib > 0 for run in runs for checkpoint in run.checkpoints)
+    columns = _COLUMNS | (_GPU_COLUMN if on_gpu else {})
+    rows = [
+        [
+            column.format(**{"name": run.name, "setup_seconds": run.setup_seconds, **asdict(end), **end.metrics})
+            for column in columns.values()
+        ]
         for run in runs
         for end in run.stage_ends
     ]
+    return list(columns), rows
 
 
 def screen_table(runs: Sequence[TrainedRun]) -> Table:
     """The table for a terminal."""
-    table = Table(*COLUMNS, title="Held-out views, masked to the object, at the end of each stage")
-    for row in table_rows(runs):
-        table.add_row(*row)
-    return table
+    titles, rows = table(runs)
+    shown = Table(*titles, title="Held-out views, masked to the object, at the end of each stage")
+    for row in rows:
+        shown.add_row(*row)
+    return shown
 
 
 def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -130,7 +140,7 @@ def write_page(path: Path, runs: Sequence[TrainedRun], settings: dict[str, Any],
 
 ![Held-out metrics against seconds of training]({path.with_suffix(".png").name})
 
-{markdown_table(list(COLUMNS), table_rows(runs))}
+{markdown_table(*table(runs))}
 
 Held-out views at the end of each stage: mean over the views, masked to the object, and over whole frames where the
 column says so. Seconds are of training alone: setting up and evaluating do not count. Memory is the most that the

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import resource
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -82,21 +81,17 @@ class Checkpoint:
     metrics: dict[str, float]
 
 
-def build_trainer(job: Job, iterations: int, output_dir: Path) -> StagedTrainer:
-    """The trainer that ``ns-train`` would make, without evaluations and checkpoints of its own on the way.
-
-    Raises:
-        InputError: the method or its words do not exist.
-    """
+def build_trainer(config: Any, job: Job, iterations: int, output_dir: Path) -> StagedTrainer:
+    """The trainer that ``ns-train`` would make of ``config``, without evaluations of its own on the way."""
     import torch
 
-    config: Any = training_config(job.method, job.words)
     config.pipeline.datamanager.data = Path(job.data)
     config.max_num_iterations = iterations
     config.output_dir, config.experiment_name, config.timestamp = output_dir, "benchmark", "run"
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_batch = 0
     config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.evaluate_stages = False
     torch.manual_seed(config.machine.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
@@ -129,25 +124,25 @@ class HeldOutViews:
 def train(job: Job) -> dict[str, Any]:
     """Train and evaluate; gives ``setup_seconds`` and ``checkpoints``.
 
-    The random numbers of training are the same with and without evaluations.
+    The trainer draws each step's random numbers anew, so that evaluations do not change the training.
     """
     import torch
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
     assert job.iterations is not None
+    config = training_config(job.method, job.words)
     started = time.perf_counter()
-    trainer = build_trainer(job, job.iterations, Path(job.output_dir))
+    trainer = build_trainer(config, job, job.iterations, Path(job.output_dir))
     setup_seconds = time.perf_counter() - started
 
     manager: Any = trainer.pipeline.datamanager
     views = HeldOutViews(manager.fixed_indices_eval_dataloader, job.held_out_views)
     on_gpu = trainer.pipeline.device.type == "cuda"
-    devices = [trainer.pipeline.device] if on_gpu else []
     ends = {stage.end for stage in trainer.plan.stages}
     found: list[Checkpoint] = []
 
     def evaluate(step: int) -> None:
-        with clock.paused() as (wall, cpu), torch.random.fork_rng(devices):
+        with clock.paused() as (wall, cpu):
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _RSS_UNIT_BYTES / 2**20
             before = time.perf_counter()
             metrics = trainer.pipeline.get_average_image_metrics(views, "eval", step, get_std=True)
@@ -194,17 +189,17 @@ def _rehearsed_seconds(job: Job, iterations: int) -> float:
     import torch
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = build_trainer(job, iterations, Path(folder))
+    config = training_config(job.method, job.words)
+    trainer = build_trainer(config, job, iterations, Path(job.output_dir))
 
-        def record(step: int) -> None:
-            if trainer.pipeline.device.type == "cuda":
-                torch.cuda.synchronize()
-            times.append(time.perf_counter())
+    def record(step: int) -> None:
+        if trainer.pipeline.device.type == "cuda":
+            torch.cuda.synchronize()
+        times.append(time.perf_counter())
 
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], record))
-        times = [time.perf_counter()]
-        trainer.train()
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], record))
+    times = [time.perf_counter()]
+    trainer.train()
     return mean_iteration_seconds(times, [stage.end for stage in trainer.plan.stages])
 
 
