@@ -1,0 +1,1 @@
+"""What `ns-viewer`, and the viewer of a training run, show of spectra."""

@@ -1,0 +1,231 @@
+"""The controls of the spectral viewer and the pictures that they ask for."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from copy import copy
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.viewer.viewer_elements import (
+    ViewerCheckbox,
+    ViewerClick,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerSlider,
+)
+from torch import Tensor
+from viser.transforms import SO3
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
+from hsi_sc_nerf.models.metrics import spectral_angle_map
+from hsi_sc_nerf.models.pose_refinement import FRAME_INDEX
+from hsi_sc_nerf.spectra.bands import covered
+from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
+from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
+from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
+from hsi_sc_nerf.viewer.picking import PickedPoint, pick
+from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, angle_to_measured, coloured
+from hsi_sc_nerf.viewer.training_views import TrainingViews
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.viewer import Viewer
+
+Outputs = dict[str, Tensor]
+
+_POINT_RADIUS = 0.01  # scene units: about a millimetre
+_POINT_RGB = (213, 94, 0)
+
+
+class SpectralPanel(torch.nn.Module):
+    """Controls of the viewer: wavelength, composite, index, training view, spectrum of a clicked point.
+
+    A module, without parameters, because nerfstudio looks for controls in modules; it shows them in the alphabetical
+    order of their names here. As long as no viewer is attached it does nothing.
+
+    Args:
+        wavelengths_nm: centres of the bands. A composite or an index that needs others is not offered.
+        num_views: number of training views.
+    """
+
+    def __init__(self, wavelengths_nm: Float[np.ndarray, "bands"], num_views: int) -> None:
+        super().__init__()
+        self.wavelengths_nm = wavelengths_nm
+        self.band = ViewerSlider(
+            "Wavelength (nm)",
+            default_value=float(wavelengths_nm[nearest_bands(wavelengths_nm, paper.PSEUDO_RGB_NM[1:2])[0]]),
+            min_value=float(wavelengths_nm.min()),
+            max_value=float(wavelengths_nm.max()),
+            step=1.0,
+            hint="Output 'band' shows the band nearest to this wavelength",
+        )
+        offered = {
+            "composite": [n for n, c in COMPOSITES.items() if covered(wavelengths_nm, c.wavelengths_nm).all()],
+            "index": [n for n, i in INDICES.items() if covered(wavelengths_nm, i.wavelengths_nm).all()],
+        }
+        self.composite = self._dropdown("Composite", "composite", offered["composite"])
+        self.index = self._dropdown("Index", "index", offered["index"])
+        self.legend = ViewerMarkdown(self._legend)
+        self.measured_view = ViewerSlider(
+            "Training view",
+            default_value=0,
+            min_value=0,
+            max_value=max(1, num_views - 1),
+            step=1,
+            cb_hook=lambda slider: self._stand_at(min(slider.value, num_views - 1)),
+            hint="Puts the camera where this view was taken, where output 'spectral_angle' compares with it",
+        )
+        self.picking = ViewerCheckbox(
+            "Click for spectrum",
+            False,
+            cb_hook=self._switch_picking,
+            hint="A click shows the spectrum of a point; until this is off again, the mouse does not move the camera",
+        )
+        self.spectrum = ViewerMarkdown()
+        self.control = ViewerControl()
+
+    def render(self, camera: Cameras, render: Callable[[Cameras], Outputs]) -> Outputs:
+        """Render a camera; a viewer's with the pictures that the controls ask for in place of whole spectra.
+
+        A viewer's camera that stands where a training view was taken is rendered as that view's, so that the view's
+        pose refinement and background are in force.
+
+        Args:
+            camera: one camera, of a frame or of a viewer.
+            render: nerfstudio's ``get_outputs_for_camera``.
+        """
+        viewer = self._viewer()
+        if viewer is None or FRAME_INDEX in (camera.metadata or {}):
+            return render(camera)
+        views = _training_views(viewer)
+        view = views.at(camera.camera_to_worlds[0, :3, 3])
+        if view is not None:
+            camera = copy(camera)
+            camera.metadata = views.metadata(view, camera.device)
+        outputs = render(camera)
+        spectral = outputs.pop("spectral")
+        pictures = {"rgb": outputs.pop("rgb").clamp(0.0, 1.0), "band": self._band(spectral)}
+        if self.composite is not None:
+            chosen = COMPOSITES[self.composite.value]
+            pictures["composite"] = composite(spectral, self.wavelengths_nm, chosen.wavelengths_nm).clamp(0.0, 1.0)
+        if self.index is not None:
+            index = INDICES[self.index.value]
+            values = index_values(index, spectral, self.wavelengths_nm)
+            pictures["index"] = coloured(values, index.drawn_range, INDEX_COLOURS)
+        angles = torch.full(spectral.shape[:2], torch.nan, device=spectral.device)
+        if view is not None and self._shown(viewer, "spectral_angle"):
+            directions = camera.generate_rays(camera_indices=0, keep_shape=True).directions
+            angles = angle_to_measured(spectral, *views.measured(view, directions))
+        pictures["spectral_angle"] = coloured(angles, ANGLE_DRAWN_RAD, ANGLE_COLOURS)
+        return pictures | outputs
+
+    def show_spectrum(self, click: ViewerClick) -> None:
+        """Show the spectrum of what a click meets and, where a training view saw it, what was measured there."""
+        viewer = self._viewer()
+        assert viewer is not None
+        views = _training_views(viewer)
+        origin, direction = torch.tensor(click.origin).float(), torch.tensor(click.direction).float()
+        view = views.at(origin)
+        metadata = {} if view is None else views.metadata(view, "cpu")
+        with viewer.train_lock or contextlib.nullcontext():
+            point = pick(viewer.get_model(), origin, direction, metadata)  # type: ignore[arg-type]
+        curves, notes = {"rendered": point.spectrum.numpy()}, [f"opacity {point.opacity:.2f}"]
+        if view is not None:
+            measured, valid, seen = views.measured(view, direction[None])
+            if seen.item():
+                curves["measured"] = np.where(valid[0], measured[0], np.nan)
+                angle = float(spectral_angle_map(point.spectrum[None, None], measured[None], valid[None]))
+                notes.append(f"spectral angle {angle:.3f} rad to {views.name(view)}")
+        scale, transform = _object_frame(viewer)
+        millimetres = (point.position / scale - transform[:, 3]) * 1000.0
+        title = "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist())
+        plot = spectra_plot(self.wavelengths_nm, curves, title)
+        self.spectrum.show(f"{inline_image(plot, 'spectrum of the point')}\n\n{title}, {', '.join(notes)}")
+        self._mark(viewer, point)
+
+    def _viewer(self) -> Viewer | None:
+        """The viewer, once one is attached."""
+        return getattr(self.control, "viewer", None)
+
+    def _dropdown(self, label: str, output: str, names: list[str]) -> ViewerDropdown | None:
+        if not names:
+            return None
+        return ViewerDropdown(
+            label,
+            names[0],
+            names,
+            cb_hook=lambda _: self.legend.show(self._legend()),
+            hint=f"What output '{output}' shows",
+        )
+
+    def _legend(self) -> str:
+        """What the colours of the outputs mean, as the controls stand."""
+        parts = []
+        if self.composite is not None:
+            chosen = COMPOSITES[self.composite.value]
+            shown = ", ".join(f"{nm:g}" for nm in chosen.wavelengths_nm)
+            parts.append(f"**composite** {chosen.name}: {shown} nm as red, green, blue ({chosen.shows})")
+        if self.index is not None:
+            index = INDICES[self.index.value]
+            bar = colour_bar(index.drawn_range, INDEX_COLOURS, index.name)
+            parts.append(f"**index** {index.name} = {index.expression}: {index.tells}")
+            parts.append(inline_image(bar, "colours {:g} to {:g}".format(*index.drawn_range)))
+        bar = colour_bar(ANGLE_DRAWN_RAD, ANGLE_COLOURS, "spectral angle (rad)")
+        parts.append("**spectral_angle** between rendering and measurement, at a training view only")
+        parts.append(inline_image(bar, "colours {:g} to {:g} rad".format(*ANGLE_DRAWN_RAD)))
+        return "\n\n".join(parts)
+
+    def _band(self, spectral: Float[Tensor, "h w bands"]) -> Float[Tensor, "h w 1"]:
+        return spectral[..., nearest_bands(self.wavelengths_nm, [self.band.value]).tolist()]
+
+    @staticmethod
+    def _shown(viewer: Viewer, output: str) -> bool:
+        panel = viewer.control_panel
+        return output == panel.output_render or (panel.split and output == panel.split_output_render)
+
+    def _stand_at(self, view: int) -> None:
+        """Put the cameras of all browsers where a training view was taken."""
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        viewer = self._viewer()
+        assert viewer is not None
+        views = _training_views(viewer)
+        rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
+        for client in viewer.viser_server.get_clients().values():
+            with client.atomic():
+                client.camera.position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
+                client.camera.wxyz = rotation.wxyz
+                client.camera.fov = views.vertical_fov(view, client.camera.aspect)
+
+    def _switch_picking(self, checkbox: ViewerCheckbox) -> None:
+        if checkbox.value:
+            self.control.register_pointer_cb("click", self.show_spectrum)
+        else:
+            self.control.unregister_pointer_cb()
+
+    def _mark(self, viewer: Viewer, point: PickedPoint) -> None:
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        viewer.viser_server.scene.add_icosphere(
+            "/picked_point",
+            radius=_POINT_RADIUS * VISER_NERFSTUDIO_SCALE_RATIO,
+            color=_POINT_RGB,
+            position=point.position.double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
+        )
+
+
+def _training_views(viewer: Viewer) -> TrainingViews:
+    return TrainingViews(cast(SpectralDataset, viewer.pipeline.datamanager.train_dataset))
+
+
+def _object_frame(viewer: Viewer) -> tuple[float, Float[Tensor, "3 4"]]:
+    """Scale and transform that brought metres in the object frame into the scene."""
+    parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
+    return parsed.dataparser_scale, parsed.dataparser_transform

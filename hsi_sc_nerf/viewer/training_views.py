@@ -1,0 +1,80 @@
+"""The training views as the viewer meets them: where their cameras stand, and what they measured along a ray."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.packed_cube import unpack
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.viewer.pictures import frame_pixels
+
+SAME_PLACE = 1e-4
+"""A camera this near to a view's (scene units, of which the scene box has two) sees what the view sees."""
+
+
+class TrainingViews:
+    """The frames that a run is trained on, with the poses that were measured.
+
+    Who looks from where a view's camera stands sees the view's rays, whichever way and however wide he looks.
+    """
+
+    def __init__(self, dataset: SpectralDataset) -> None:
+        self.dataset = dataset
+        cameras = dataset.cameras.to("cpu")
+        self.rotations: Float[Tensor, "views 3 3"] = cameras.camera_to_worlds[:, :, :3]
+        self.centres: Float[Tensor, "views 3"] = cameras.camera_to_worlds[:, :, 3]
+
+    def at(self, place: Float[Tensor, "3"]) -> int | None:
+        """The view whose camera stands at a place, in scene units; None for none."""
+        distances = (self.centres - place.to(self.centres)).norm(dim=-1)
+        view = int(distances.argmin())
+        return view if distances[view] <= SAME_PLACE else None
+
+    def name(self, view: int) -> str:
+        """The capture that a view was made from."""
+        return self.dataset.frames[view].capture
+
+    def metadata(self, view: int, device: torch.device | str) -> dict[str, Float[Tensor, "1 ..."]]:
+        """What tells the model that rays are this view's."""
+        metadata = self.dataset.cameras[view : view + 1].metadata
+        assert metadata is not None
+        return {name: values.to(device) for name, values in metadata.items()}
+
+    def vertical_fov(self, view: int, aspect: float) -> float:
+        """Vertical field of view (radians) of a window, ``aspect`` times as wide as high, that shows a whole view."""
+        lens, _ = self._lens(view)
+        half_height = max(lens.h / 2.0 / lens.fl_y, lens.w / 2.0 / lens.fl_x / aspect)
+        return 2.0 * float(np.arctan(half_height))
+
+    def measured(
+        self, view: int, directions: Float[Tensor, "*rays 3"]
+    ) -> tuple[Float[Tensor, "n bands"], Bool[Tensor, "n bands"], Bool[Tensor, "*rays"]]:
+        """What a view measured along rays from its camera's centre.
+
+        Args:
+            view: which.
+            directions: of the rays, in the scene.
+
+        Returns:
+            Reflectance of the nearest pixels, which of its values are measurements, and which rays the view saw: the
+            first two are theirs, in order.
+        """
+        pixels, seen = frame_pixels(directions.cpu(), self.rotations[view], *self._lens(view))
+        lines, samples = pixels[seen].numpy().T
+        reflectance, valid = unpack(self.dataset.frames[view].cube()[lines, samples])
+        device = directions.device
+        return torch.from_numpy(reflectance).to(device), torch.from_numpy(valid).to(device), seen.to(device)
+
+    def _lens(self, view: int) -> tuple[PinholeIntrinsics, tuple[float, float, float, float]]:
+        camera = self.dataset.cameras[view]
+        lens = PinholeIntrinsics(
+            int(camera.width), int(camera.height), *(float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+        )
+        if camera.distortion_params is None:
+            return lens, (0.0, 0.0, 0.0, 0.0)
+        k1, k2, _, _, p1, p2 = camera.distortion_params.flatten().tolist()
+        return lens, (k1, k2, p1, p2)
