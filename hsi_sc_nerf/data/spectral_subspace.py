@@ -95,8 +95,8 @@ def find_subspace(
         max_rank: most directions to take otherwise.
 
     Raises:
-        InputError: too few spectra are whole.
-        ValueError: the noise is not above 0, or a rank is out of 1 to bands.
+        InputError: too few spectra are whole, or the rank is not from 1 to the number of bands.
+        ValueError: the noise is not above 0.
     """
     whole = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
     if whole.sum() < FEWEST_SPECTRA:
@@ -105,8 +105,8 @@ def find_subspace(
             f"needs {FEWEST_SPECTRA}; sample more pixels, or train with the direct head."
         )
     bands = spectra.shape[1]
-    if not 1 <= (max_rank if rank is None else rank) <= bands:
-        raise ValueError(f"the rank of a basis of {bands} bands is 1 to {bands}")
+    if rank is not None and not 1 <= rank <= bands:
+        raise InputError(f"a basis for spectra of {bands} bands has 1 to {bands} columns, not {rank}; choose a rank.")
     sample = spectra[whole].astype(np.float64)
     deviation = estimate_noise(sample) if noise is None else np.broadcast_to(noise, spectra.shape)[whole]
     deviation = np.broadcast_to(deviation, sample.shape).astype(np.float64)
@@ -118,7 +118,7 @@ def find_subspace(
     # The triangle of a QR decomposition has the singular values and directions of the whole.
     _, singular, directions = np.linalg.svd(np.linalg.qr(sample / even, mode="r"))
     above = int((singular > _largest_of_noise(deviation / even)).sum())
-    chosen = rank or min(max(above, 1), max_rank)
+    chosen = rank or max(1, min(above, max_rank))
 
     span, _ = np.linalg.qr((directions[:chosen] * of_band).T)
     _, energy, turn = np.linalg.svd(sample @ span, full_matrices=False)
