@@ -8,7 +8,7 @@ import pytest
 
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler, spread_over
 from hsi_sc_nerf.errors import InputError
 
 SHAPE = (5, 7, 4)
@@ -136,6 +136,29 @@ def test_pixels_are_drawn_evenly(sampler, masks, share):
 def test_the_rest_is_found_without_a_list_of_it(sampler, masks):
     rest = np.flatnonzero(~masks)
     np.testing.assert_array_equal(sampler(1)._rest(np.arange(len(rest))), rest)
+
+
+@pytest.mark.parametrize("share", [0.75, 1.0])
+def test_without_an_object_there_is_nothing_to_train_on(tmp_path, counts, masks, share):
+    pixels = PixelSampler(reader_of(tmp_path, counts), np.zeros_like(masks), 8, 0, has_flagged=False)
+    with pytest.raises(InputError, match="masks of all training frames are empty"):
+        pixels.sample(0, share)
+    assert not pixels.sample(0, 0.0)["mask"].any()
+
+
+def test_fixed_pixels_are_spread_over_the_object(masks):
+    flat = [np.ravel_multi_index(tuple(pixel), masks.shape) for pixel in spread_over(masks, 3)]
+    foreground = np.flatnonzero(masks)  # 14 pixels
+    assert flat == foreground[[2, 7, 11]].tolist()
+    assert len(spread_over(masks, 99)) == len(foreground)
+    assert spread_over(np.zeros_like(masks), 3).shape == (0, 3)
+
+
+def test_given_pixels_are_read_in_their_order(sampler, counts, masks):
+    batch = sampler(1).at(INDICES)
+    np.testing.assert_array_equal(batch["indices"], INDICES)
+    np.testing.assert_array_equal(batch["mask"][:, 0], [masks[tuple(pixel)] for pixel in INDICES])
+    np.testing.assert_allclose(batch["spectral"], [counts[tuple(p)] / REFLECTANCE_SCALE for p in INDICES], rtol=1e-6)
 
 
 def test_nothing_but_the_sampled_frames_is_touched(tmp_path, counts):

@@ -7,6 +7,7 @@ import torch
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
+from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 STEPS = 6
@@ -21,7 +22,7 @@ def trainer(tiny_dataset, folder, device="cpu", **changes):
     model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.machine.device_type = device
-    config.max_num_iterations = STEPS
+    config.max_num_iterations, config.evaluate_stages = STEPS, False
     for key, value in changes.items():
         setattr(config, key, value)
     made = config.setup(local_rank=0, world_size=1)
@@ -58,11 +59,49 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
     torch.testing.assert_close(twists[2], twists[5], rtol=0, atol=0)  # kept, and frozen
 
 
+def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path):
+    """Frozen groups, loss weights, learning rates and the paper's rays, by stage."""
+    first, second = full_frame_stage(), masked_stage()
+    first.frozen_groups, first.angular_loss_mult, first.group_lr = ("proposal_networks",), 0.0, {"fields": (0.1, 0.1)}
+    second.frozen_groups, second.hsi_loss_mult, second.foreground_share = ("camera_opt", "fields"), 9.0, 1.0
+    made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
+    weight, seen, changed = made.pipeline.model.config.angular_loss_mult, [], []
+    original = made.train_iteration
+
+    def train_iteration(step):
+        before = {name: [p.clone() for p in group] for name, group in made.optimizers.parameters.items()}
+        result = original(step)
+        for name, group in made.optimizers.parameters.items():
+            if any(not torch.equal(a, b) for a, b in zip(before[name], group, strict=True)):
+                changed.append((step, name))
+        config = made.pipeline.model.config
+        lr = made.optimizers.optimizers["fields"].param_groups[0]["lr"]
+        seen.append((config.angular_loss_mult, config.hsi_loss_mult, lr, "angular_loss" in result[1]))
+        return result
+
+    made.train_iteration = train_iteration
+    made.train()
+    assert seen[:3] == [(0.0, 0.75, pytest.approx(1e-3), False)] * 3
+    assert [row[:2] for row in seen[3:]] == [(weight, 9.0)] * 3
+    assert {name for step, name in changed if step < 3} == {"fields", "camera_opt"}
+    assert {name for step, name in changed if step >= 3} == {"proposal_networks"}
+    assert made.config.pipeline.model.hsi_loss_mult == 0.75  # the run's own configuration stays as it is
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [({"ema_decay": 1.0}, "ema-decay"), ({"full_frame": StageConfig("a", 1.0, frozen_groups=("x",))}, "named 'x'")],
+)
+def test_impossible_settings_end_in_a_sentence(tiny_dataset, tmp_path, changes, sentence):
+    with pytest.raises(SystemExit, match=f"hsi-sc-nerf: .*{sentence}"):
+        trainer(tiny_dataset, tmp_path, **changes)
+
+
 def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()
     kept = first.base_dir / "stage-full-frame"
-    assert {path.name for path in kept.iterdir()} == {"step-000000002.ckpt", "step-000000002.json"}
+    assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
 
     second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
     assert second._start_step == 3
