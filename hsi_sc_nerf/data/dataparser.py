@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -33,6 +34,9 @@ class SpectralDataParserConfig(DataParserConfig):
     """A dataset made by `hsi-sc-nerf process`, or a capture session, which is processed into a folder beside it."""
     train_split_fraction: float = paper.TRAIN_SPLIT_FRACTION
     """Share of the frames to train on; the others, evenly spread, are held out for evaluation."""
+    scene: Literal["box", "cameras"] = "box"
+    """What fills the unit cube of the scene. box: everything that turns, and nothing else. cameras: the places that
+    the camera takes around the object, as nerfstudio scales scenes without bounds (the paper's preset)."""
     process: ProcessConfig = field(default_factory=ProcessConfig)
     """How to process a session."""
 
@@ -64,8 +68,13 @@ class SpectralDataParser(DataParser):
         num_frames = len(dataset.frames)
         train, held_out = split_frames(num_frames, self.config.train_split_fraction)
         chosen = train if split == "train" else held_out
-        centre, scale = scene_scaling(dataset.scene_box_m)
         poses = dataset.camera_to_worlds
+        if self.config.scene == "box":
+            centre, scale = scene_scaling(dataset.scene_box_m)
+            aabb = (dataset.scene_box_m - centre) * scale
+        else:
+            centre, scale = scene_scaling(np.stack([f(poses[:, :3, 3], axis=0) for f in (np.min, np.max)]))
+            aabb = np.array([[-1.0] * 3, [1.0] * 3])
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
 
         lens = dataset.intrinsics
@@ -91,15 +100,15 @@ class SpectralDataParser(DataParser):
             image_filenames=[dataset.frames[i].image_path for i in chosen],
             mask_filenames=[dataset.frames[i].mask_path for i in chosen],
             cameras=cameras,
-            scene_box=SceneBox(aabb=torch.from_numpy((dataset.scene_box_m - centre) * scale).float()),
+            scene_box=SceneBox(aabb=torch.from_numpy(aabb).float()),
             dataparser_transform=transform,
             dataparser_scale=scale,
             metadata={
+                "dataset": dataset,
                 "frames": [dataset.frames[i] for i in chosen],
                 "flagged_values": dataset.flagged_values,
                 "wavelengths_nm": dataset.wavelengths_nm,
                 "rgb_bands": nearest_bands(dataset.wavelengths_nm, dataset.pseudo_rgb_nm).tolist(),
-                "background_reflectance": dataset.background_reflectance,
                 "object_box": torch.from_numpy((dataset.object_box_m - centre) * scale).float(),
                 # What the pose refinement needs to know of the turntable.
                 "turntable": {
@@ -131,9 +140,9 @@ def split_frames(num_frames: int, train_fraction: float) -> tuple[np.ndarray, np
     return train, held_out
 
 
-def scene_scaling(scene_box_m: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (metres) and scale that bring the scene box into [-1, 1]^3, as nerfstudio's models expect."""
-    low, high = scene_box_m
+def scene_scaling(box_m: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (metres) and scale that bring a box into [-1, 1]^3, as nerfstudio's models expect."""
+    low, high = box_m
     return (low + high) / 2.0, float(2.0 / (high - low).max())
 
 

@@ -126,14 +126,14 @@ def _surface_depth(
 @torch.no_grad()
 def _surface_of_rays(model: SpectralModel, rays: RayBundle, box: Float[torch.Tensor, "2 3"]) -> SurfacePoints:
     """The surface points that rays hit inside the box."""
+    background = model.spectra_behind(rays)  # before the model corrects the rays
     outputs = model(rays)
     points = rays.origins + rays.directions * _surface_depth(model, rays, outputs["depth"])
     opacity = outputs["accumulation"]
     hit = (opacity[:, 0] > MIN_OPACITY) & ((points > box[0]) & (points < box[1])).all(dim=-1)
     points, opacity = points[hit], opacity[hit]
     # What the ray collected beside the background's share is the object's own spectrum.
-    background = model.renderer_rgb.background * (1.0 - opacity)
-    spectra = ((outputs["spectral"][hit] - background) / opacity).clamp(0.0, 1.0)
+    spectra = ((outputs["spectral"][hit] - background[hit] * (1.0 - opacity)) / opacity).clamp(0.0, 1.0)
     normals = -torch.nn.functional.normalize(model.field.density_gradient(points), dim=-1)
     facing = (normals * rays.directions[hit]).sum(dim=-1, keepdim=True) <= 0
     return SurfacePoints(

@@ -1,4 +1,4 @@
-"""The model: nerfacto with a spectrum a ray, bounded by the turntable's box, before the chamber's own spectrum."""
+"""The model: nerfacto with a spectrum a ray, before the chamber that stands still behind the turntable."""
 
 from __future__ import annotations
 
@@ -9,21 +9,27 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer, RGBRenderer
-from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils import colormaps
-from torch import Tensor
+from torch import Tensor, nn
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.packed import PackedDataset
+from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
+from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
-from hsi_sc_nerf.models.losses import angular_loss, hsi_loss
+from hsi_sc_nerf.models.compositing import WeightedSum
+from hsi_sc_nerf.models.from_dataset import BackgroundKind, band_weights, chamber_background, training_subspace
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
-from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10
 
 ANGLE_PICTURE_MAX_RAD = 0.2
@@ -35,10 +41,27 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Configuration of the spectral model. Where a default differs from nerfacto's, a turntable scene is why."""
 
     _target: type = field(default_factory=lambda: SpectralModel)
+    head: Literal["direct", "basis"] = "direct"
+    """What a sample of the field emits. direct: the reflectance in every band. basis: a few coefficients, which a
+    basis of spectra found in the training pixels turns into all bands, once a pixel."""
+    basis_rank: int | None = None
+    """Coefficients of the basis head. None: as many as stand out of the noise of the training pixels."""
+    learn_basis: bool = True
+    """Let training improve the basis."""
+    background: BackgroundKind = "spectrum"
+    """What is seen where the object lets light through. spectrum: the chamber's median spectrum. image: a picture of
+    the chamber that stands still with the camera, taken from the frames. learned-image: the same, improved in the
+    first stage. last-sample: nothing but what the ray met last, as nerfacto does."""
+    hsi_loss: Literal["squared", "charbonnier"] = "squared"
+    """How errors of reflectance count: their squares (the paper), or linearly where they are large."""
+    angular_loss: Literal["cosine", "angle"] = "cosine"
+    """How spectral angles count: one minus their cosine (the paper), or the angles themselves."""
+    weigh_bands: bool = False
+    """Let bands count by how well they were measured."""
     angular_loss_mult: float = paper.ANGULAR_LOSS_WEIGHT
-    """Weight of the spectral angle's cosine loss."""
+    """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
-    """Weight of the squared error over pixels and bands."""
+    """Weight of the reflectance errors over pixels and bands."""
     interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
     """Weight of the proposal loss."""
     distortion_loss_mult: float = paper.DISTORTION_LOSS_WEIGHT
@@ -52,7 +75,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     near_plane: float = 0.01
     """Rays start no nearer to the camera than this (scene units)."""
     disable_scene_contraction: bool = True
-    """The scene is the box that holds everything that turns: nothing lies outside it to contract."""
+    """The scene is the box that holds everything that turns: nothing lies outside it to contract. False: a scene
+    without bounds, whose rays end at the far plane; it goes with the data parser's --scene cameras."""
     proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
     """Rays are sampled between where they enter and leave the box."""
     num_proposal_samples_per_ray: tuple[int, ...] = (64, 32)
@@ -82,27 +106,6 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Refinement of the measured poses."""
 
 
-class ChamberRenderer(RGBRenderer):
-    """Composite spectra along rays; what the object lets through shows the chamber's spectrum.
-
-    Args:
-        background: reflectance of the chamber behind the scene box, one number a band.
-    """
-
-    background: Tensor
-
-    def __init__(self, background: Float[Tensor, "bands"]) -> None:
-        super().__init__(background_color="black")
-        self.register_buffer("background", background)
-
-    def forward(  # type: ignore[override]
-        self, rgb: Float[Tensor, "*rays samples bands"], weights: Float[Tensor, "*rays samples 1"]
-    ) -> Float[Tensor, "*rays bands"]:
-        """Weighted sum of the samples' spectra plus the background's share."""
-        spectrum = torch.sum(weights * rgb, dim=-2)
-        return spectrum + self.background * (1.0 - torch.sum(weights, dim=-2))
-
-
 class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
@@ -112,7 +115,10 @@ class SpectralModel(NerfactoModel):
     config: SpectralModelConfig
     field: SpectralField
     camera_optimizer: PoseRefinement
-    renderer_rgb: ChamberRenderer
+    subspace: SpectralSubspace | None
+    decoder: nn.Module
+    renderer_rgb: nn.Module  # type: ignore[assignment]
+    band_weights: Tensor | None
 
     def populate_modules(self) -> None:
         """Build the modules.
@@ -121,11 +127,20 @@ class SpectralModel(NerfactoModel):
         """
         Model.populate_modules(self)
         config, metadata = self.config, self.kwargs["metadata"]
-        self.wavelengths_nm: np.ndarray = metadata["wavelengths_nm"]
+        dataset: PackedDataset = metadata["dataset"]
+        self.wavelengths_nm = dataset.wavelengths_nm
         self.rgb_bands: list[int] = metadata["rgb_bands"]
+        self.subspace, self.decoder = None, nn.Identity()
+        if config.head == "basis":
+            self.subspace = training_subspace(dataset, metadata["frames"], config.basis_rank)
+            basis = torch.from_numpy(self.subspace.scaled_basis).float()
+            self.decoder = BasisDecoder(basis, learnable=config.learn_basis)
+        contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = SpectralField(
             self.scene_box.aabb,
             num_bands=len(self.wavelengths_nm),
+            coefficient_start=None if self.subspace is None else torch.from_numpy(self.subspace.mean_coefficients),
+            spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
             num_levels=config.num_levels,
             max_res=config.max_res,
@@ -140,15 +155,19 @@ class SpectralModel(NerfactoModel):
             average_init_density=config.average_init_density,
             implementation=config.implementation,
         )
-        self._build_proposals()
+        self._build_proposals(contraction)
         self.camera_optimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
-        self.collider = AABBBoxCollider(  # type: ignore[assignment]
-            self.scene_box, near_plane=config.near_plane
-        )
+        if contraction is None:
+            self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
+        else:
+            self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
+        self.background = chamber_background(config.background, dataset, metadata["frames"])
+        self.register_buffer("band_weights", band_weights(dataset) if config.weigh_bands else None, persistent=False)
 
-        self.renderer_rgb = ChamberRenderer(torch.as_tensor(metadata["background_reflectance"]).float())
+        nothing_behind = self.background is None
+        self.renderer_rgb = RGBRenderer(background_color="last_sample") if nothing_behind else WeightedSum()
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.renderer_expected_depth = DepthRenderer(method="expected")
@@ -156,7 +175,16 @@ class SpectralModel(NerfactoModel):
         self.normals_shader = NormalsShader()
         self.step = 0
 
-    def _build_proposals(self) -> None:
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Nerfacto's groups; the basis and the background, where they learn, have rates of their own."""
+        groups = super().get_param_groups()
+        for name, module in (("basis", self.decoder), ("background", self.background)):
+            parameters = [] if module is None else list(module.parameters())
+            if parameters:
+                groups[name] = parameters
+        return groups
+
+    def _build_proposals(self, contraction: SceneContraction | None) -> None:
         """Proposal networks and the sampler that uses them, as in nerfacto."""
         config = self.config
         arguments = config.proposal_net_args_list
@@ -164,6 +192,7 @@ class SpectralModel(NerfactoModel):
             SpectralProposalField(
                 self.scene_box.aabb,
                 **arguments[min(i, len(arguments) - 1)],
+                spatial_distortion=contraction,
                 average_init_density=config.average_init_density,
                 implementation=config.implementation,
             )
@@ -187,12 +216,23 @@ class SpectralModel(NerfactoModel):
             initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
         )
 
+    def spectra_behind(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
+        """The chamber's reflectance behind rays as measured, before a refinement of the poses has moved them."""
+        if self.background is None:
+            return torch.zeros(*ray_bundle.shape, len(self.wavelengths_nm), device=self.device)
+        return self.background(ray_bundle.directions, ray_bundle.metadata.get(CAMERA_ROTATION))
+
     def get_outputs(self, ray_bundle: RayBundle) -> dict:  # type: ignore[override]
         """Nerfacto's outputs with the spectrum; held-out views are corrected like training views."""
+        behind = None if self.background is None else self.spectra_behind(ray_bundle)
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
-        outputs["spectral"] = outputs["rgb"]
+        spectral = self.decoder(outputs["rgb"])
+        if behind is not None:
+            spectral = spectral + behind * (1.0 - outputs["accumulation"])
+        # A basis can go below black by a little.
+        outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
         outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
         return outputs
 
@@ -217,9 +257,13 @@ class SpectralModel(NerfactoModel):
         target, valid = self._measured(batch)
         losses = {}
         if config.hsi_loss_mult > 0:
-            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target, valid=valid)
+            errors = hsi_loss if config.hsi_loss == "squared" else charbonnier_loss
+            value = errors(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
+            losses["hsi_loss"] = config.hsi_loss_mult * value
         if config.angular_loss_mult > 0:
-            losses["angular_loss"] = config.angular_loss_mult * angular_loss(outputs["spectral"], target, valid=valid)
+            angles = angular_loss if config.angular_loss == "cosine" else angle_loss
+            value = angles(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
+            losses["angular_loss"] = config.angular_loss_mult * value
         if not self.training:
             return losses
         assert metrics_dict is not None

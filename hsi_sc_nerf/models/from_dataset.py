@@ -1,0 +1,71 @@
+"""What a model takes from its dataset before it trains: spectral basis, background, weights of the bands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame
+from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, find_subspace, pixel_noise, sample_training_spectra
+from hsi_sc_nerf.data.static_background import estimate_static_background
+from hsi_sc_nerf.models.band_weights import inverse_variance_weights
+from hsi_sc_nerf.models.camera_background import CameraBackground
+from hsi_sc_nerf.models.compositing import ChamberSpectrum
+
+BackgroundKind = Literal["last-sample", "spectrum", "image", "learned-image"]
+
+
+def training_subspace(
+    dataset: PackedDataset, frames: Sequence[PackedFrame], rank: int | None = None
+) -> SpectralSubspace:
+    """The spectra of training pixels, half of them of the object, as a basis.
+
+    Args:
+        dataset: whose uncertainty is the noise floor; where it is not known, the spectra tell their noise themselves.
+        frames: training frames.
+        rank: of the basis; None for what stands out of the noise.
+
+    Raises:
+        InputError: hardly any pixel is free of flagged values.
+    """
+    spectra, valid = sample_training_spectra(frames)
+    noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
+    return find_subspace(spectra, noise, valid, rank=rank)
+
+
+def chamber_background(
+    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]
+) -> ChamberSpectrum | CameraBackground | None:
+    """What stands behind the rays: None where nothing does ("last-sample").
+
+    Args:
+        kind: what it is taken to be.
+        dataset: whose camera it stands still with.
+        frames: training frames, from which its picture is taken.
+    """
+    if kind == "last-sample":
+        return None
+    spectrum = torch.from_numpy(dataset.background_reflectance).float()
+    if kind == "spectrum":
+        return ChamberSpectrum(spectrum)
+    picture = estimate_static_background(dataset, frames)
+    k1, k2, p1, p2 = dataset.distortion.tolist()
+    return CameraBackground(
+        torch.from_numpy(picture.image),
+        cell_px=picture.cell_px,
+        intrinsics=dataset.intrinsics,
+        distortion=(k1, k2, p1, p2),
+        spectrum=spectrum,
+        learnable=kind == "learned-image",
+    )
+
+
+def band_weights(dataset: PackedDataset) -> Float[Tensor, "bands"] | None:
+    """How much each band counts, by how well it was measured; None where the session does not tell."""
+    if dataset.typical_uncertainty is None:
+        return None
+    return torch.from_numpy(inverse_variance_weights(dataset.typical_uncertainty)).float()
