@@ -79,6 +79,14 @@ def hide_some(images: Images) -> Images:
     return hidden
 
 
+def bump_one(images: Images) -> Images:
+    """The camera is pushed aside for one frame, by a hundredth of its width."""
+    height, width = images[0].shape
+    aside = np.array([[1.0, 0.0, width / 100.0], [0.0, 1.0, -width / 150.0]])
+    bumped = cv2.warpAffine(images[5], aside, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    return [bumped if i == 5 else image for i, image in enumerate(images)]
+
+
 CASES = {
     "even turn": Case(),
     "partial turn (200 degrees)": Case(("{partial_turn: {span_deg: 200}}",)),
@@ -96,6 +104,7 @@ CASES = {
     "blurred and noisy": Case(("{optical_blur: {sigma_px: 1.5}}", "photon_noise", "{read_noise: {electrons: 300}}")),
     "every fifth frame out of focus": Case(alter=blur_some),
     "two frames covered": Case(alter=hide_some),
+    "camera bumped in one frame": Case(alter=bump_one),
     "textured background": Case(("textured_background",)),
     "20 frames": Case(frames=20),
     "markers of 20 px": Case(frames=36, size=0.273),

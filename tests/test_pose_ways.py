@@ -13,6 +13,8 @@ from hsi_sc_nerf.poses import ways
 from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.report import describe_poses
+from hsi_sc_nerf.poses.scale import Scale
 from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -169,3 +171,31 @@ def test_a_camera_of_other_images():
     images = [np.zeros((10, 10), np.uint8)] * 4
     with pytest.raises(InputError, match="10 x 10 pixels, but the camera of the earlier session had 64 x 48"):
         find_poses(images, list("abcd"), known, "angles", CONFIG, progress=False)
+
+
+def test_a_camera_that_no_one_has_is_not_believed(monkeypatch):
+    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
+    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
+        found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
+        monkeypatch.setattr(ways, "poses_by_colmap", lambda *_, found=found: found)
+        if believed:
+            assert find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG).intrinsics.fl_x == focal_px
+            continue
+        with pytest.raises(InputError, match="too few to tell the camera"):
+            find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG)
+
+
+def test_the_figures_in_words_and_the_warning_above_one_pixel():
+    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
+    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    words = ", ".join(describe_poses(poses, poses.report()))
+    assert words.startswith("4 of 4 frames, one axis, axis leans ")
+    assert words.endswith("scale as given")
+    scale = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.092)
+    worse = replace(poses, overall_error_px=1.2, loop_closure_deg=-0.25, disc_tilt_deg=0.5, scale=scale)
+    words = ", ".join(describe_poses(worse, worse.report()))
+    for part in ("error 1.20 px", "closes to 0.250°", "0.50° to the disc", "markers ± 0.20 % (by it", "+2.2 % off"):
+        assert part in words
+    assert "the reprojection error of 1.20 px is above 1.0 px" in worse.report()["warnings"]
+    assert not any("above 1.0 px" in w for w in replace(poses, overall_error_px=0.99).report()["warnings"])

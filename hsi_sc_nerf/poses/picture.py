@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX
+from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX, describe_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 _ARROW_SHARE = 0.15
@@ -86,18 +86,5 @@ def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
 def _summary(poses: TurntablePoses) -> str:
     """The figures that are not drawn, in two lines."""
     report = poses.report()
-    parts = [
-        f"{poses.method}, {poses.model}",
-        f"{report['frames']['used']} of {report['frames']['total']} frames",
-        f"axis leans {report['axis_tilt_in_image_deg']:.2f}° in the image",
-        f"camera looks down {report['camera_looks_down_deg']:.2f}°",
-    ]
-    if report["loop_closure_deg"] is not None:
-        parts.append(f"loop closes to {report['loop_closure_deg']:.3f}°")
-    if poses.scale is not None:
-        parts.append(f"scale ± {100.0 * poses.scale.uncertainty:.3f} %")
-        if poses.scale.source == "markers" and poses.scale.disagreement_percent is not None:
-            parts.append(f"container {poses.scale.disagreement_percent:+.1f} %")
-    if poses.outliers:
-        parts.append(f"{len(poses.outliers)} markers thrown out")
-    return f"{', '.join(parts)}\n{len(report['warnings'])} warnings (see poses.json)"
+    words = ", ".join(describe_poses(poses, report))
+    return f"By {poses.method}: {words}\n{len(report['warnings'])} warnings (see poses.json)"

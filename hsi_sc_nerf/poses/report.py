@@ -93,6 +93,40 @@ def pose_report(poses: TurntablePoses) -> dict:
     }
 
 
+def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
+    """What was found and how good it is, in a few words each; ``report`` is ``pose_report`` of the poses.
+
+    Axis, camera, loop closure, scale with its uncertainty, and what was thrown out; the warnings are apart.
+    """
+    frames, error_px = report["frames"], report["reprojection_error_px"]["overall"]
+    parts = [f"{frames['used']} of {frames['total']} frames"]
+    if error_px is not None:
+        parts.append(f"reprojection error {error_px:.2f} px")
+    parts += [
+        "free poses of a wobbling table" if poses.model == "free poses" else "one axis",
+        f"axis leans {report['axis_tilt_in_image_deg']:.2f}° in the image",
+        f"camera looks down {report['camera_looks_down_deg']:.2f}°",
+    ]
+    if report["axis_tilt_to_disc_deg"] is not None:
+        parts.append(f"axis tilts {report['axis_tilt_to_disc_deg']:.2f}° to the disc")
+    if report["loop_closure_deg"] is not None:
+        parts.append(f"loop closes to {abs(report['loop_closure_deg']):.3f}°")
+    parts += [_scale_in_words(poses)]
+    if poses.outliers:
+        parts.append(f"{len(poses.outliers)} sightings of markers thrown out")
+    return parts
+
+
+def _scale_in_words(poses: TurntablePoses) -> str:
+    scale = poses.scale
+    if scale is None:
+        return "scale as given" if poses.metric else "no scale"
+    words = f"scale by the {scale.source} ± {100.0 * scale.uncertainty:.2f} %"
+    if scale.source == "markers" and scale.disagreement_percent is not None:
+        words += f" (by it the container is {scale.disagreement_percent:+.1f} % off its given diameter)"
+    return words
+
+
 def is_full_turn(angles_deg: np.ndarray) -> bool:
     """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""
     widest_step = np.abs(np.diff(angles_deg)).max()

@@ -90,13 +90,14 @@ def _by_colmap_or_freed_angles(
 ) -> TurntablePoses:
     """By COLMAP; where that fails, as it may at low resolution, from the known angles, adjusted on features."""
     try:
-        return replace(poses_by_colmap(images, names, facts, config), chosen=f"by {_NAMES['colmap']}, {_AS_SET}")
+        poses = _checked(poses_by_colmap(images, names, facts, config))
+        return replace(poses, chosen=f"by {_NAMES['colmap']}, {_AS_SET}")
     except InputError as error:
         angles_deg, failed = facts.angles_deg(len(names)), str(error).rstrip(".")
         if angles_deg is None:
             raise
     try:
-        poses = poses_by_freed_angles(images, names, angles_deg, facts, config)
+        poses = _checked(poses_by_freed_angles(images, names, angles_deg, facts, config))
     except InputError as error:
         raise InputError(f"{failed}; nor do features suit the known angles: {error}") from error
     warning = (
@@ -110,6 +111,24 @@ def _by_colmap_or_freed_angles(
     )
 
 
+def _checked(poses: TurntablePoses) -> TurntablePoses:
+    """Poses from features, whose focal length may run away with the distance where they are few.
+
+    Raises:
+        InputError: no camera has such a field of view.
+    """
+    field_deg = float(np.rad2deg(2.0 * np.arctan(poses.intrinsics.w / 2.0 / poses.intrinsics.fl_x)))
+    low, high = FIELD_OF_VIEW_DEG
+    if not low <= field_deg <= high:
+        raise InputError(
+            f"the features are too few to tell the camera (a field of view of {field_deg:.1f} degrees suits "
+            "them best); take images of more pixels, an object with more texture, or markers"
+        )
+    return poses
+
+
+FIELD_OF_VIEW_DEG = (4.0, 100.0)
+"""Cameras beyond these are not believed: from a long tele lens to a very wide one, over the image's width."""
 _AS_SET = "as the settings say"
 _ORDER: tuple[Literal["markers", "colmap", "angles"], ...] = ("markers", "colmap", "angles")
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
@@ -136,12 +155,12 @@ def _by(
             progress=progress,
         )
     if way == "colmap":
-        return poses_by_colmap(images, names, facts, config)
+        return _checked(poses_by_colmap(images, names, facts, config))
     angles_deg = facts.angles_deg(len(names))
     if angles_deg is None:
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
     if facts.camera is None:
-        return poses_by_angles(images, names, angles_deg, facts, config)
+        return _checked(poses_by_angles(images, names, angles_deg, facts, config))
     height, width = images[0].shape
     return poses_by_known_camera(
         names,
