@@ -9,7 +9,7 @@ from test_staged_trainer import trainer
 from hsi_sc_nerf.models.stages import full_frame_stage
 
 SWITCH, STEPS = 8, 20
-EVALUATIONS = {"steps_per_eval_batch": 5, "steps_per_eval_image": 7}
+EVALUATIONS = {"steps_per_eval_batch": 5, "steps_per_eval_image": 13}
 
 
 class Killed(BaseException):
