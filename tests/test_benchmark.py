@@ -3,8 +3,11 @@
 import csv
 import json
 import math
-from dataclasses import replace
+import shutil
+from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -14,14 +17,13 @@ from nerfstudio.engine.trainer import writer
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.benchmark import run
+from hsi_sc_nerf.evaluation.benchmark import plot, run
 from hsi_sc_nerf.evaluation.benchmark.configurations import (
     CONFIGURATIONS,
     named_configuration,
     own_configuration,
     training_config,
 )
-from hsi_sc_nerf.evaluation.benchmark.plot import draw_accuracy_and_time
 from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, table, write_csv
 from hsi_sc_nerf.evaluation.benchmark.run import Checkpoint, HeldOutViews
 from hsi_sc_nerf.evaluation.benchmark.timing import TrainingClock, checkpoint_iterations, mean_iteration_seconds
@@ -126,126 +128,6 @@ def test_bad_words_are_refused_in_one_sentence(method, words, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.fixture
-def in_this_process(monkeypatch):
-    """Runs in this process, which has nerfstudio imported; gives the names of those that ran."""
-    ran = []
-
-    def run_step(name, argv, log):
-        ran.append(name)
-        writer.EVENT_WRITERS.clear()  # those of earlier runs, whose folders may be gone
-        run.main(Path(argv[-2]), Path(argv[-1]))
-
-    monkeypatch.setattr(benchmark, "run_step", run_step)
-    return ran
-
-
-def command(tiny_dataset, folder, device="cpu", **changes):
-    made = BenchmarkCommand(
-        data=tiny_dataset[0],
-        output_dir=folder,
-        configurations=("ours",),
-        sets=("no-normals=--pipeline.model.predict-normals False",),
-        common=TINY.format(device=device),
-        iterations=6,
-        checkpoints=(0.34, 1.0),
-        held_out_views=1,
-        threads=torch.get_num_threads(),
-    )
-    return replace(made, **changes)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_two_configurations_and_nothing_twice(tiny_dataset, tmp_path, in_this_process, device, capsys):
-    asked = command(tiny_dataset, tmp_path, device)
-    asked.main()
-    assert in_this_process == ["result of ours", "result of no-normals"]
-
-    with (tmp_path / "benchmark.csv").open(encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    assert [(line["configuration"], line["iteration"], line["ends_stage"]) for line in lines] == [
-        (name, *rest) for name in ("ours", "no-normals") for rest in (("2", "False"), ("3", "True"), ("6", "True"))
-    ]
-    assert [line["stage"] for line in lines[:3]] == ["full-frame", "full-frame", "masked"]
-    for line in lines:
-        assert all(math.isfinite(float(line[key])) for key in ("sam", "sam_std", "rmse", "ssim", "psnr", "full_psnr"))
-        assert float(line["peak_memory_mib"]) > 10
-        assert (float(line["gpu_memory_mib"]) > 0) == (device == "cuda")
-    for clock in ("train_seconds", "cpu_seconds"):
-        first, second, third = (float(line[clock]) for line in lines[:3])
-        assert 0 < first < second < third
-    content = json.loads((tmp_path / "benchmark.json").read_text())
-    assert content["machine"]["torch"] == torch.__version__.split("+")[0]
-    assert "predict-normals" in (tmp_path / "benchmark.md").read_text()
-    assert cv2.imread(str(tmp_path / "benchmark.png")).std() > 5
-
-    asked.main()
-    assert len(in_this_process) == 2  # nothing was left to do
-    (tmp_path / "ours" / "result.json").unlink()
-    asked.main()
-    assert in_this_process[2:] == ["result of ours"]
-    replace(asked, configurations=(), iterations=4).main()
-    assert in_this_process[3:] == ["result of no-normals"]
-
-
-def test_time_is_turned_into_iterations_by_a_rehearsal(tiny_dataset, tmp_path, in_this_process):
-    command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=0.3).main()
-    assert in_this_process == ["rehearsal of ours", "result of ours"]
-    rehearsed = json.loads((tmp_path / "ours" / "rehearsal.json").read_text())
-    trained = json.loads((tmp_path / "ours" / "result.json").read_text())
-    assert rehearsed["iterations"] == max(1, round(0.3 / rehearsed["iteration_seconds"]))
-    assert trained["checkpoints"][-1]["iteration"] == rehearsed["iterations"]
-    (tmp_path / "ours" / "result.json").unlink()
-    command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=0.3).main()
-    assert in_this_process[2:] == ["result of ours"]
-
-
-def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
-    ends = []
-    for checkpoints in ((1.0,), (0.17, 0.34, 0.67, 1.0)):
-        asked = command(tiny_dataset, tmp_path / str(len(ends)), sets=(), checkpoints=checkpoints)
-        (done,) = benchmark.train_all([named_configuration("ours")], asked)
-        ends.append(done.checkpoints[-1].metrics)
-    assert ends[0] == pytest.approx(ends[1], rel=1e-4)
-
-
-def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, in_this_process, monkeypatch):
-    works = benchmark.run_step
-
-    def run_step(name, argv, log):
-        if "ours" in name:
-            raise InputError(f"the step '{name}' failed with status 1; {log} tells why.")
-        works(name, argv, log)
-
-    monkeypatch.setattr(benchmark, "run_step", run_step)
-    with pytest.raises(InputError, match=r"1 of 2 configurations failed.*result of ours"):
-        command(tiny_dataset, tmp_path).main()
-    assert not (tmp_path / "ours" / "result.json").exists()
-    assert "no-normals" in (tmp_path / "benchmark.csv").read_text()
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"configurations": ("theirs",)},
-        {"sets": ("ours=--vis tensorboard",)},
-        {"configurations": (), "sets": ()},
-        {"common": "--no-such-word 1"},
-        {"iterations": 0},
-        {"train_seconds": -1.0},
-        {"checkpoints": (0.5, 2.0)},
-        {"held_out_views": 0},
-        {"threads": 0},
-        {"data": Path("nowhere")},
-    ],
-)
-def test_bad_settings_are_one_sentence_before_anything_is_trained(tiny_dataset, tmp_path, in_this_process, changes):
-    with pytest.raises(InputError, match=r"^[^\n]+\.$"):
-        command(tiny_dataset, tmp_path / "out", **changes).main()
-    assert in_this_process == []
-    assert not (tmp_path / "out").exists()
-
-
 def made_up_run(name, gpu_memory_mib=0.0):
     checkpoints = [
         Checkpoint(
@@ -269,6 +151,159 @@ def made_up_run(name, gpu_memory_mib=0.0):
     return TrainedRun(name, "hsi-sc-nerf", ("--vis", "viewer"), 0.1, tuple(checkpoints))
 
 
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Runs in this process, which has nerfstudio imported."""
+
+    def run_step(name, argv, log):
+        writer.EVENT_WRITERS.clear()  # those of earlier runs, whose folders may be gone
+        run.main(Path(argv[-2]), Path(argv[-1]))
+
+    monkeypatch.setattr(benchmark, "run_step", run_step)
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """No run is trained; gives the names of those that were asked for. What is in ``fails`` fails."""
+    ran = SimpleNamespace(names=[], fails=())
+
+    def run_step(name, argv, log):
+        ran.names.append(name)
+        if name in ran.fails:
+            raise InputError(f"the step '{name}' failed with status 1; {log} tells why.")
+        if name.startswith("rehearsal"):
+            found = {"iterations": 30, "iteration_seconds": 0.1}
+            Path(json.loads(Path(argv[-2]).read_text())["output_dir"]).mkdir()
+        else:
+            found = {"setup_seconds": 0.1, "checkpoints": [asdict(c) for c in made_up_run("a").checkpoints]}
+        Path(argv[-1]).write_text(json.dumps(found))
+
+    monkeypatch.setattr(benchmark, "run_step", run_step)
+    monkeypatch.setattr(plot, "draw_accuracy_and_time", lambda path, runs: None)
+    return ran
+
+
+def command(tiny_dataset, folder, device="cpu", **changes):
+    made = BenchmarkCommand(
+        data=tiny_dataset[0],
+        output_dir=folder,
+        configurations=("ours",),
+        sets=("no-normals=--pipeline.model.predict-normals False",),
+        common=TINY.format(device=device),
+        iterations=6,
+        checkpoints=(0.34, 1.0),
+        held_out_views=1,
+        threads=torch.get_num_threads(),
+    )
+    return replace(made, **changes)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_path, in_this_process, device):
+    command(tiny_dataset, tmp_path, device).main()
+    with (tmp_path / "benchmark.csv").open(encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["configuration"], line["iteration"], line["ends_stage"]) for line in lines] == [
+        (name, *rest) for name in ("ours", "no-normals") for rest in (("2", "False"), ("3", "True"), ("6", "True"))
+    ]
+    assert [line["stage"] for line in lines[:3]] == ["full-frame", "full-frame", "masked"]
+    for line in lines:
+        assert all(math.isfinite(float(line[key])) for key in ("sam", "sam_std", "rmse", "ssim", "psnr", "full_psnr"))
+        assert float(line["peak_memory_mib"]) > 10
+        assert (float(line["gpu_memory_mib"]) > 0) == (device == "cuda")
+    for clock in ("train_seconds", "cpu_seconds"):
+        first, second, third = (float(line[clock]) for line in lines[:3])
+        assert 0 < first < second < third
+    content = json.loads((tmp_path / "benchmark.json").read_text())
+    assert content["machine"]["torch"] == version("torch")
+    assert "predict-normals" in (tmp_path / "benchmark.md").read_text()
+    assert cv2.imread(str(tmp_path / "benchmark.png")).std() > 5
+
+
+def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
+    job = benchmark._job(named_configuration("ours"), command(tiny_dataset, tmp_path), tiny_dataset[0])
+    ends = []
+    for checkpoints in ((1.0,), (0.17, 0.67, 1.0)):
+        writer.EVENT_WRITERS.clear()
+        ends.append(run.train(replace(job, checkpoints=checkpoints))["checkpoints"][-1]["metrics"])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-4)
+
+
+def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path):
+    writer.EVENT_WRITERS.clear()
+    asked = command(tiny_dataset, tmp_path, iterations=None, train_seconds=0.3)
+    found = run.rehearse(benchmark._job(named_configuration("ours"), asked, tiny_dataset[0]))
+    assert found["iterations"] == max(1, round(0.3 / found["iteration_seconds"]))
+
+
+def test_finished_runs_are_not_repeated(tiny_dataset, tmp_path, made_up):
+    asked = command(tiny_dataset, tmp_path)
+    asked.main()
+    assert made_up.names == ["result of ours", "result of no-normals"]
+    asked.main()
+    assert len(made_up.names) == 2
+    (tmp_path / "ours" / "result.json").unlink()
+    asked.main()
+    assert made_up.names[2:] == ["result of ours"]
+    assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == [
+        "ours",
+        "no-normals",
+    ]
+    replace(asked, configurations=(), iterations=4).main()
+    assert made_up.names[3:] == ["result of no-normals"]
+
+
+def test_a_run_on_another_dataset_is_another_run(tiny_dataset, tmp_path, made_up):
+    data = tmp_path / "data"
+    shutil.copytree(tiny_dataset[0], data)
+    asked = command((data,), tmp_path / "out", sets=())
+    asked.main()
+    (data / "transforms.json").write_text((data / "transforms.json").read_text() + "\n")
+    asked.main()
+    assert made_up.names == ["result of ours"] * 2
+
+
+def test_a_rehearsal_comes_before_a_run_of_given_time_and_is_kept(tiny_dataset, tmp_path, made_up):
+    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=3.0)
+    made_up.fails = ("result of ours",)
+    with pytest.raises(InputError, match="result of ours"):
+        asked.main()
+    made_up.fails = ()
+    asked.main()
+    assert made_up.names == ["rehearsal of ours", "result of ours", "result of ours"]
+    assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["rehearsal.json", "result.json"]
+
+
+def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):
+    made_up.fails = ("result of ours",)
+    with pytest.raises(InputError, match=r"1 of 2 configurations failed.*result of ours"):
+        command(tiny_dataset, tmp_path).main()
+    assert list((tmp_path / "ours").iterdir()) == []
+    assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"configurations": ("theirs",)},
+        {"sets": ("ours=--vis tensorboard",)},
+        {"configurations": (), "sets": ()},
+        {"common": "--no-such-word 1"},
+        {"iterations": 0},
+        {"train_seconds": -1.0},
+        {"checkpoints": (0.5, 2.0)},
+        {"held_out_views": 0},
+        {"threads": 0},
+        {"data": Path("nowhere")},
+    ],
+)
+def test_bad_settings_are_one_sentence_before_anything_is_trained(tiny_dataset, tmp_path, made_up, changes):
+    with pytest.raises(InputError, match=r"^[^\n]+\.$"):
+        command(tiny_dataset, tmp_path / "out", **changes).main()
+    assert made_up.names == []
+    assert not (tmp_path / "out").exists()
+
+
 def test_table_has_a_row_for_each_stage():
     titles, rows = table([made_up_run("a"), made_up_run("b")])
     assert [row[:5] for row in rows] == [
@@ -283,5 +318,5 @@ def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
     runs = [made_up_run(f"run-{i}") for i in range(9)]
     write_csv(tmp_path / "runs.csv", runs)
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 27
-    draw_accuracy_and_time(tmp_path / "runs.png", runs)
+    plot.draw_accuracy_and_time(tmp_path / "runs.png", runs)
     assert cv2.imread(str(tmp_path / "runs.png")).std() > 5

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.cli.steps import run_step
-from hsi_sc_nerf.data.atomic import write_json
+from hsi_sc_nerf.data.atomic import TEMPORARY_PREFIX, write_json
 from hsi_sc_nerf.data.packed import TRANSFORMS_NAME, is_packed, open_packed
 from hsi_sc_nerf.data.session import is_session
 from hsi_sc_nerf.errors import InputError
@@ -100,32 +101,45 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     # What a finished run must agree in to count as this one's.
     identity = {"machine": machine, "data_sha256": hashlib.sha256((data / TRANSFORMS_NAME).read_bytes()).hexdigest()}
     jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}
-    runs: list[TrainedRun] = []
+    contents = {
+        name: _finished(command.output_dir / name / "result.json", job, identity) for name, job in jobs.items()
+    }
+    missing = [name for name, content in contents.items() if content is None]
+    if len(missing) < len(jobs):
+        console.print(f"Already trained: {', '.join(name for name in jobs if name not in missing)}")
     failures: list[str] = []
-    trained, started = 0, time.perf_counter()
-    for number, (name, job) in enumerate(jobs.items(), start=1):
-        folder = command.output_dir / name
-        content = _finished(folder / "result.json", job, identity)
-        state = "already trained" if content is not None else job.method
-        if content is None and trained:
-            waiting = sum(_finished(command.output_dir / n / "result.json", jobs[n], identity) is None for n in jobs)
-            minutes = waiting * (time.perf_counter() - started) / trained / 60
-            state += f", about {minutes:.0f} min left in all"
-        console.print(f"[bold]{number}/{len(jobs)} {name}[/bold] ({escape(state)})")
-        if content is None:
-            try:
-                content = _train(folder, job, identity)
-            except InputError as error:
-                failures.append(str(error))
-                console.print(f"[yellow]{escape(str(error))}")
-                continue
-            trained += 1
-        checkpoints = tuple(Checkpoint(**c) for c in content["checkpoints"])
-        runs.append(TrainedRun(name, job.method, job.words, content["setup_seconds"], checkpoints))
-        _write(runs, command, machine)
+    started = time.perf_counter()
+    for number, name in enumerate(missing):
+        minutes = (len(missing) - number) * (time.perf_counter() - started) / max(1, number) / 60
+        left = f", about {minutes:.0f} min left in all" if number else ""
+        console.print(f"[bold]{number + 1}/{len(missing)} {name}[/bold] ({jobs[name].method}{left})")
+        try:
+            contents[name] = _train(command.output_dir / name, jobs[name], identity)
+        except InputError as error:
+            failures.append(str(error))
+            console.print(f"[yellow]{escape(str(error))}")
+        else:
+            _write(_runs(jobs, contents), command, machine)
+    if not missing:
+        _write(_runs(jobs, contents), command, machine)
     if failures:
         raise InputError(f"{len(failures)} of {len(jobs)} configurations failed; the first: {failures[0]}")
-    return runs
+    return _runs(jobs, contents)
+
+
+def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[TrainedRun]:
+    """Those that are finished."""
+    return [
+        TrainedRun(
+            name,
+            job.method,
+            job.words,
+            content["setup_seconds"],
+            tuple(Checkpoint(**c) for c in content["checkpoints"]),
+        )
+        for name, job in jobs.items()
+        if (content := contents[name]) is not None
+    ]
 
 
 def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -> None:
@@ -192,22 +206,17 @@ def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
 
 
 def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str, Any]) -> dict[str, Any]:
+    """Do a job in a process of its own; what it finds is kept as ``NAME.json`` with the job that was asked for."""
     folder.mkdir(parents=True, exist_ok=True)
     log = folder.parent / "logs" / f"{folder.name}-{name}.log"
     log.parent.mkdir(exist_ok=True)
-    job_path, result_path = folder / f".{name}-job.json", folder / f"{name}.json"
-    found_path = folder / f".{name}-found.json"
-    write_json(job_path, asdict(doing))
-    module = "hsi_sc_nerf.evaluation.benchmark.run"
-    run_step(
-        f"{name} of {folder.name}",
-        [sys.executable, "-m", module, str(job_path), str(found_path)],
-        log,
-    )
-    found = json.loads(found_path.read_text(encoding="utf-8"))
-    write_json(result_path, {"job": asdict(asked), **identity, **found})
-    job_path.unlink()
-    found_path.unlink()
+    with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY_PREFIX) as temporary:
+        job_path, found_path = Path(temporary, "job.json"), Path(temporary, "found.json")
+        write_json(job_path, asdict(doing))
+        module = "hsi_sc_nerf.evaluation.benchmark.run"
+        run_step(f"{name} of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
+        found = json.loads(found_path.read_text(encoding="utf-8"))
+    write_json(folder / f"{name}.json", {"job": asdict(asked), **identity, **found})
     return found
 
 
