@@ -6,6 +6,7 @@ import pytest
 import torch
 from test_staged_trainer import trainer
 
+from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.stages import full_frame_stage
 
 SWITCH, STEPS = 8, 20
@@ -115,13 +116,24 @@ def test_both_stages_leave_their_held_out_metrics(whole):
     assert again["psnr"] == pytest.approx(found["results"]["psnr"], rel=1e-6)
 
 
-def test_killed_while_the_first_stage_is_evaluated(tiny_dataset, tmp_path):
-    made = longer(tiny_dataset, tmp_path, evaluate_stages=True)
-    fail_in(made, made.pipeline, "get_average_eval_image_metrics", lambda **_: True)
-    folder = made.base_dir / "stage-full-frame"
-    assert not folder.exists()
-    longer(tiny_dataset, tmp_path, load_dir=made.checkpoint_dir, evaluate_stages=True).train()
-    assert {path.suffix for path in folder.iterdir()} == {".ckpt", ".json"}
+@pytest.mark.parametrize("stage", ["full-frame", "masked"])
+def test_killed_while_a_stage_is_evaluated(tiny_dataset, tmp_path, monkeypatch, stage):
+    values = {f"{prefix}{name}": 0.5 for prefix in ("", "full_") for name in ("sam", "rmse", "ssim", "psnr")}
+    monkeypatch.setattr(SpectralPipeline, "get_average_eval_image_metrics", lambda *_, **__: values)
+    made = longer(tiny_dataset, tmp_path / "killed", max_num_iterations=SWITCH + 1, evaluate_stages=True)
+    last = SWITCH - (stage == "full-frame")
+    fail_in(made, made.pipeline, "get_average_eval_image_metrics", lambda step, **_: step == last)
+    assert not (made.base_dir / f"stage-{stage}").exists()
+
+    options = {"load_dir": made.checkpoint_dir, "max_num_iterations": SWITCH + 1, "evaluate_stages": True}
+    resumed = longer(tiny_dataset, tmp_path / "resumed", **options)
+    if stage == "full-frame":
+        resumed.train()
+    else:
+        with pytest.raises(SystemExit, match="has all 9 iterations"):
+            resumed.train()
+    for name in {stage, "masked"}:
+        assert {path.suffix for path in (resumed.base_dir / f"stage-{name}").iterdir()} == {".ckpt", ".json"}
 
 
 def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp_path, whole):
@@ -136,6 +148,7 @@ def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp
 
     made.pipeline.datamanager.next_train = next_train
     made.train()
+    assert not (made.base_dir / "stage-full-frame").exists()  # the first run has kept it
     assert seen == [(step, 0.75) for step in range(SWITCH, SWITCH + STEPS - 15)]
     assert checkpoint(made.checkpoint_dir)["training"]["completed_stage"] == "masked"
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from nerfstudio.utils import writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_staged_trainer import STEPS, trainer
 
@@ -13,7 +12,7 @@ from hsi_sc_nerf.models.training_log import draw_spectra, stage_summary
 @pytest.fixture
 def events(tiny_dataset, tmp_path, monkeypatch):
     """Everything that a small run logs."""
-    monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
     made = trainer(tiny_dataset, tmp_path, evaluate_stages=True, steps_per_eval_batch=4, steps_per_eval_image=4)
     made.config.logging.steps_per_log = 1
     made.config.full_frame.learn_after = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -35,7 +35,7 @@ from hsi_sc_nerf.models.stages import (
     plan_stages,
     step_seed,
 )
-from hsi_sc_nerf.models.training_log import flush_logs, log_learning_rates, stage_summary
+from hsi_sc_nerf.models.training_log import stage_summary
 from hsi_sc_nerf.models.training_progress import TrainingProgress
 from hsi_sc_nerf.models.weight_average import WeightAverage
 
@@ -85,6 +85,7 @@ class StagedTrainer(Trainer):
         self._frozen: set[str] | None = None
         self._steps_since_update = 0
         self._saved_step: int | None = None
+        self._loaded: Path | None = None
         self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
         try:
             super().setup(test_mode)
@@ -109,17 +110,16 @@ class StagedTrainer(Trainer):
 
     def train(self) -> None:
         """Train what is left of the plan: nerfstudio would add ``max_num_iterations`` to a resumed run."""
-        left = self.plan.num_iterations - self._start_step
-        if left <= 0:
-            raise SystemExit(
-                f"hsi-sc-nerf: the checkpoint in {self.config.load_dir or self.config.load_checkpoint} has all "
-                f"{self.plan.num_iterations} iterations; raise --max-num-iterations to train on"
-            )
-        self.config = dataclasses.replace(self.config, max_num_iterations=left)
         try:
-            before = self.plan.at(self._start_step - 1)
-            if self._start_step == before.end and not checkpoint_path(self._kept_in(before), before.end - 1).exists():
-                self._keep(before)  # killed right at the switch, or begun from another run's stage
+            if self._loaded is not None:
+                self._keep_stage_of(self._loaded)
+            left = self.plan.num_iterations - self._start_step
+            if left <= 0:
+                raise InputError(
+                    f"{self._loaded}: has all {self.plan.num_iterations} iterations; raise --max-num-iterations to "
+                    "train on."
+                )
+            self.config = dataclasses.replace(self.config, max_num_iterations=left)
             with TrainingProgress(self.plan.num_iterations, self._start_step) as self._progress:
                 super().train()
         except TrainingDivergedError as error:
@@ -129,7 +129,7 @@ class StagedTrainer(Trainer):
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         finally:
-            flush_logs()
+            _flush_logs()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One guarded step of the stage that it belongs to."""
@@ -152,16 +152,16 @@ class StagedTrainer(Trainer):
         if complaint is not None:
             CONSOLE.print(f"[yellow]{complaint}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            log_learning_rates(rates, step)
+            for group, rate in rates.items():  # named as nerfstudio names those of its schedules
+                writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
         self._progress.update(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
 
     def _enter(self, stage: Stage) -> None:
         """Begin, or go on with, ``stage``."""
         self.pipeline.datamanager.foreground_share = stage.config.foreground_share
-        self._model.config = dataclasses.replace(
-            cast(SpectralModelConfig, self.config.pipeline.model), **stage.config.loss_weights()
-        )
+        weights: dict[str, Any] = stage.config.loss_weights()
+        self._model.config = dataclasses.replace(cast(SpectralModelConfig, self.config.pipeline.model), **weights)
         self._stage = stage
 
     def _freeze(self, frozen: set[str]) -> None:
@@ -193,13 +193,17 @@ class StagedTrainer(Trainer):
         if step == stage.end - 1:
             self._keep(stage)
 
-    def _kept_in(self, stage: Stage) -> Path:
-        return self.base_dir / f"stage-{stage.config.name}"
+    def _keep_stage_of(self, loaded: Path) -> None:
+        """Keep the stage that a loaded checkpoint completed, where its run was killed before it did so itself."""
+        stage = self.plan.at(self._start_step - 1)
+        kept = loaded.resolve().parents[1] / f"stage-{stage.config.name}" / loaded.name
+        if self._start_step == stage.end and not kept.exists():
+            self._keep(stage)
 
     def _keep(self, stage: Stage) -> None:
         """Keep the last checkpoint of a finished stage, and what it gives on the held-out views."""
         step = stage.end - 1
-        kept = checkpoint_path(self._kept_in(stage), step)
+        kept = checkpoint_path(self.base_dir / f"stage-{stage.config.name}", step)
         self.save_checkpoint(step)
         if self.config.evaluate_stages:
             metrics = self.pipeline.get_average_eval_image_metrics(step=step, get_std=True)
@@ -208,7 +212,7 @@ class StagedTrainer(Trainer):
             results = {"stage": stage.config.name, "step": step, "checkpoint": kept.name, "results": metrics}
             write_json(kept.with_suffix(".json"), results)
         link_checkpoint(checkpoint_path(self.checkpoint_dir, step), kept.parent)
-        flush_logs()
+        _flush_logs()
 
     def _after_train(self) -> None:
         """Save, then finish as nerfstudio does, with the averaged weights where there are any."""
@@ -280,4 +284,13 @@ class StagedTrainer(Trainer):
         self._steps_since_update = training.get("steps_since_update", 0)
         if training.get("completed_stage") is not None:
             self.plan = plan_after(self.plan, training["completed_stage"], self._start_step)
+        self._loaded = path
         CONSOLE.print(f"Going on from {path}")
+
+
+def _flush_logs() -> None:
+    """Write to disk what is logged so far: TensorBoard's writer loses what waits in it when the process ends."""
+    writer.write_out_storage()
+    for event_writer in writer.EVENT_WRITERS:
+        if isinstance(event_writer, writer.TensorboardWriter):
+            event_writer.tb_writer.flush()

@@ -1,4 +1,4 @@
-"""What a run tells beside nerfstudio's own logs: learning rates, spectra of fixed pixels, each stage's result."""
+"""What a run tells beside nerfstudio's own logs: spectra of fixed pixels, and each stage's result in a line."""
 
 from __future__ import annotations
 
@@ -9,25 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from nerfstudio.utils import writer
 from torch import Tensor
 
 # What the paper's table has, with units; the whole frame's have the prefix `full_`.
 _SUMMARY = {"sam": "SAM {:.4f} rad", "rmse": "RMSE {:.4f}", "ssim": "SSIM {:.3f}", "psnr": "PSNR {:.1f} dB"}
-
-
-def log_learning_rates(rates: Mapping[str, float], step: int) -> None:
-    """Log the learning rate of each parameter group, named as nerfstudio names those of its schedules."""
-    for group, rate in rates.items():
-        writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
-
-
-def flush_logs() -> None:
-    """Write to disk what is logged so far: TensorBoard's writer loses what waits in it when the process ends."""
-    writer.write_out_storage()
-    for event_writer in writer.EVENT_WRITERS:
-        if isinstance(event_writer, writer.TensorboardWriter):
-            event_writer.tb_writer.flush()
 
 
 def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
