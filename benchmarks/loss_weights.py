@@ -21,6 +21,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.benchmark.configurations import Configuration, named_configuration
 from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
 from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_words, markdown_table
+from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
@@ -79,6 +80,8 @@ class LossWeights:
     """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
     train_seconds: float = 600.0
     """Time for training each weighting."""
+    clock: Clock = "wall"
+    """What the seconds are of, as in `hsi-sc-nerf benchmark`."""
     iterations: int | None = None
     """The same number of iterations for each weighting instead of the same time; the paper's is 40000."""
     threads: int | None = None
@@ -102,6 +105,7 @@ class LossWeights:
             output_dir=self.output_dir / "runs",
             common=self.common,
             train_seconds=self.train_seconds,
+            clock=self.clock,
             iterations=self.iterations,
             checkpoints=(1.0,),
             threads=self.threads,

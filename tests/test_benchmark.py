@@ -179,7 +179,7 @@ def made_up(monkeypatch):
         Path(argv[-1]).write_text(json.dumps(found))
 
     monkeypatch.setattr(benchmark, "run_step", run_step)
-    monkeypatch.setattr(plot, "draw_accuracy_and_time", lambda path, runs: None)
+    monkeypatch.setattr(plot, "draw_accuracy_and_time", lambda path, runs, clock: None)
     return ran
 
 
@@ -229,9 +229,10 @@ def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_pat
     assert ends[0] == pytest.approx(ends[1], rel=1e-4)
 
 
-def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path):
+@pytest.mark.parametrize("clock", ["wall", "cpu"])
+def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, clock):
     writer.EVENT_WRITERS.clear()
-    asked = command(tiny_dataset, tmp_path, iterations=None, train_seconds=0.3)
+    asked = command(tiny_dataset, tmp_path, iterations=None, train_seconds=0.3, clock=clock)
     found = run.rehearse(benchmark._job(named_configuration("ours"), asked, tiny_dataset[0]))
     assert found["iterations"] == max(1, round(0.3 / found["iteration_seconds"]))
 
@@ -318,5 +319,5 @@ def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
     runs = [made_up_run(f"run-{i}") for i in range(9)]
     write_csv(tmp_path / "runs.csv", runs)
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 27
-    plot.draw_accuracy_and_time(tmp_path / "runs.png", runs)
+    plot.draw_accuracy_and_time(tmp_path / "runs.png", runs, "cpu")
     assert cv2.imread(str(tmp_path / "runs.png")).std() > 5

@@ -40,6 +40,7 @@ from hsi_sc_nerf.evaluation.benchmark.report import (
     write_results,
 )
 from hsi_sc_nerf.evaluation.benchmark.run import Checkpoint, Job
+from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,9 @@ class BenchmarkCommand:
     --common="--pipeline.datamanager.train-num-rays-per-batch 1024"."""
     train_seconds: float = 600.0
     """Time for training each configuration; how many iterations fill it is found by a rehearsal."""
+    clock: Clock = "wall"
+    """What --train-seconds and the picture count: wall time, or the processor's time over all threads (cpu), which is
+    fairer on a machine that does other work beside."""
     iterations: int | None = None
     """The same number of iterations for each configuration instead of the same time."""
     checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
@@ -185,6 +189,7 @@ def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) ->
         output_dir=str((command.output_dir / configuration.name).resolve()),
         iterations=command.iterations,
         train_seconds=None if command.iterations else command.train_seconds,
+        clock=command.clock,
         checkpoints=command.checkpoints,
         threads=command.threads or available_cores(),
         held_out_views=command.held_out_views,
@@ -198,8 +203,11 @@ def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
         found = _finished(folder / "rehearsal.json", job, identity)
         if found is None:
             rehearsed_in = folder / "rehearsal"
-            found = _process(folder, "rehearsal", replace(job, output_dir=str(rehearsed_in.resolve())), job, identity)
-            shutil.rmtree(rehearsed_in)
+            try:
+                rehearsal = replace(job, output_dir=str(rehearsed_in.resolve()))
+                found = _process(folder, "rehearsal", rehearsal, job, identity)
+            finally:
+                shutil.rmtree(rehearsed_in, ignore_errors=True)
         iterations = found["iterations"]
     shutil.rmtree(folder / "benchmark", ignore_errors=True)
     return _process(folder, "result", replace(job, iterations=iterations), job, identity)
@@ -234,7 +242,9 @@ def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[
 
     settings = {
         "data": command.data.name,
-        "length": f"{command.iterations} iterations" if command.iterations else f"{command.train_seconds:g} s",
+        "length": f"{command.iterations} iterations"
+        if command.iterations
+        else f"{command.train_seconds:g} s ({command.clock})",
         "checkpoints": ", ".join(f"{share:g}" for share in command.checkpoints),
         "held-out views": command.held_out_views or "all",
         "threads": command.threads or available_cores(),
@@ -243,4 +253,4 @@ def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[
     write_csv(out.with_suffix(".csv"), runs)
     write_results(out.with_suffix(".json"), runs, settings, machine)
     write_page(out.with_suffix(".md"), runs, settings, machine)
-    draw_accuracy_and_time(out.with_suffix(".png"), runs)
+    draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)

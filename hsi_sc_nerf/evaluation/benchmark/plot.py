@@ -12,19 +12,22 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import ScalarFormatter
 
 from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun
+from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 from hsi_sc_nerf.evaluation.pictures import _COLOURS, _STYLE, _figure, _save
 
 _PANELS = {"sam": "SAM (rad)", "rmse": "RMSE", "psnr": "PSNR (dB)", "ssim": "SSIM"}
 _LOGARITHMIC = ("sam", "rmse")
+_SECONDS = {"wall": "train_seconds", "cpu": "cpu_seconds"}
 
 
 @rc_context(_STYLE)
-def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
+def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun], clock: Clock = "wall") -> None:
     """A panel for each metric, a curve for each run, rings where a stage ends; peak memory as bars.
 
     Args:
         path: The PNG file.
         runs: One or more.
+        clock: What the seconds are of.
     """
     figure = _figure(11.0, 5.2 + 0.12 * len(runs))
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(2.6, 1))[0]
@@ -34,7 +37,7 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
     lines = [("-", "--", ":", "-.")[(i // len(_COLOURS)) % 4] for i in range(len(runs))]
     for axes, (metric, title) in zip(panels.ravel(), _PANELS.items(), strict=True):
         for run, colour, line in zip(runs, colours, lines, strict=True):
-            _draw_run(axes, run, metric, colour, line)
+            _draw_run(axes, run, metric, _SECONDS[clock], colour, line)
         if metric in _LOGARITHMIC:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(ScalarFormatter())
@@ -42,7 +45,7 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
             axes.tick_params(axis="y", which="both", labelsize=8)
         axes.set_title(f"{title}, {'lower' if metric in _LOGARITHMIC else 'higher'} is better")
     for axes in panels[1]:
-        axes.set_xlabel("training (wall seconds)")
+        axes.set_xlabel(f"training ({'wall' if clock == 'wall' else 'processor'} seconds)")
     panels[0, 0].set_xlim(left=0)
     left.suptitle("Held-out views, masked to the object; rings: ends of stages", fontsize=9)
 
@@ -59,12 +62,12 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun]) -> None:
     _save(figure, path)
 
 
-def _draw_run(axes: Axes, run: TrainedRun, metric: str, colour: str, line: str) -> None:
-    seconds = [checkpoint.train_seconds for checkpoint in run.checkpoints]
+def _draw_run(axes: Axes, run: TrainedRun, metric: str, time: str, colour: str, line: str) -> None:
+    seconds = [getattr(checkpoint, time) for checkpoint in run.checkpoints]
     values = [checkpoint.metrics[metric] for checkpoint in run.checkpoints]
     axes.plot(seconds, values, color=colour, linestyle=line, linewidth=1.2, marker="o", markersize=2.5)
     axes.plot(
-        [end.train_seconds for end in run.stage_ends],
+        [getattr(end, time) for end in run.stage_ends],
         [end.metrics[metric] for end in run.stage_ends],
         linestyle="",
         marker="o",

@@ -13,7 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.evaluation.benchmark.configurations import training_config
-from hsi_sc_nerf.evaluation.benchmark.timing import TrainingClock, checkpoint_iterations, mean_iteration_seconds
+from hsi_sc_nerf.evaluation.benchmark.timing import (
+    Clock,
+    TrainingClock,
+    checkpoint_iterations,
+    mean_iteration_seconds,
+)
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -38,6 +43,7 @@ class Job:
         output_dir: where the training run is kept.
         iterations: length of the run; None: find out how many fit into ``train_seconds``, and train nothing.
         train_seconds: time to fill; None where ``iterations`` is given.
+        clock: what ``train_seconds`` are of.
         checkpoints: shares of the run at which it is evaluated, beside the stages' ends.
         threads: CPU threads.
         held_out_views: how many held-out views are evaluated, evenly spread; None for all.
@@ -49,6 +55,7 @@ class Job:
     output_dir: str
     iterations: int | None
     train_seconds: float | None
+    clock: Clock
     checkpoints: tuple[float, ...]
     threads: int
     held_out_views: int | None
@@ -195,10 +202,11 @@ def _rehearsed_seconds(job: Job, iterations: int) -> float:
     def record(step: int) -> None:
         if trainer.pipeline.device.type == "cuda":
             torch.cuda.synchronize()
-        times.append(time.perf_counter())
+        times.append(clock())
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], record))
-    times = [time.perf_counter()]
+    clock = time.perf_counter if job.clock == "wall" else time.process_time
+    times = [clock()]
     trainer.train()
     return mean_iteration_seconds(times, [stage.end for stage in trainer.plan.stages])
 

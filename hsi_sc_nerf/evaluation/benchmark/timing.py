@@ -6,6 +6,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
+from typing import Literal
+
+Clock = Literal["wall", "cpu"]
+"""Wall time, or the processor's time over all threads of a process, which other work on a machine hardly changes."""
 
 # The first steps of a stage build caches and tables.
 _WARM_UP_STEPS = 2
