@@ -17,7 +17,7 @@ from hsi_sc_nerf.export.nerfstudio_adapter import extend_export_point_cloud
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.pipeline import SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
-from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
+from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 from hsi_sc_nerf.models.stages import StageConfig, exponential_decay, full_frame_stage, masked_stage
 

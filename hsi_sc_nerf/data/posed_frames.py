@@ -23,6 +23,7 @@ from hsi_sc_nerf.poses.from_features import PSEUDO_RGB, FeatureConfig, group_of_
 from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
 from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.picture import draw_poses
+from hsi_sc_nerf.poses.report import describe_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import PoseWay, SessionFacts
 
@@ -107,8 +108,7 @@ def pose_frames(
     report = poses.report() | {"pictures": None if pictures is None else _pictures_report(names, pictures, poses)}
     write_json(output_dir / "poses.json", report)
     draw_poses(poses, output_dir / "report" / "poses.png")
-    error_px = f", {poses.overall_error_px:.2f} px" if np.isfinite(poses.overall_error_px) else ""
-    console.print(f"Poses: {poses.used.sum()} of {len(names)} frames{error_px}, {poses.chosen}.", highlight=False)
+    console.print(f"Poses {poses.chosen}: {', '.join(describe_poses(poses, report))}.", highlight=False)
     if pictures is not None and poses.method == "markers":
         best = Counter(frame.ranking[0] for frame in pictures.frames)
         if best.keys() != {GRAY}:

@@ -46,7 +46,7 @@ from hsi_sc_nerf.data.posed_frames import (
 )
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.data.report import mask_picture
-from hsi_sc_nerf.data.scene_box import object_box, scene_box
+from hsi_sc_nerf.data.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.from_features import FeatureConfig
@@ -135,7 +135,17 @@ def process_session(
     console.print(describe_tally(tally, values), highlight=False)
 
     images = [note.gray for note in notes]
-    poses = pose_frames(session, images, facts, config.poses, config.features, output_dir, console, estimate_poses)
+    poses = pose_frames(
+        session,
+        images,
+        facts,
+        config.poses,
+        config.features,
+        output_dir,
+        console,
+        estimate_poses,
+        config.marker_range_nm,
+    )
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
@@ -166,6 +176,9 @@ def process_session(
         typical = typical_uncertainty(calibration.uncertainty, _mean_spectrum(frames, masks))
     write_calibration(output_dir / REPORT_NAME, session, calibration, tally, typical)
     widths_nm = session.frames[0].cube.fwhm_nm
+    diameter_m = session.info.container_diameter_m if poses.metric else None
+    if note := assumed_disc(bool(poses.marker_corners_m), diameter_m):
+        console.print(f"Scene: {note}.", highlight=False)
     dataset = PackedDataset(
         root=output_dir,
         intrinsics=poses.intrinsics,
@@ -174,7 +187,7 @@ def process_session(
         fwhm_nm=None if widths_nm is None else widths_nm[calibration.bands],
         pseudo_rgb_nm=wavelengths_nm[nearest_bands(wavelengths_nm, config.pseudo_rgb_nm)],
         object_name=session.info.object or session.path.resolve().name,
-        scene_box_m=scene_box(bounds, poses.marker_corners_m, container, config.scene_margin_m),
+        scene_box_m=scene_box(bounds, poses.marker_corners_m, container, config.scene_margin_m, diameter_m),
         object_box_m=bounds,
         background_reflectance=_background(frames, masks),
         container=container,

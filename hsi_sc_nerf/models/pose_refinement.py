@@ -112,6 +112,10 @@ class PoseRefinement(CameraOptimizer):
         turns, raybundle.origins = self.corrections(frames, rotations, raybundle.origins)
         raybundle.directions = torch.einsum("...ij,...j->...i", turns, raybundle.directions)
 
+    def forward(self, indices: Int[Tensor, "n"]) -> Float[Tensor, "n 3 4"]:
+        """What nerfstudio's viewer moves the training cameras by that it draws: nothing, they stay as measured."""
+        return torch.eye(4, device=indices.device)[:3].expand(len(indices), 3, 4)
+
     @property
     def frozen(self) -> bool:
         """Whether nothing is being learned."""

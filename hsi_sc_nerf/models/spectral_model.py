@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
@@ -16,94 +18,26 @@ from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRen
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
-from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.models.nerfacto import NerfactoModel
 from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 
-from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
+from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
 from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.compositing import WeightedSum
-from hsi_sc_nerf.models.from_dataset import BackgroundKind, band_weights, chamber_background, training_subspace
+from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, training_subspace
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
-from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement
+from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
 from hsi_sc_nerf.numerics import safe_log10
+from hsi_sc_nerf.viewer.panel import SpectralPanel
 
 ANGLE_PICTURE_MAX_RAD = 0.2
 """Spectral angle that the error picture draws at full scale."""
-
-
-@dataclass
-class SpectralModelConfig(NerfactoModelConfig):
-    """Configuration of the spectral model. Where a default differs from nerfacto's, a turntable scene is why."""
-
-    _target: type = field(default_factory=lambda: SpectralModel)
-    head: Literal["direct", "basis"] = "direct"
-    """What a sample of the field emits. direct: the reflectance in every band. basis: a few coefficients, which a
-    basis of spectra found in the training pixels turns into all bands, once a pixel."""
-    basis_rank: int | None = None
-    """Coefficients of the basis head. None: as many as stand out of the noise of the training pixels."""
-    learn_basis: bool = True
-    """Let training improve the basis."""
-    background: BackgroundKind = "spectrum"
-    """What is seen where the object lets light through. spectrum: the chamber's median spectrum. image: a picture of
-    the chamber that stands still with the camera, taken from the frames. learned-image: the same, improved in the
-    first stage. last-sample: nothing but what the ray met last, as nerfacto does."""
-    hsi_loss: Literal["squared", "charbonnier"] = "squared"
-    """How errors of reflectance count: their squares (the paper), or linearly where they are large."""
-    angular_loss: Literal["cosine", "angle"] = "cosine"
-    """How spectral angles count: one minus their cosine (the paper), or the angles themselves."""
-    weigh_bands: bool = False
-    """Let bands count by how well they were measured."""
-    angular_loss_mult: float = paper.ANGULAR_LOSS_WEIGHT
-    """Weight of the spectral angle's loss."""
-    hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
-    """Weight of the reflectance errors over pixels and bands."""
-    interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
-    """Weight of the proposal loss."""
-    distortion_loss_mult: float = paper.DISTORTION_LOSS_WEIGHT
-    """Weight of the distortion loss."""
-    orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
-    """Weight of the orientation loss on computed normals."""
-    pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
-    """Weight of the predicted-normal loss."""
-    predict_normals: bool = True
-    """Predict normals, as the paper does. It roughly doubles the time of a step."""
-    near_plane: float = 0.01
-    """Rays start no nearer to the camera than this (scene units)."""
-    disable_scene_contraction: bool = True
-    """The scene is the box that holds everything that turns: nothing lies outside it to contract. False: a scene
-    without bounds, whose rays end at the far plane; it goes with the data parser's --scene cameras."""
-    proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
-    """Rays are sampled between where they enter and leave the box."""
-    num_proposal_samples_per_ray: tuple[int, ...] = (64, 32)
-    """Samples a ray for each proposal network: a box of 0.2 m needs far fewer than an unbounded scene."""
-    num_nerf_samples_per_ray: int = 32
-    """Samples a ray for the spectral field."""
-    proposal_net_args_list: list[dict] = field(
-        default_factory=lambda: [
-            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
-            for max_res in (64, 128)
-        ]
-    )
-    """The proposal networks: a scene of 0.2 m fits into smaller tables than nerfacto's."""
-    max_res: int = 512
-    """Finest grid of the spectral field; 512 cells over a 0.2 m box are 0.4 mm each."""
-    log2_hashmap_size: int = 17
-    """Size of the field's hash table a level."""
-    average_init_density: float = 0.1
-    """The box starts nearly empty."""
-    use_appearance_embedding: bool = False
-    """Reflectance is calibrated and the lamps stand still: views need no appearance of their own."""
-    implementation: Literal["tcnn", "torch"] = "torch"
-    """"torch" trains and loads everywhere, with or without a GPU."""
-    eval_num_rays_per_chunk: int = 4096
-    """Rays rendered at a time."""
-    camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
-    """Refinement of the measured poses."""
 
 
 class SpectralModel(NerfactoModel):
@@ -136,10 +70,14 @@ class SpectralModel(NerfactoModel):
             basis = torch.from_numpy(self.subspace.scaled_basis).float()
             self.decoder = BasisDecoder(basis, learnable=config.learn_basis)
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
-        self.field = SpectralField(
+        own: dict[str, Any] = {}
+        if self.subspace is not None:
+            own["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
+        if config.density_groups > 1:
+            own["num_groups"] = config.density_groups
+        self.field = (SpectralField if config.density_groups == 1 else BandGroupField)(
             self.scene_box.aabb,
             num_bands=len(self.wavelengths_nm),
-            coefficient_start=None if self.subspace is None else torch.from_numpy(self.subspace.mean_coefficients),
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
             num_levels=config.num_levels,
@@ -154,6 +92,7 @@ class SpectralModel(NerfactoModel):
             appearance_embedding_dim=config.appearance_embed_dim if config.use_appearance_embedding else 0,
             average_init_density=config.average_init_density,
             implementation=config.implementation,
+            **own,
         )
         self._build_proposals(contraction)
         self.camera_optimizer = config.camera_optimizer.setup(
@@ -166,13 +105,18 @@ class SpectralModel(NerfactoModel):
         self.background = chamber_background(config.background, dataset, metadata["frames"])
         self.register_buffer("band_weights", band_weights(dataset) if config.weigh_bands else None, persistent=False)
 
-        nothing_behind = self.background is None
-        self.renderer_rgb = RGBRenderer(background_color="last_sample") if nothing_behind else WeightedSum()
+        if isinstance(self.field, BandGroupField):
+            self.renderer_rgb = BandGroupSum(self.field.group_sizes)
+        elif self.background is None:
+            self.renderer_rgb = RGBRenderer(background_color="last_sample")
+        else:
+            self.renderer_rgb = WeightedSum()
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.renderer_expected_depth = DepthRenderer(method="expected")
         self.renderer_normals = NormalsRenderer()
         self.normals_shader = NormalsShader()
+        self.panel = SpectralPanel(self.wavelengths_nm, self.num_train_data)
         self.step = 0
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -228,13 +172,19 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
-        spectral = self.decoder(outputs["rgb"])
+        spectral, opacity = self.decoder(outputs["rgb"]), outputs["accumulation"]
+        if isinstance(self.field, BandGroupField):
+            spectral, opacity = spectral.chunk(2, dim=-1)
         if behind is not None:
-            spectral = spectral + behind * (1.0 - outputs["accumulation"])
+            spectral = spectral + behind * (1.0 - opacity)
         # A basis can go below black by a little.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
         outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
         return outputs
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """A rendered camera; a viewer's with the pictures that its controls ask for."""
+        return self.panel.render(camera, partial(super().get_outputs_for_camera, obb_box=obb_box))
 
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
         """Reflectance, and which values of it are measurements where not all are."""

@@ -25,7 +25,8 @@ from hsi_sc_nerf.models.checkpoints import (
 )
 from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
+from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,

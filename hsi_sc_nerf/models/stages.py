@@ -85,7 +85,7 @@ def masked_stage() -> StageConfig:
         name="masked",
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
-        frozen_groups=("camera_opt",),
+        frozen_groups=("camera_opt", "background"),
         lr_start=0.5,
         lr_end=0.02,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.data.session_pictures import SessionPictures
-from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, _in_object_frame
+from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.structure_from_motion import matched_tracks
 from hsi_sc_nerf.poses.turntable_from_angles import adjusted_from_angles
@@ -44,4 +44,4 @@ def poses_by_freed_angles(
     adjusted = adjusted_from_angles(
         tracks, angles_deg, (width, height), config.adjustment, direction_known=known.direction is not None
     )
-    return _in_object_frame(adjusted, images, names, known, config, "angles")
+    return in_object_frame(adjusted, images, names, known, config, "angles")

@@ -14,6 +14,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.frame import lie_on_disc
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.late_frames import with_late_frames
+from hsi_sc_nerf.poses.loop_closure import track_loop_closure_deg
 from hsi_sc_nerf.poses.markers import find_dictionary
 from hsi_sc_nerf.poses.observe import observe
 from hsi_sc_nerf.poses.outliers import usable
@@ -22,7 +23,7 @@ from hsi_sc_nerf.poses.scale import Scale
 from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import StructureFromMotionConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks, split_half_error_deg
-from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
+from hsi_sc_nerf.poses.turntable_from_angles import adjusted_from_angles
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 from hsi_sc_nerf.poses.visible_markers import marker_corners, side_lengths
 
@@ -86,7 +87,7 @@ def poses_by_colmap(images: Images, names: Sequence[str], known: Known, config: 
     adjusted = adjust_tracks(start, free.tracks, config.adjustment)
     # Frames that COLMAP lost, or got wrong, come back by one angle each.
     adjusted = adjust_tracks(with_late_frames(adjusted.turntable, free.tracks), free.tracks, config.adjustment)
-    return _in_object_frame(adjusted, images, names, known, config, "colmap")
+    return in_object_frame(adjusted, images, names, known, config, "colmap")
 
 
 def poses_by_angles(
@@ -111,17 +112,10 @@ def poses_by_angles(
     pictures = SessionPictures.of(images)
     tracks = matched_tracks(pictures.named(pictures.features), names, config.motion)
     height, width = images[0].shape
-    frames = np.unique(tracks.frame)
-    start = turntable_from_angles(
-        tracks,
-        frames,
-        np.deg2rad(angles_deg[frames]),
-        (width, height),
-        direction_known=known.direction is not None,
-    )
     adjustment = replace(config.adjustment, free_angles=False)
-    adjusted = adjust_tracks(start, tracks, adjustment)
-    return _in_object_frame(adjusted, images, names, known, replace(config, adjustment=adjustment), "angles")
+    direction_known = known.direction is not None
+    adjusted = adjusted_from_angles(tracks, angles_deg, (width, height), adjustment, direction_known=direction_known)
+    return in_object_frame(adjusted, images, names, known, replace(config, adjustment=adjustment), "angles")
 
 
 def group_of_most_variance(pictures: SessionPictures, background: StaticBackgroundConfig | None = None) -> str:
@@ -138,7 +132,7 @@ def group_of_most_variance(pictures: SessionPictures, background: StaticBackgrou
     return max(variance, key=variance.__getitem__)
 
 
-def _in_object_frame(
+def in_object_frame(
     adjusted: AdjustedTracks,
     images: Images,
     names: Sequence[str],
@@ -187,7 +181,7 @@ def _in_object_frame(
         blur_px=0.0,
         disc_markers=disc,
         disc_tilt_deg=None,
-        loop_closure_deg=None,
+        loop_closure_deg=track_loop_closure_deg(adjusted),
         nominal_step_deg=known.nominal_step_deg,
         nominal_direction=known.direction,
         warnings=tuple(_warnings(adjusted, config, scale, known, bool(disc))),

@@ -1,0 +1,99 @@
+"""Configuration of the spectral model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from nerfstudio.models.nerfacto import NerfactoModelConfig
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.models.from_dataset import BackgroundKind
+from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
+
+
+def _model() -> type:
+    # The model's module imports this one.
+    from hsi_sc_nerf.models.spectral_model import SpectralModel
+
+    return SpectralModel
+
+
+@dataclass
+class SpectralModelConfig(NerfactoModelConfig):
+    """Configuration of the spectral model. Where a default differs from nerfacto's, a turntable scene is why."""
+
+    _target: type = field(default_factory=_model)
+    head: Literal["direct", "basis"] = "direct"
+    """What a sample of the field emits. direct: the reflectance in every band. basis: a few coefficients, which a
+    basis of spectra found in the training pixels turns into all bands, once a pixel."""
+    basis_rank: int | None = None
+    """Coefficients of the basis head. None: as many as stand out of the noise of the training pixels."""
+    learn_basis: bool = True
+    """Let training improve the basis."""
+    background: BackgroundKind = "spectrum"
+    """What is seen where the object lets light through. spectrum: the chamber's median spectrum. image: a picture of
+    the chamber that stands still with the camera, taken from the frames. learned-image: the same, improved in the
+    first stage. last-sample: nothing but what the ray met last, as nerfacto does."""
+    hsi_loss: Literal["squared", "charbonnier"] = "squared"
+    """How errors of reflectance count: their squares (the paper), or linearly where they are large."""
+    angular_loss: Literal["cosine", "angle"] = "cosine"
+    """How spectral angles count: one minus their cosine (the paper), or the angles themselves."""
+    weigh_bands: bool = False
+    """Let bands count by how well they were measured."""
+    angular_loss_mult: float = paper.ANGULAR_LOSS_WEIGHT
+    """Weight of the spectral angle's loss."""
+    hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
+    """Weight of the reflectance errors over pixels and bands."""
+    interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
+    """Weight of the proposal loss."""
+    distortion_loss_mult: float = paper.DISTORTION_LOSS_WEIGHT
+    """Weight of the distortion loss."""
+    orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
+    """Weight of the orientation loss on computed normals."""
+    pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
+    """Weight of the predicted-normal loss."""
+    predict_normals: bool = True
+    """Predict normals, as the paper does. It roughly doubles the time of a step."""
+    near_plane: float = 0.01
+    """Rays start no nearer to the camera than this (scene units)."""
+    disable_scene_contraction: bool = True
+    """The scene is the box that holds everything that turns: nothing lies outside it to contract. False: a scene
+    without bounds, whose rays end at the far plane; it goes with the data parser's --scene cameras."""
+    proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
+    """Rays are sampled between where they enter and leave the box."""
+    num_proposal_samples_per_ray: tuple[int, ...] = (64, 32)
+    """Samples a ray for each proposal network: a box of 0.2 m needs far fewer than an unbounded scene."""
+    num_nerf_samples_per_ray: int = 32
+    """Samples a ray for the spectral field."""
+    proposal_net_args_list: list[dict] = field(
+        default_factory=lambda: [
+            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
+            for max_res in (64, 128)
+        ]
+    )
+    """The proposal networks: a scene of 0.2 m fits into smaller tables than nerfacto's."""
+    max_res: int = 512
+    """Finest grid of the spectral field; 512 cells over a 0.2 m box are 0.4 mm each."""
+    log2_hashmap_size: int = 17
+    """Size of the field's hash table a level."""
+    average_init_density: float = 0.1
+    """The box starts nearly empty."""
+    use_appearance_embedding: bool = False
+    """Reflectance is calibrated and the lamps stand still: views need no appearance of their own."""
+    implementation: Literal["tcnn", "torch"] = "torch"
+    """"torch" trains and loads everywhere, with or without a GPU."""
+    eval_num_rays_per_chunk: int = 4096
+    """Rays rendered at a time."""
+    density_groups: int = 1
+    """Groups of neighbouring bands that have a density of their own, for translucent objects whose light passes at
+    some wavelengths only (direct head). 1: one density for all."""
+    camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
+    """Refinement of the measured poses."""
+
+    def __post_init__(self) -> None:
+        if self.head == "basis" and (self.background == "last-sample" or self.density_groups > 1):
+            raise SystemExit(
+                "hsi-sc-nerf: --pipeline.model.head basis goes neither with the background last-sample nor with "
+                "density groups, which need a value in every band at each sample; take --pipeline.model.head direct."
+            )
