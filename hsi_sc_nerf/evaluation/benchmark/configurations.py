@@ -7,6 +7,7 @@ import copy
 import io
 import re
 import shlex
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -94,9 +95,13 @@ def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
         InputError: the package has no such method, or it does not take these words.
     """
     import tyro
-    from nerfstudio.plugins.types import MethodSpecification
 
-    from hsi_sc_nerf import config as plugin
+    # Libraries' warnings about each other's versions would bury the progress.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from nerfstudio.plugins.types import MethodSpecification
+
+        from hsi_sc_nerf import config as plugin
 
     methods = {
         str(m.config.method_name): m.config for m in vars(plugin).values() if isinstance(m, MethodSpecification)
@@ -109,13 +114,13 @@ def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
         with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(complaint):
             return tyro.cli(type(default), default=default, args=words, config=(tyro.conf.FlagConversionOff,))
     except SystemExit as error:
+        gist = _gist(complaint.getvalue()) if error.code else "they only ask for help"
         raise InputError(
-            f"'{shlex.join(words)}' is not what {method} takes ({_gist(complaint.getvalue())}); "
-            f"ns-train {method} --help lists the words."
+            f"'{shlex.join(words)}' is not what {method} takes ({gist}); ns-train {method} --help lists the words."
         ) from error
 
 
 def _gist(complaint: str) -> str:
-    """The first sentence of tyro's framed message."""
-    lines = [line.strip("╭╮╰╯│─ ") for line in complaint.splitlines()]
-    return next((line for line in lines if line and not line.endswith("error")), "they only ask for help")
+    """The first line below the title of tyro's message, whatever the frame is drawn with."""
+    lines = [line.strip("│ ") for line in complaint.splitlines() if line.strip("╭╮╰╯│─- ")]
+    return lines[1].rstrip(".") if len(lines) > 1 else "no reason is given"

@@ -6,6 +6,7 @@ import json
 import resource
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -223,4 +224,9 @@ def main(job_path: Path, result_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    try:
+        main(Path(sys.argv[1]), Path(sys.argv[2]))
+    except (Exception, SystemExit):
+        # To the log, which stdout goes to.
+        traceback.print_exc(file=sys.stdout)
+        sys.exit(1)
