@@ -38,3 +38,17 @@ class ChamberSpectrum(nn.Module):
     ) -> Float[Tensor, "*rays bands"]:
         """The spectrum, for every ray."""
         return self.spectrum.expand(*directions.shape[:-1], -1)
+
+
+class SumBeforeLastSample(WeightedSum):
+    """Composite spectra before the last sample's, as nerfacto does where nothing is known of the background.
+
+    nerfstudio's own renderer takes three channels for this.
+    """
+
+    def forward(
+        self, rgb: Float[Tensor, "*rays samples bands"], weights: Float[Tensor, "*rays samples 1"]
+    ) -> Float[Tensor, "*rays bands"]:
+        """Sum of the samples' spectra, and for what they let through that of the last sample."""
+        through = 1.0 - torch.sum(weights, dim=-2)
+        return super().forward(rgb, weights) + through * rgb[..., -1, :]

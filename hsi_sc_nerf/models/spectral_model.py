@@ -14,7 +14,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
-from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer, RGBRenderer
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
@@ -27,7 +27,7 @@ from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
 from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
 from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
-from hsi_sc_nerf.models.compositing import WeightedSum
+from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
 from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, training_subspace
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
@@ -108,7 +108,7 @@ class SpectralModel(NerfactoModel):
         if isinstance(self.field, BandGroupField):
             self.renderer_rgb = BandGroupSum(self.field.group_sizes)
         elif self.background is None:
-            self.renderer_rgb = RGBRenderer(background_color="last_sample")
+            self.renderer_rgb = SumBeforeLastSample()
         else:
             self.renderer_rgb = WeightedSum()
         self.renderer_accumulation = AccumulationRenderer()
