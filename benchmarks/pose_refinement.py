@@ -1,6 +1,6 @@
 """What refining poses during training is worth, by mode, on a simulated session with known truth, as a table.
 
-    uv run python benchmarks/pose_refinement.py --output-dir /tmp/refinement --page README.md
+    uv run python benchmarks/pose_refinement.py --output-dir /tmp/refinement --page docs/poses.md
 
 The same frames are trained on with the true poses, with the true poses disturbed by known errors, and with those that
 the markers gave. Held-out views keep the errors of their poses, as in a real session. What is left of the errors is
@@ -214,6 +214,7 @@ class PoseRefinementBenchmark:
         )
         config.pipeline.datamanager.data = data
         config.pipeline.model.camera_optimizer.mode = mode
+        config.evaluate_stages = False
         config.experiment_name = "pose-refinement"
         config.output_dir, config.timestamp = self.output_dir / "runs", f"{data.name}-{mode}"
         torch.manual_seed(config.machine.seed)
