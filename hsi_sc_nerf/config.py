@@ -99,6 +99,8 @@ hsi_sc_nerf_paper = MethodSpecification(
                     {"hidden_dim": 16, "log2_hashmap_size": 17, "num_levels": 5, "max_res": size, "use_linear": False}
                     for size in (128, 256)
                 ],
+                predict_normals=True,
+                match_resolution=False,
                 num_levels=paper.HASH_LEVELS,
                 max_res=paper.FINEST_GRID,
                 log2_hashmap_size=paper.LOG2_HASH_TABLE,

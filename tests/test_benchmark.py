@@ -31,7 +31,7 @@ from hsi_sc_nerf.evaluation.benchmark.timing import TrainingClock, checkpoint_it
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 TINY = " ".join(
     (
-        "--pipeline.datamanager.train-num-rays-per-batch 64 --pipeline.model.num-levels 4",
+        "--pipeline.datamanager.train-num-rays-per-batch 64",
         "--pipeline.model.log2-hashmap-size 10 --pipeline.model.max-res 32",
         "--pipeline.model.num-proposal-samples-per-ray 16 8 --pipeline.model.num-nerf-samples-per-ray 8",
         "--machine.device-type {device}",

@@ -31,6 +31,7 @@ def pipeline(flagged_dataset) -> SpectralPipeline:
     config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
     config.datamanager.data = flagged_dataset
     config.datamanager.train_num_rays_per_batch = 256
+    config.model.match_resolution = False
     config.model.num_levels, config.model.log2_hashmap_size, config.model.max_res = 4, 10, 32
     config.model.num_proposal_samples_per_ray, config.model.num_nerf_samples_per_ray = (16, 8), 8
     return config.setup(device="cpu")

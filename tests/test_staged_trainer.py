@@ -18,6 +18,7 @@ def trainer(tiny_dataset, folder, device="cpu", **changes):
     config.pipeline.datamanager.data = tiny_dataset[0]
     config.pipeline.datamanager.train_num_rays_per_batch = 64
     model = config.pipeline.model
+    model.match_resolution = False
     model.num_levels, model.log2_hashmap_size, model.max_res = 4, 10, 32
     model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"

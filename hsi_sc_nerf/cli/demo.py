@@ -15,10 +15,6 @@ from hsi_sc_nerf.errors import InputError
 # A smaller model than the method's default, for two cores.
 DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
-    "pipeline.model.predict-normals": "False",
-    "pipeline.model.num-levels": "10",
-    "pipeline.model.max-res": "256",
-    "pipeline.model.log2-hashmap-size": "15",
     "pipeline.model.num-proposal-samples-per-ray": "48 24",
     "pipeline.model.num-nerf-samples-per-ray": "24",
     "pipeline.model.proposal-warmup": "200",

@@ -22,6 +22,9 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
+BRIGHTNESS_GAIN = 0.05
+SHAPE_GAIN = 0.25
+
 
 def grid_positions(
     positions: Float[Tensor, "*bs 3"], aabb: Float[Tensor, "2 3"], spatial_distortion: SpatialDistortion | None
@@ -42,6 +45,32 @@ def _zeroed_outside(positions: Float[Tensor, "*bs 3"]) -> tuple[Float[Tensor, "*
     """Grid positions, 0 outside the unit cube, and 1 inside it, 0 outside."""
     inside = ((positions > 0.0) & (positions < 1.0)).all(dim=-1, keepdim=True)
     return positions * inside, inside.to(positions)
+
+
+class CoefficientGains(nn.Module):
+    """Slow down how fast coefficients are learned, the first of them, a spectrum's brightness, most.
+
+    In a direct head each band has a part of the gradient and a sigmoid's slope of 1/4. Coefficients without gains
+    learn far faster than the density does, and end worse, over the whole frame too: it seems that colour explains the
+    views before the surface is found. (Pear, 36 frames of 128 x 128, 400 steps: held-out RMSE 0.052 without gains,
+    0.036 with them, 0.035 with the direct head, whose steps take a third more time; 0.040 with 1/4 for all, 0.038
+    with 1/20.)
+
+    Args:
+        rank: number of coefficients.
+    """
+
+    gains: Tensor
+
+    def __init__(self, rank: int) -> None:
+        super().__init__()
+        gains = torch.full((rank,), SHAPE_GAIN)
+        gains[0] = BRIGHTNESS_GAIN
+        self.register_buffer("gains", gains, persistent=False)
+
+    def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
+        """Coefficients from what the network emits."""
+        return raw * self.gains
 
 
 class SpectralField(NerfactoField):
@@ -78,10 +107,12 @@ class SpectralField(NerfactoField):
             implementation="torch",
         )
         if coefficient_start is not None:
+            gains = CoefficientGains(len(coefficient_start))
+            self.mlp_head.out_activation = gains
             last = self.mlp_head.layers[-1]
             assert isinstance(last, nn.Linear)
             with torch.no_grad():
-                last.bias.copy_(coefficient_start)
+                last.bias.copy_(coefficient_start / gains.gains)
         fuse_hash_encodings(self)
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:

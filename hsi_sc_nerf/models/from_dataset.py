@@ -1,10 +1,11 @@
-"""What a model takes from its dataset before it trains: spectral basis, background, weights of the bands."""
+"""What a model takes from its dataset before it trains: spectral basis, grid, background, weights of the bands."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, find_subspace, pixel_noise, sample_training_spectra
 from hsi_sc_nerf.data.static_background import estimate_static_background
+from hsi_sc_nerf.fields.grid_size import GridSize, grid_for_resolution
 from hsi_sc_nerf.models.band_weights import inverse_variance_weights
 from hsi_sc_nerf.models.camera_background import CameraBackground
 from hsi_sc_nerf.models.compositing import ChamberSpectrum
@@ -62,6 +64,13 @@ def chamber_background(
         spectrum=spectrum,
         learnable=kind == "learned-image",
     )
+
+
+def field_grid(dataset: PackedDataset) -> GridSize:
+    """The grid that resolves in the scene box what the camera does."""
+    box = dataset.scene_box_m
+    distance = np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - box.mean(axis=0), axis=1).mean()
+    return grid_for_resolution(float((box[1] - box[0]).max()), float(distance) / dataset.intrinsics.fl_x)
 
 
 def band_weights(dataset: PackedDataset) -> Float[Tensor, "bands"] | None:

@@ -53,8 +53,9 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the orientation loss on computed normals."""
     pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
     """Weight of the predicted-normal loss."""
-    predict_normals: bool = True
-    """Predict normals, as the paper does. It roughly doubles the time of a step."""
+    predict_normals: bool = False
+    """Predict normals, as the paper does. It roughly doubles the time of a step, and the cloud's normals are those of
+    the density in any case."""
     near_plane: float = 0.01
     """Rays start no nearer to the camera than this (scene units)."""
     disable_scene_contraction: bool = True
@@ -73,10 +74,9 @@ class SpectralModelConfig(NerfactoModelConfig):
         ]
     )
     """The proposal networks: a scene of 0.2 m fits into smaller tables than nerfacto's."""
-    max_res: int = 512
-    """Finest grid of the spectral field; 512 cells over a 0.2 m box are 0.4 mm each."""
-    log2_hashmap_size: int = 17
-    """Size of the field's hash table a level."""
+    match_resolution: bool = True
+    """Size the spectral field's hash grid by what a pixel of the camera resolves in the scene box. False: take
+    num-levels, max-res and log2-hashmap-size."""
     average_init_density: float = 0.1
     """The box starts nearly empty."""
     use_appearance_embedding: bool = False

@@ -28,7 +28,7 @@ from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
 from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
-from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, training_subspace
+from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid, training_subspace
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
 from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement
@@ -70,7 +70,14 @@ class SpectralModel(NerfactoModel):
             basis = torch.from_numpy(self.subspace.scaled_basis).float()
             self.decoder = BasisDecoder(basis, learnable=config.learn_basis)
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
-        own: dict[str, Any] = {}
+        own: dict[str, Any] = {
+            "num_levels": config.num_levels,
+            "max_res": config.max_res,
+            "log2_hashmap_size": config.log2_hashmap_size,
+        }
+        if config.match_resolution:
+            grid = field_grid(dataset)
+            own = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
         if self.subspace is not None:
             own["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
         if config.density_groups > 1:
@@ -80,11 +87,8 @@ class SpectralModel(NerfactoModel):
             num_bands=len(self.wavelengths_nm),
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
-            num_levels=config.num_levels,
-            max_res=config.max_res,
             base_res=config.base_res,
             features_per_level=config.features_per_level,
-            log2_hashmap_size=config.log2_hashmap_size,
             hidden_dim_color=config.hidden_dim_color,
             num_images=self.num_train_data,
             use_pred_normals=config.predict_normals,
