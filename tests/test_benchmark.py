@@ -32,6 +32,7 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.i
 TINY = " ".join(
     (
         "--pipeline.datamanager.train-num-rays-per-batch 64",
+        "--pipeline.model.match-resolution False --pipeline.model.num-levels 4",
         "--pipeline.model.log2-hashmap-size 10 --pipeline.model.max-res 32",
         "--pipeline.model.num-proposal-samples-per-ray 16 8 --pipeline.model.num-nerf-samples-per-ray 8",
         "--machine.device-type {device}",
