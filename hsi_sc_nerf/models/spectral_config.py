@@ -24,14 +24,14 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Configuration of the spectral model. Where a default differs from nerfacto's, a turntable scene is why."""
 
     _target: type = field(default_factory=_model)
-    head: Literal["direct", "basis"] = "direct"
+    head: Literal["direct", "basis"] = "basis"
     """What a sample of the field emits. direct: the reflectance in every band. basis: a few coefficients, which a
     basis of spectra found in the training pixels turns into all bands, once a pixel."""
     basis_rank: int | None = None
     """Coefficients of the basis head. None: as many as stand out of the noise of the training pixels."""
-    learn_basis: bool = True
-    """Let training improve the basis."""
-    background: BackgroundKind = "spectrum"
+    learn_basis: bool = False
+    """Let training improve the basis, which gained nothing on the sessions tried."""
+    background: BackgroundKind = "image"
     """What is seen where the object lets light through. spectrum: the chamber's median spectrum. image: a picture of
     the chamber that stands still with the camera, taken from the frames. learned-image: the same, improved in the
     first stage. last-sample: nothing but what the ray met last, as nerfacto does."""

@@ -24,7 +24,13 @@ PAPER = "hsi-sc-nerf-paper"
 CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "paper": (PAPER, ""),
     "ours": (OURS, ""),
-    "ours-no-normals": (OURS, "--pipeline.model.predict-normals False"),
+    "ours-direct-head": (OURS, "--pipeline.model.head direct"),
+    "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
+    "ours-predicted-normals": (OURS, "--pipeline.model.predict-normals True"),
+    "ours-nerfacto-grid": (
+        OURS,
+        "--pipeline.model.match-resolution False --pipeline.model.max-res 2048 --pipeline.model.log2-hashmap-size 19",
+    ),
     "ours-foreground-only": (OURS, "--masked.foreground-share 1.0"),
     "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
     "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
