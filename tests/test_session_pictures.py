@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -20,6 +21,7 @@ from rich.console import Console
 from scipy.special import ndtr
 from turntable_scene import MarkerScene
 
+from hsi_sc_nerf.data import session_pictures
 from hsi_sc_nerf.data.packed_cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.data.posed_frames import pose_frames
 from hsi_sc_nerf.data.process import process_session
@@ -62,6 +64,67 @@ def test_group_means_count_what_was_measured():
         with np.errstate(invalid="ignore"):
             np.testing.assert_allclose(means[k], values.sum(-1) / valid.sum(-1), rtol=1e-5)
         np.testing.assert_allclose(flagged_share[k], 1.0 - valid.mean(-1), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def many_bands():
+    """A noisy step in 120 bands; beyond 700 nm there is less noise."""
+    wavelengths_nm = np.linspace(400.0, 1000.0, 120)
+    sigma = np.where(wavelengths_nm < 700.0, 0.04, 0.02)
+    cube = edge(noise=0.0)[..., None] + sigma * np.random.default_rng(2).normal(size=(80, 100, 120))
+    return np.clip(cube, 0.0, 1.0), wavelengths_nm
+
+
+def test_scores_from_a_few_bands_are_those_of_all(many_bands, tmp_path):
+    cube, wavelengths_nm = many_bands
+    frame = pictures_of(cube, wavelengths_nm, tmp_path)
+    for name, (low, high) in {GRAY: GRAY_NM, **BAND_GROUPS_NM}.items():
+        inside = bands(wavelengths_nm, low, high)
+        assert inside.sum() >= 10
+        assert frame.scores[name] == pytest.approx(edge_precision(cube[..., inside].mean(-1)), rel=0.2)
+    assert frame.ranking[0] == "near infrared"
+
+
+def test_pictures_are_made_of_all_bands_when_they_are_asked_for(many_bands, tmp_path, monkeypatch):
+    cube, wavelengths_nm = many_bands
+    made = []
+
+    def counted(packed, members):
+        made.append(members)
+        return group_means(packed, members)
+
+    monkeypatch.setattr(session_pictures, "group_means", counted)
+    frame = pictures_of(cube, wavelengths_nm, tmp_path)
+    assert "red" in frame.pictures
+    assert "x-ray" not in frame.pictures
+    assert frame.pictures[GRAY].shape == cube.shape[:2]
+    assert set(frame.pictures) == {GRAY, *BAND_GROUPS_NM, "860 nm"}
+    assert len(frame.pictures) == 7
+    (few,) = made
+    assert few.sum(axis=1).tolist() == [8] * 6
+    red = bands(wavelengths_nm, *BAND_GROUPS_NM["red"])
+    with ThreadPoolExecutor(4) as pool:
+        shown = list(pool.map(frame.pictures.__getitem__, ["red"] * 8))
+    assert len(made) == 2
+    np.testing.assert_array_equal(made[1], red[None])
+    assert all(picture is shown[0] for picture in shown)
+    np.testing.assert_allclose(shown[0], 255.0 * cube[..., red].mean(-1), atol=0.51)
+    with pytest.raises(KeyError):
+        frame.pictures["x-ray"]
+
+
+def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anyway(many_bands, tmp_path):
+    cube, wavelengths_nm = many_bands
+    cube = cube.copy()
+    cube[:10, :20] = np.nan
+    frame = pictures_of(cube, wavelengths_nm, tmp_path)
+    assert (frame.pictures["red"][:10, :20] == 255).all()
+    np.testing.assert_array_equal(np.argwhere(frame.flagged), np.argwhere(np.isnan(cube[..., 0])))
+    assert frame.ill_exposed[:10, :20].all()
+    cv2.imwrite(str(tmp_path / "c.png"), np.zeros((80, 100), np.uint8))
+    frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.pictures[GRAY], GRAY_NM, {})
+    assert (frame.pictures["red"][:10, :20] == 0).all()
+    assert frame.ill_exposed[:10, :20].all()
 
 
 def edge(contrast=0.6, blur_px=2.0, noise=0.01):
@@ -234,6 +297,15 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     assert more[:2].min() > 0
     assert not more[2:].any()
     assert joined.overall_error_px < 1.2 * alone.overall_error_px
+    # Where the best picture is exposed well something hides the marker: the others are not asked.
+    hidden = two_pictures([np.where(image == 255, 128, image).astype(np.uint8) for image in spot], images)
+    ill_exposed = [replace(frame, flagged=image == 255) for frame, image in zip(hidden.frames, spot, strict=True)]
+    well, ill = (
+        estimate_turntable_poses(shown, scene.names(), **known) for shown in (hidden, SessionPictures(ill_exposed))
+    )
+    more = np.subtract(ill.markers_per_frame, well.markers_per_frame)
+    assert more[:2].min() > 0
+    assert not more[2:].any()
 
 
 def test_plain_images_are_sessions_of_one_picture_a_frame():

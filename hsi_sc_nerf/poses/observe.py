@@ -1,16 +1,19 @@
 """All markers of all frames: detection, refinement, and a second look where the adjusted turntable expects them.
 
 A frame may be shown in several pictures (``SessionPictures``). Its best one goes first; a marker that is missing
-there is taken from the next one that shows it.
+there is taken from the next one that shows it, unless the best one is well exposed where the marker should be: then
+it is hidden.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from rich.progress import track
@@ -39,6 +42,8 @@ _FEW_MARKERS = 4
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
+# The best picture is ill exposed at a marker where more than this share of its pixels is black, clipped or flagged.
+_MOST_ILL_EXPOSED = 0.05
 
 
 _T = TypeVar("_T")
@@ -173,6 +178,14 @@ def observe_expected(
     blurs_px: dict[str, float] = {}
     for rank in range(max(len(frame.ranking) for frame in session.frames)):
         missing = [(i, m) for i, m in missing if (i, m) not in found and rank < len(session.frames[i].ranking)]
+        if rank == 1:
+            # Where the best picture is well exposed the marker is hidden, and no other picture shows it.
+            shown = Counter(i for i, _ in [*have, *found])
+            missing = [
+                (i, m)
+                for i, m in missing
+                if shown[i] < _FEW_MARKERS or _ill_exposed(session.frames[i], expected[i, m])
+            ]
         names = {i: session.frames[i].ranking[rank] for i, _ in missing}
         if rank > 0:
             for name in sorted(set(names.values()) - blurs_px.keys()):
@@ -191,6 +204,14 @@ def observe_expected(
     return Observations(
         *(np.concatenate([getattr(seen, k), getattr(more, k)]) for k in Observations.__dataclass_fields__)
     )
+
+
+def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> bool:
+    """Whether too many pixels of the best picture inside the corners are black, clipped or flagged."""
+    ill = frame.ill_exposed
+    # OpenCV's (0, 0) is the first pixel's centre.
+    inside = cv2.fillConvexPoly(np.zeros(ill.shape, np.uint8), np.rint(corners_px - 0.5).astype(np.int32), 1) > 0
+    return bool(inside.any()) and float(ill[inside].mean()) > _MOST_ILL_EXPOSED
 
 
 def _by_frame(seen: Observations, frames: int) -> list[Detections]:
