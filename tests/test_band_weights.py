@@ -29,5 +29,5 @@ def test_bands_without_a_measurement_weigh_nothing():
 
 @pytest.mark.parametrize(("sigma", "error"), [([np.nan], 0.01), ([0.1], 0.0)])
 def test_what_gives_no_weights_is_refused(sigma, error):
-    with pytest.raises(ValueError, match="standard deviation|greater than 0"):
+    with pytest.raises(ValueError, match=r"standard deviation|greater than 0"):
         inverse_variance_weights(np.array(sigma), error)

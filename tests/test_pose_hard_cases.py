@@ -324,11 +324,13 @@ def test_the_container_is_measured_by_its_markers(shift_m):
     poses[:, 0, 3] += shift_m
     machine = replace(machine, marker_poses=poses)
     disc_m = disc_height_m(machine, SIDE_M)
-    assert container_diameter(machine, SIDE_M, disc_m, 0.07) == pytest.approx(2 * 0.0455, abs=1e-9)
-    assert container_diameter(resized(machine, 1.7), 1.7 * SIDE_M, 1.7 * disc_m, None) == pytest.approx(
+    faces = machine.marker_poses[:, :3, 2], machine.marker_poses[:, :3, 3]
+    assert container_diameter(*faces, SIDE_M, disc_m, 0.07) == pytest.approx(2 * 0.0455, abs=1e-9)
+    larger = resized(machine, 1.7).marker_poses
+    assert container_diameter(larger[:, :3, 2], larger[:, :3, 3], 1.7 * SIDE_M, 1.7 * disc_m, None) == pytest.approx(
         1.7 * 2 * 0.0455, abs=1e-9
     )
-    assert container_diameter(machine, SIDE_M, disc_m, 0.02) is None
+    assert container_diameter(*faces, SIDE_M, disc_m, 0.02) is None
     corners = reproject(machine, observed(machine), CENTRE_PX, SIDE_M)
     np.testing.assert_allclose(
         corners, reproject(resized(machine, 2.0), observed(machine), CENTRE_PX, 2.0 * SIDE_M), atol=1e-9

@@ -17,7 +17,7 @@ from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.data.frames import FramePaths
 from hsi_sc_nerf.data.packed import Container, PackedDataset, PackedFrame
 from hsi_sc_nerf.data.session import Session
-from hsi_sc_nerf.data.session_pictures import GRAY, SessionPictures, read_frames
+from hsi_sc_nerf.data.session_pictures import GRAY, MadeWhenAsked, SessionPictures, read_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.from_features import PSEUDO_RGB, FeatureConfig, group_of_most_variance
 from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
@@ -170,7 +170,12 @@ def _read_pictures(
     if config.picture == "pseudo-rgb":
         shown = [np.asarray(cv2.imread(str(p.image), cv2.IMREAD_GRAYSCALE)) for p in paths]
         more = [
-            replace(frame, pictures={**frame.pictures, PSEUDO_RGB: image})
+            replace(
+                frame,
+                pictures=MadeWhenAsked(
+                    (*frame.pictures, PSEUDO_RGB), frame.pictures.__getitem__, {PSEUDO_RGB: image}
+                ),
+            )
             for frame, image in zip(frames, shown, strict=True)
         ]
         return SessionPictures(more, PSEUDO_RGB)

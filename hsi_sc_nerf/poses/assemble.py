@@ -102,7 +102,8 @@ def _scaled(adjusted, observations, session):
     """The machine in metres, and the container's diameter by the markers."""
     turntable, side_m = adjusted.turntable, adjusted.problem.side_m
     disc_m = object_frame.disc_height_m(turntable, side_m)
-    measured_m = container_diameter(turntable, side_m, disc_m, session.container_height_m)
+    poses = turntable.marker_poses
+    measured_m = container_diameter(poses[:, :3, 2], poses[:, :3, 3], side_m, disc_m, session.container_height_m)
     if session.marker_side_m is not None:
         return adjusted, measured_m
     if measured_m is None:

@@ -19,7 +19,7 @@ from hsi_sc_nerf.poses.markers import find_dictionary
 from hsi_sc_nerf.poses.observe import observe
 from hsi_sc_nerf.poses.outliers import usable
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.scale import Scale
+from hsi_sc_nerf.poses.scale import Scale, container_diameter
 from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import StructureFromMotionConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks, split_half_error_deg
@@ -63,6 +63,8 @@ class Known:
 
     marker_dictionary: str | None = None
     marker_side_m: float | None = None
+    container_diameter_m: float | None = None
+    container_height_m: float | None = None
     camera_distance_m: float | None = None
     """Of the camera from the turntable's axis: the scale where no marker gives it."""
     nominal_step_deg: float | None = None
@@ -161,7 +163,7 @@ def in_object_frame(
     floor = float(np.percentile(places[:, 2], LOWEST_POINTS_PERCENTILE))
     if disc:
         floor = float(np.median([corners[m][:, 2].mean() for m in disc]))
-    scale, metres = _scale(corners, known)
+    scale, metres = scale_by_markers(corners, floor, known)
     poses[:, 2, 3] -= floor
     poses[:, :3, 3] *= metres
     used = np.isfinite(rows[0])
@@ -203,24 +205,43 @@ def _markers(
     return corners, dictionary if corners else None, tuple(np.bincount(seen.frame, minlength=len(images)).tolist())
 
 
-def _scale(corners: dict[int, Float[np.ndarray, "4 3"]], known: Known) -> tuple[Scale | None, float]:
-    """Where the scale comes from, and how many metres the unit of length is."""
-    if corners and known.marker_side_m is not None:
-        sides = side_lengths(corners)
-        typical = float(np.median(list(sides.values())))
-        relative = {m: side / typical for m, side in sides.items()}
-        spread = float(np.std(list(relative.values()))) if len(sides) > 1 else 0.0
-        scale = Scale(
-            source="markers",
-            marker_side_m=known.marker_side_m,
-            uncertainty=spread / np.sqrt(len(sides)),
-            marker_sides=relative,
-            marker_side_sigmas=dict.fromkeys(sides, spread),
-            container_diameter_m=None,
-            measured_container_diameter_m=None,
-        )
-        return scale, known.marker_side_m / typical
-    return None, known.camera_distance_m or 1.0
+def scale_by_markers(
+    corners: dict[int, Float[np.ndarray, "4 3"]], floor: float, known: Known
+) -> tuple[Scale | None, float]:
+    """Where the scale comes from, and how many metres the unit of length is; ``floor`` is the disc's height."""
+    nothing = None, known.camera_distance_m or 1.0
+    if not corners:
+        return nothing
+    sides = side_lengths(corners)
+    typical = float(np.median(list(sides.values())))
+    relative = {m: side / typical for m, side in sides.items()}
+    spread = float(np.std(list(relative.values()))) if len(sides) > 1 else 0.0
+    faces = np.stack(list(corners.values()))
+    # Corners go round from the upper left one, so this points out of the face.
+    normals = np.cross(faces[:, 3] - faces[:, 0], faces[:, 1] - faces[:, 0])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+
+    def diameter(height: float | None) -> float | None:
+        return container_diameter(normals, faces.mean(axis=1), typical, floor, height)
+
+    source: Literal["markers", "container"]
+    if known.marker_side_m is not None:
+        source, metres = "markers", known.marker_side_m / typical
+    elif known.container_diameter_m is not None and (wide := diameter(None)) is not None:
+        source, metres = "container", known.container_diameter_m / wide
+    else:
+        return nothing
+    measured = diameter(None if known.container_height_m is None else known.container_height_m / metres)
+    scale = Scale(
+        source=source,
+        marker_side_m=typical * metres,
+        uncertainty=spread / np.sqrt(len(sides)),
+        marker_sides=relative,
+        marker_side_sigmas=dict.fromkeys(sides, spread),
+        container_diameter_m=known.container_diameter_m,
+        measured_container_diameter_m=None if measured is None else measured * metres,
+    )
+    return scale, metres
 
 
 def _warnings(

@@ -48,23 +48,27 @@ class Scale:
 
 
 def container_diameter(
-    turntable: Turntable, side_m: float, disc_m: float, container_height_m: float | None
+    normals: Float[np.ndarray, "m 3"],
+    centres: Float[np.ndarray, "m 3"],
+    side: float,
+    disc: float,
+    container_height: float | None,
 ) -> float | None:
-    """Diameter of the upright cylinder whose wall the markers around the container touch, metres.
+    """Diameter of the upright cylinder whose wall the markers around the container touch; any unit of length.
 
     The container need not stand on the axis: three or more markers tell its centre. Fewer are taken to stand around
     the axis. None where no upright marker faces outwards, or their planes touch no common circle.
 
     Args:
-        turntable: the adjusted machine.
-        side_m: the markers' side.
-        disc_m: height of the disc in the turntable's frame.
-        container_height_m: markers whose centre is above this height over the disc are not on the container.
+        normals: of the markers, unit vectors out of their faces; z is the axis.
+        centres: of the markers.
+        side: the markers' side.
+        disc: height of the disc.
+        container_height: markers whose centre is above this height over the disc are not on the container.
     """
-    normals, centres = turntable.marker_poses[:, :3, 2], turntable.marker_poses[:, :3, 3]
     upright = (np.abs(normals[:, 2]) < _UPRIGHT_SINE) & ((normals[:, :2] * centres[:, :2]).sum(-1) > 0)
-    if container_height_m is not None:
-        upright &= centres[:, 2] - disc_m < container_height_m
+    if container_height is not None:
+        upright &= centres[:, 2] - disc < container_height
     normals = normals[upright, :2] / np.linalg.norm(normals[upright, :2], axis=-1, keepdims=True)
     away = (normals * centres[upright, :2]).sum(-1)
     if len(away) == 0:
@@ -74,7 +78,7 @@ def container_diameter(
     if len(away) < _FEWEST_TO_FIND_THE_CENTRE or np.linalg.cond(design) > 20.0:
         design[:, :2] = 0.0
     solution = np.linalg.lstsq(design, away, rcond=None)[0]
-    if np.abs(design @ solution - away).max() > _ON_CONTAINER_SIDES * side_m or solution[2] <= 0.0:
+    if np.abs(design @ solution - away).max() > _ON_CONTAINER_SIDES * side or solution[2] <= 0.0:
         return None
     return 2.0 * float(solution[2])
 

@@ -24,8 +24,6 @@ PoseWay = Literal["auto", "markers", "colmap", "angles"]
 class SessionFacts(Known):
     """What is known of a session beside its images."""
 
-    container_diameter_m: float | None = None
-    container_height_m: float | None = None
     frame_angles_deg: tuple[float, ...] | None = None
     """One angle a frame, instead of even steps."""
     camera: KnownCamera | None = None
