@@ -16,7 +16,7 @@ from hsi_sc_nerf.simulate.truth import load_truth
 
 pytestmark = pytest.mark.slow
 
-ITERATIONS = 500
+ITERATIONS = 400
 
 
 def command(*words):
