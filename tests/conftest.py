@@ -1,5 +1,11 @@
+import os
+
 import pytest
 from threadpoolctl import threadpool_limits
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Processes side by side, each with all cores' threads, wait for one another.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items):

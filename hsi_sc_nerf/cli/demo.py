@@ -19,6 +19,7 @@ DEMO_TRAINING = {
     "pipeline.model.num-nerf-samples-per-ray": "24",
     "pipeline.model.proposal-warmup": "200",
     "pipeline.model.proposal-weights-anneal-max-num-iters": "100",
+    "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
     "steps-per-eval-image": "1000000",
     "vis": "tensorboard",
