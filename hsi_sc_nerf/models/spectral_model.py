@@ -35,9 +35,7 @@ from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement
 from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.viewer.panel import SpectralPanel
-
-ANGLE_PICTURE_MAX_RAD = 0.2
-"""Spectral angle that the error picture draws at full scale."""
+from hsi_sc_nerf.viewer.pictures import ANGLE_DRAWN_RAD
 
 
 class SpectralModel(NerfactoModel):
@@ -239,7 +237,7 @@ class SpectralModel(NerfactoModel):
         metrics = spectral_metrics(rendered, truth, mask, valid)
         metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth, None, valid).items()}
 
-        angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_PICTURE_MAX_RAD
+        angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_DRAWN_RAD[1]
         images = {
             "img": torch.cat([truth[..., self.rgb_bands], rendered[..., self.rgb_bands]], dim=1).clamp(0.0, 1.0),
             "spectral_angle": colormaps.apply_colormap(angle.clamp(0.0, 1.0)),

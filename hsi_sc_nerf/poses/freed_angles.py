@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.data.session_pictures import SessionPictures
-from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, in_object_frame
+from hsi_sc_nerf.poses.from_features import FeatureConfig, Images, Known, poses_by_angles
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.structure_from_motion import matched_tracks
-from hsi_sc_nerf.poses.turntable_from_angles import adjusted_from_angles
 
 
 def poses_by_freed_angles(
@@ -37,11 +33,4 @@ def poses_by_freed_angles(
     Raises:
         InputError: too little texture, or features that contradict the angles.
     """
-    pictures = SessionPictures.of(images)
-    tracks = matched_tracks(pictures.named(pictures.features), names, config.motion)
-    height, width = images[0].shape
-    config = replace(config, adjustment=replace(config.adjustment, free_angles=True))
-    adjusted = adjusted_from_angles(
-        tracks, angles_deg, (width, height), config.adjustment, direction_known=known.direction is not None
-    )
-    return in_object_frame(adjusted, images, names, known, config, "angles")
+    return poses_by_angles(images, names, angles_deg, known, config, free_angles=True)

@@ -98,6 +98,7 @@ def poses_by_angles(
     angles_deg: Float[np.ndarray, "n"],
     known: Known,
     config: FeatureConfig,
+    free_angles: bool = False,
 ) -> TurntablePoses:
     """Poses from angles that are known: features give the camera before the axis, and nothing else.
 
@@ -107,6 +108,7 @@ def poses_by_angles(
         angles_deg: of each frame, relative to the first; positive counter-clockwise where the direction is known.
         known: what else is known.
         config: settings.
+        free_angles: let the given angles be a start only, from which features adjust each frame's.
 
     Raises:
         InputError: too little texture, or features that contradict the angles.
@@ -114,7 +116,7 @@ def poses_by_angles(
     pictures = SessionPictures.of(images)
     tracks = matched_tracks(pictures.named(pictures.features), names, config.motion)
     height, width = images[0].shape
-    adjustment = replace(config.adjustment, free_angles=False)
+    adjustment = replace(config.adjustment, free_angles=free_angles)
     direction_known = known.direction is not None
     adjusted = adjusted_from_angles(tracks, angles_deg, (width, height), adjustment, direction_known=direction_known)
     return in_object_frame(adjusted, images, names, known, replace(config, adjustment=adjustment), "angles")
