@@ -104,7 +104,7 @@ hsi_sc_nerf_paper = MethodSpecification(
                 num_levels=paper.HASH_LEVELS,
                 max_res=paper.FINEST_GRID,
                 log2_hashmap_size=paper.LOG2_HASH_TABLE,
-                average_init_density=1.0,
+                average_init_density=paper.INITIAL_DENSITY,
                 use_appearance_embedding=True,
                 camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
             ),

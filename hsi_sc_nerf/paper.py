@@ -44,6 +44,7 @@ HASH_LEVELS = 16
 LOG2_HASH_TABLE = 19
 FINEST_GRID = 2048
 LEARNING_RATE = 1e-2
+INITIAL_DENSITY = 0.01  # nerfacto as a method; its model's own default, 1, starts in fog that hides the object
 # The schedule falls a hundredfold over 200 000 steps, of which each stage makes a tenth: it hardly falls.
 LEARNING_RATE_DECAY = 0.01
 LEARNING_RATE_DECAY_STEPS = 200_000
