@@ -2,7 +2,7 @@ import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
-from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
+from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings, interpolate_hash_grid
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
@@ -51,3 +51,37 @@ def test_fuse_replaces_torch_encodings_only():
     fuse_hash_encodings(module)
     assert type(module[0]) is FusedHashEncoding
     assert type(module[1]) is torch.nn.Linear
+
+
+@pytest.mark.parametrize("count", [200, 5000])  # by one thread; shared among all
+def test_compiled_loops_equal_tensor_operations(count):
+    """In float32 the processor runs compiled loops, in float64 the tensor operations that a GPU runs."""
+    torch.manual_seed(0)
+    size, scalings = 2**9, torch.tensor([4.0, 7.0, 20.0])
+    points, table = torch.rand(count, 3), torch.rand(3 * size, 2) - 0.5
+    points[:2] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    upstream = torch.randn(count, 6)
+    found = []
+    for kind in (torch.float32, torch.float64):
+        x, rows = (value.detach().to(kind).requires_grad_() for value in (points, table))
+        features = interpolate_hash_grid(x, rows, scalings, size)
+        (features * upstream).sum().backward()
+        found.append([value.double() for value in (features.detach(), rows.grad, x.grad)])
+    for compiled, reference in zip(*found, strict=True):
+        torch.testing.assert_close(compiled, reference, rtol=1e-4, atol=1e-4)
+
+
+def test_threads_do_not_change_gradients():
+    torch.manual_seed(0)
+    points, upstream = torch.rand(6000, 3), torch.randn(6000, 4)
+    before, gradients = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            x, table = points.clone().requires_grad_(), torch.ones(2 * 64, 2, requires_grad=True)
+            (interpolate_hash_grid(x, table, torch.tensor([4.0, 8.0]), 64) * upstream).sum().backward()
+            gradients.append((table.grad, x.grad))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(gradients[0][0], gradients[1][0])
+    assert torch.equal(gradients[0][1], gradients[1][1])

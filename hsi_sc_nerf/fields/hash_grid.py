@@ -2,7 +2,7 @@
 
 Same function and same parameters as nerfstudio's torch ``HashEncoding`` (Müller et al. 2022), so checkpoints and
 results are interchangeable. nerfstudio gathers the eight corners of a cell one after the other and keeps all of
-them for autograd; here one fused gather-and-sum reads the table, and one histogram writes its gradient.
+them for autograd; here one fused gather-and-sum reads the table, and without a GPU compiled loops do the work.
 """
 
 from __future__ import annotations
@@ -32,11 +32,45 @@ def interpolate_hash_grid(
         scalings: cells along an edge of the unit cube, a level.
         table_size: rows of one level.
     """
-    return _Interpolate.apply(positions, table, scalings.to(positions), table_size)
+    compiled = positions.device.type == "cpu" and positions.dtype == table.dtype == torch.float32
+    function = _CompiledInterpolate if compiled else _Interpolate
+    return function.apply(positions, table, scalings.to(positions), table_size)
+
+
+class _CompiledInterpolate(torch.autograd.Function):
+    """The interpolation on the processor."""
+
+    @staticmethod
+    def forward(ctx, positions, table, scalings, table_size):
+        from hsi_sc_nerf.fields import hash_grid_cpu  # compiles; a GPU does without it
+
+        ctx.save_for_backward(positions, table, scalings)
+        ctx.table_size = table_size
+        features = hash_grid_cpu.interpolate(
+            positions.numpy(force=True), table.numpy(force=True), scalings.numpy(), table_size
+        )
+        return torch.from_numpy(features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        from hsi_sc_nerf.fields import hash_grid_cpu
+
+        positions, table, scalings = (tensor.numpy(force=True) for tensor in ctx.saved_tensors)
+        grid = positions, table, scalings, ctx.table_size, grad.contiguous().numpy()
+        grad_positions = grad_table = None
+        if ctx.needs_input_grad[0]:
+            grad_positions = torch.from_numpy(hash_grid_cpu.position_gradient(*grid))
+        if ctx.needs_input_grad[1]:
+            grad_table = torch.from_numpy(hash_grid_cpu.table_gradient(*grid))
+        return grad_positions, grad_table, None, None
 
 
 class _Interpolate(torch.autograd.Function):
-    """The interpolation with its gradients written out; what is saved is what the backward pass reads."""
+    """The interpolation as tensor operations with their gradients written out.
+
+    What is saved is what the backward pass reads.
+    """
 
     @staticmethod
     def forward(ctx, positions, table, scalings, table_size):
@@ -120,16 +154,10 @@ def _scatter_to_table(
     grad: Float[Tensor, "n features"], indices: Int[Tensor, "n 8"], weights: Float[Tensor, "n 8"], rows: int
 ) -> Float[Tensor, "rows features"]:
     """Gradient of the weighted sums with respect to the table."""
-    flat = indices.reshape(-1)
-    if grad.device.type == "cpu":
-        # bincount is several times faster than index_add_ there, and sums in float64.
-        columns = [
-            torch.bincount(flat, weights=(weights * grad[:, f : f + 1]).reshape(-1), minlength=rows)
-            for f in range(grad.shape[1])
-        ]
-        return torch.stack(columns, dim=1).to(grad.dtype)
     contributions = (weights[..., None] * grad[:, None, :]).reshape(-1, grad.shape[1])
-    return torch.zeros(rows, grad.shape[1], device=grad.device, dtype=grad.dtype).index_add_(0, flat, contributions)
+    return torch.zeros(rows, grad.shape[1], device=grad.device, dtype=grad.dtype).index_add_(
+        0, indices.reshape(-1), contributions
+    )
 
 
 class FusedHashEncoding(HashEncoding):
