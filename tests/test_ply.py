@@ -30,7 +30,7 @@ def header(path: Path) -> list[str]:
 
 @pytest.mark.parametrize("chunk", [7, 50, 1000])
 def test_round_trip(tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ply, "_CHUNK_POINTS", chunk)
+    monkeypatch.setattr(ply, "CHUNK_POINTS", chunk)
     written, path = cloud(), tmp_path / "cloud.ply"
     extra = {"opacity": np.linspace(0, 1, 50, dtype=np.float32), "views": np.arange(50)}
     write_spectral_ply(path, **written, wavelengths_nm=WAVELENGTHS, extra=extra)

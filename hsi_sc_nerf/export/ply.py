@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud, stream
 
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
@@ -32,20 +32,6 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
-# Points that are interleaved at a time: 27 MB at 204 bands.
-_CHUNK_POINTS = 1 << 15
-
-
-@dataclass(frozen=True)
-class SpectralCloud:
-    """Points with their spectra."""
-
-    points: Float[np.ndarray, "n 3"]  # metres
-    normals: Float[np.ndarray, "n 3"]
-    colours: UInt8[np.ndarray, "n 3"]
-    spectra: Float[np.ndarray, "n bands"]  # reflectance
-    wavelengths_nm: Float[np.ndarray, "bands"]
-    extra: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
 
 
 def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[str]:
@@ -96,42 +82,39 @@ def write_spectral_ply(
         InputError: the file cannot be written, for instance because the disk is full.
         ValueError: the arrays' shapes do not fit together, two wavelengths are equal, or a name is taken.
     """
-    path = Path(path)
-    extra = dict(extra or {})
-    band_names = band_property_names(wavelengths_nm)
-    names = [*_GEOMETRY, *band_names, *extra]
-    if len({*names, *_COLOUR}) != len(names) + len(_COLOUR) or any(len(name.split()) != 1 for name in extra):
-        raise ValueError(f"extra columns need one-word names that are not taken: {list(extra)}")
-    count = len(points_m)
-    expected = {"points_m": (points_m, 3), "normals": (normals, 3), "colours": (colours, 3)}
-    expected["spectra"] = (spectra, len(band_names))
-    for name, (array, width) in expected.items():
-        if array.shape != (count, width):
-            raise ValueError(f"{name} has shape {array.shape}, not {(count, width)}")
-    for name, column in extra.items():
-        if column.shape != (count,):
-            raise ValueError(f"{name} has shape {column.shape}, not {(count,)}")
+    cloud = SpectralCloud(points_m, normals, colours, spectra, wavelengths_nm, dict(extra or {}))
+    write_ply_stream(Path(path), stream(cloud, CHUNK_POINTS))
 
+
+def write_ply_stream(path: Path, cloud: CloudStream) -> None:
+    """Write a cloud piece by piece, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written, for instance because the disk is full.
+        ValueError: the pieces do not fit together, two wavelengths are equal, or an extra column's name is taken.
+    """
+    band_names = band_property_names(cloud.wavelengths_nm)
+    names = [*_GEOMETRY, *_COLOUR, *band_names, *cloud.extra_names]
+    if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
+        raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
     layout = np.dtype(
         [
             ("points", "<f4", 3),
             ("normals", "<f4", 3),
             ("colours", "u1", 3),
             ("spectra", "<f4", len(band_names)),
-            ("extra", "<f4", len(extra)),
+            ("extra", "<f4", len(cloud.extra_names)),
         ]
     )
-    rows = np.empty(min(count, _CHUNK_POINTS), layout)
     with atomic_write(path) as (temporary,), temporary.open("wb") as file:
-        file.write(_header(count, [*band_names, *extra]))
-        for start in range(0, count, _CHUNK_POINTS):
-            chunk = slice(start, min(start + _CHUNK_POINTS, count))
-            part = rows[: chunk.stop - start]
-            part["points"], part["normals"], part["colours"] = points_m[chunk], normals[chunk], colours[chunk]
-            part["spectra"] = spectra[chunk]
-            for index, values in enumerate(extra.values()):
-                part["extra"][:, index] = values[chunk]
-            part.tofile(file)
+        file.write(_header(cloud.count, [*band_names, *cloud.extra_names]))
+        for _, chunk in cloud.placed():
+            rows = np.empty(len(chunk), layout)
+            rows["points"], rows["normals"], rows["colours"] = chunk.points, chunk.normals, chunk.colours
+            rows["spectra"] = chunk.spectra
+            for index, values in enumerate(chunk.extra.values()):
+                rows["extra"][:, index] = values
+            rows.tofile(file)
 
 
 def _parse_header(path: Path) -> tuple[int, np.dtype, int]:
@@ -192,8 +175,8 @@ def read_spectral_ply(path: Path) -> SpectralCloud:
     extra = {name: np.empty(count, np.float32) for name in extra_names}
     with path.open("rb") as file:
         file.seek(offset)
-        for start in range(0, count, _CHUNK_POINTS):
-            part = np.fromfile(file, layout, min(_CHUNK_POINTS, count - start))
+        for start in range(0, count, CHUNK_POINTS):
+            part = np.fromfile(file, layout, min(CHUNK_POINTS, count - start))
             chunk = slice(start, start + len(part))
             for array, (group, _) in zip(arrays, columns, strict=True):
                 array[chunk] = structured_to_unstructured(part[list(group)])
