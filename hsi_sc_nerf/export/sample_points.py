@@ -1,0 +1,173 @@
+"""Spectra of given points on the object's surface, as the training cameras that see them would render them.
+
+A spectrum depends on the viewing direction, and the model knows only directions that it was trained on: a ray along
+the normal of an upward face comes from where no camera ever stood. So each point gets the mean over the training
+cameras that see it: of those that look at it at less than ``MAX_INCIDENCE_DEG`` the most frontal ones render their ray
+through the point, and those count whose ray ends at the point's place on the surface and not before it, at something
+in the way, or behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from hsi_sc_nerf.export.point_cloud import MIN_OPACITY
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
+
+MAX_INCIDENCE_DEG = 70.0
+"""Cameras that look at a face more obliquely than this see it smeared over their pixels."""
+
+
+@dataclass(frozen=True)
+class PointSampling:
+    """How points get their spectra."""
+
+    reach_mm: float = 5.0
+    """How far a point may lie from the model's surface, in millimetres. A point further away gets no spectrum."""
+    views: int = 4
+    """How many training cameras' views are averaged at each point, the most frontal ones first. More take longer."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointSpectra:
+    """What the training cameras see of points.
+
+    Attributes:
+        spectra: mean reflectance over the views; NaN without any.
+        spectral_std: standard deviation over the views, root mean square over the bands; NaN with fewer than two.
+        views: how many views were averaged.
+    """
+
+    spectra: Float[np.ndarray, "n bands"]
+    spectral_std: Float[np.ndarray, "n"]
+    views: Int[np.ndarray, "n"]
+
+
+def frontal_views(
+    cosines: Float[np.ndarray, "n cameras"], in_frame: Bool[np.ndarray, "n cameras"], count: int
+) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+    """Pairs of a point and a camera that may see it: for each point the ``count`` most frontal cameras.
+
+    Args:
+        cosines: of the angle between the point's normal and the direction to the camera.
+        in_frame: whether the camera's image holds the point.
+        count: cameras a point, at most.
+    """
+    ranked = np.where(in_frame, cosines, -1.0)
+    count = min(count, ranked.shape[1])
+    best = np.argpartition(-ranked, count - 1, axis=1)[:, :count]
+    point, place = np.nonzero(np.take_along_axis(ranked, best, axis=1) > np.cos(np.deg2rad(MAX_INCIDENCE_DEG)))
+    return point, best[point, place]
+
+
+def outward(
+    normals: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
+    density: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]],
+    reach: float,
+) -> Float[Tensor, "n 3"]:
+    """Normals turned to the side on which, ``reach`` away from the point, there is less density.
+
+    Files hold normals that point inwards, or either way. Where both sides are alike, a normal stays as it is.
+    """
+    inside, outside = density(points - reach * normals), density(points + reach * normals)
+    return torch.where(outside > inside, -normals, normals)
+
+
+def mean_and_spread(
+    spectra: Float[np.ndarray, "pairs bands"], point: Int[np.ndarray, "pairs"], num_points: int
+) -> PointSpectra:
+    """Mean and spread of the spectra that belong to the same point."""
+    bands = spectra.shape[1]
+    views = np.bincount(point, minlength=num_points)
+    total = np.zeros((num_points, bands))
+    np.add.at(total, point, spectra)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(views[:, None] > 0, total / views[:, None], np.nan)
+        squares = np.bincount(point, np.square(spectra - mean[point]).mean(axis=1), minlength=num_points)
+        spread = np.where(views > 1, np.sqrt(squares / (views - 1.0)), np.nan)
+    return PointSpectra(mean.astype(np.float32), spread.astype(np.float32), views)
+
+
+@torch.no_grad()
+def sample_points(
+    model: SpectralModel,
+    poses: Float[np.ndarray, "cameras 4 4"],
+    intrinsics: PinholeIntrinsics,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    reach: float,
+    views: int,
+) -> PointSpectra:
+    """Spectra of some points; how many at a time is the caller's choice, memory grows with them.
+
+    Lens distortion is neglected where it is decided which images hold a point.
+
+    Args:
+        model: trained model, in evaluation mode.
+        poses: camera-to-world of the training cameras as refined, scene units.
+        intrinsics: of the cameras.
+        points: scene units.
+        normals: unit vectors, to either side of the surface.
+        reach: how far from its surface a point may lie, along the normal, scene units.
+        views: how many cameras' views are averaged.
+    """
+    device = model.device
+    where = torch.from_numpy(points).float().to(device)
+    normals = outward(torch.from_numpy(normals).float().to(device), where, _density(model), reach).cpu().numpy()
+    to_point = points[:, None] - poses[:, :3, 3]
+    distances = np.linalg.norm(to_point, axis=-1)
+    directions = to_point / distances[..., None]
+    cosines = -np.einsum("nk,nck->nc", normals, directions)
+    in_frame = np.stack([_in_frame(points, pose, intrinsics) for pose in poses], axis=1)
+    point, camera = frontal_views(cosines, in_frame, views)
+
+    kept, seen = [np.zeros((0, len(model.wavelengths_nm)), np.float32)], []
+    chunk = model.config.eval_num_rays_per_chunk
+    for start in range(0, len(point), chunk):
+        p, c = point[start : start + chunk], camera[start : start + chunk]
+        spectra, opacity, depth = _rendered(model, poses[c, :3, 3], directions[p, c])
+        missed = np.abs(depth - distances[p, c]) * cosines[p, c]
+        hit = (opacity > MIN_OPACITY) & (missed <= reach)
+        kept.append(spectra[hit])
+        seen.append(p[hit])
+    return mean_and_spread(np.concatenate(kept), np.concatenate([np.zeros(0, int), *seen]), len(points))
+
+
+def _density(model: SpectralModel) -> Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]]:
+    return lambda places: model.field.density_fn(places[:, None])[:, 0]
+
+
+def _in_frame(
+    points: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics
+) -> Bool[np.ndarray, "n"]:
+    pixels, depth = project(points, pose, intrinsics)
+    return (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=-1)
+
+
+def _rendered(
+    model: SpectralModel, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
+) -> tuple[Float[np.ndarray, "rays bands"], Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+    """Spectrum of what rays of unit length meet, without the background's share; opacity; depth."""
+    ones = torch.ones(len(origins), 1)
+    rays = RayBundle(
+        origins=torch.from_numpy(origins).float(),
+        directions=torch.from_numpy(directions).float(),
+        pixel_area=ones,
+        camera_indices=torch.zeros_like(ones, dtype=torch.long),
+        metadata={"directions_norm": ones},
+    ).to(model.device)
+    behind = model.spectra_behind(rays)
+    outputs = model(rays)
+    spectra, opacity = outputs["spectral"], outputs["accumulation"]
+    if model.background is not None:
+        spectra = (spectra - behind * (1.0 - opacity)) / opacity.clamp_min(1e-6)
+    return spectra.clamp(0.0, 1.0).cpu().numpy(), opacity[:, 0].cpu().numpy(), outputs["depth"][:, 0].cpu().numpy()
