@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.paper import F_SCORE_THRESHOLD_M
@@ -72,8 +73,14 @@ def _hits(
 
 def _score(precise: Bool[np.ndarray, "n"], recalled: Bool[np.ndarray, "m"]) -> SpatialScore:
     precision, recall = (100.0 * float(np.mean(hits)) if len(hits) else 0.0 for hits in (precise, recalled))
+    return SpatialScore(precision, recall, float(f_score(precision, recall)))
+
+
+def f_score(precision: ArrayLike, recall: ArrayLike) -> Float[np.ndarray, "*n"]:
+    """Harmonic mean of precision and recall; 0 where both are."""
+    precision, recall = np.asarray(precision, float), np.asarray(recall, float)
     total = precision + recall
-    return SpatialScore(precision, recall, 2 * precision * recall / total if total else 0.0)
+    return np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
 
 
 def sample_surface(
