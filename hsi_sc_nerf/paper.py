@@ -51,3 +51,7 @@ LEARNING_RATE_DECAY_STEPS = 200_000
 
 # Spatial validation (section "Spatial Validation").
 F_SCORE_THRESHOLD_M = 0.002
+
+# Traits (sections "Applications" and "Spectral Validation").
+POISSON_DEPTH = 8
+CLASSIFICATION_ANGLE_RAD = 0.1

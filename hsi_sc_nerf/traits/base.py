@@ -1,0 +1,109 @@
+"""The base that no camera sees: the object's surface goes on to where it stands, and is flat there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+SECTORS = 72
+# Share of a sector's points that lie below its edge: strays.
+_STRAYS = 0.005
+# The surface's slope at the edge is that of this much of it.
+_STRIP_M = 0.003
+# A skirt that is flatter than this (radius to height) would reach far on little evidence.
+_FLATTEST = 2.0
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where the seen surface ends and what closes it, by sectors of azimuth about ``centre_m``.
+
+    Attributes:
+        centre_m: x and y of the middle.
+        height_m: z of the plane that the object stands on.
+        edge_height_m: z at which the seen surface ends.
+        edge_radius_m: distance of that edge from the middle.
+        foot_radius_m: distance of the base's outline from the middle.
+    """
+
+    centre_m: Float[np.ndarray, "2"]
+    height_m: float
+    edge_height_m: Float[np.ndarray, "sectors"]
+    edge_radius_m: Float[np.ndarray, "sectors"]
+    foot_radius_m: Float[np.ndarray, "sectors"]
+
+    def points(self, spacing_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Points about ``spacing_m`` apart on the skirt (edge to outline) and the flat base, with outward normals."""
+        edge_m = float(self.edge_radius_m.max())
+        around = max(SECTORS, int(np.ceil(2.0 * np.pi * edge_m / spacing_m)))
+        azimuth = 2.0 * np.pi * np.arange(around) / around
+        edge_z, edge_r, foot_r = (
+            self._at(values, azimuth) for values in (self.edge_height_m, self.edge_radius_m, self.foot_radius_m)
+        )
+        out = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+        length_m = np.hypot(edge_r - foot_r, edge_z - self.height_m)
+        steps = int(np.ceil(length_m.max() / spacing_m))
+        share = (np.arange(steps) + 0.5)[:, None] / max(steps, 1)
+        radius, z = edge_r + share * (foot_r - edge_r), edge_z + share * (self.height_m - edge_z)
+        wall = np.concatenate([radius[..., None] * out, z[..., None]], axis=-1)
+        wall_normals = np.concatenate([(edge_z - self.height_m)[:, None] * out, (foot_r - edge_r)[:, None]], axis=-1)
+        wall_normals = np.broadcast_to(wall_normals, wall.shape)
+        # Where the seen surface reaches the base there is no wall.
+        real = np.broadcast_to(length_m > spacing_m, wall.shape[:2])
+
+        along = np.arange(-edge_m, edge_m + spacing_m, spacing_m)
+        x, y = (grid.ravel() for grid in np.meshgrid(along, along))
+        inside = np.hypot(x, y) < self._at(self.foot_radius_m, np.arctan2(y, x) % (2.0 * np.pi))
+        floor = np.stack([x, y, np.full_like(x, self.height_m)], axis=-1)[inside]
+        down = np.broadcast_to([0.0, 0.0, -1.0], floor.shape)
+
+        points = np.concatenate([wall[real], floor])
+        points[:, :2] += self.centre_m
+        normals = np.concatenate([wall_normals[real], down])
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def _at(self, values: Float[np.ndarray, "sectors"], azimuth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        middles = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
+        return np.interp(azimuth, middles, values, period=2.0 * np.pi)
+
+
+def find_base(
+    points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], height_m: float | None = None
+) -> Base:
+    """Where an object that stands upright (z up) closes: its surface goes straight on, down to the base's plane.
+
+    Args:
+        points_m: the seen surface.
+        normals: unit normals, outwards.
+        height_m: z of the plane that the object stands on; without it, where the seen surface ends at its lowest.
+    """
+    z = points_m[:, 2]
+    low = points_m[z < np.quantile(z, _STRAYS) + _STRIP_M, :2]
+    centre = (low.min(axis=0) + low.max(axis=0)) / 2.0
+    offset = points_m[:, :2] - centre
+    radius = np.hypot(*offset.T)
+    sector = (np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi) * (SECTORS / (2.0 * np.pi))).astype(
+        int
+    ) % SECTORS
+    outwards = (normals[:, :2] * offset).sum(axis=1) / np.maximum(radius, 1e-12)
+
+    edge_z, edge_r, slope = (np.full(SECTORS, np.nan) for _ in range(3))
+    for index in np.unique(sector):
+        here = np.flatnonzero(sector == index)
+        edge_z[index] = np.quantile(z[here], _STRAYS)
+        strip = here[z[here] <= edge_z[index] + _STRIP_M]
+        edge_r[index] = np.median(radius[strip][z[strip] <= np.median(z[strip])])
+        slope[index] = np.clip(-normals[strip, 2].mean() / max(outwards[strip].mean(), 1e-6), 0.0, _FLATTEST)
+    edge_z, edge_r, slope = (_smooth_around(values) for values in (edge_z, edge_r, slope))
+    base_z = float(edge_z.min()) if height_m is None else height_m
+    foot_r = np.maximum(edge_r - slope * np.maximum(edge_z - base_z, 0.0), 0.0)
+    return Base(centre, base_z, edge_z, edge_r, foot_r)
+
+
+def _smooth_around(values: Float[np.ndarray, "sectors"]) -> Float[np.ndarray, "sectors"]:
+    known = np.flatnonzero(np.isfinite(values))
+    filled = np.interp(np.arange(SECTORS), known, values[known], period=SECTORS)
+    return gaussian_filter1d(filled, 1.0, mode="wrap")

@@ -1,0 +1,92 @@
+"""The object's closed surface from its points: screened Poisson reconstruction over a closed base."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.traits.base import find_base
+from hsi_sc_nerf.traits.smoothing import NEIGHBOURS, smoothed, thinned
+
+# Points that a quadric is fitted to lie a third of its radius apart: about thirty weigh in.
+_THINNING = 3.0
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """How the mesh is made."""
+
+    octree_depth: int = paper.POISSON_DEPTH
+    """Depth of the Poisson reconstruction's octree: each step halves the mesh's triangles in size."""
+    smoothing_radius_m: float = 0.002
+    """Bumps smaller than this, in metres, are taken for noise of the reconstruction and smoothed away."""
+    base_height_m: float | None = None
+    """Height above the turntable's disc, in metres, of what the object stands on (the container's height): the
+    unseen base is closed there. Without it, where the cloud ends at its lowest."""
+
+
+def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], config: MeshConfig) -> Mesh:
+    """The closed surface of an object that stands upright, its base flat.
+
+    The points are thinned and smoothed, the base that no camera saw is closed (`find_base`), and the whole goes
+    through screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D). What floats beside the largest piece is
+    left out.
+
+    Args:
+        points_m: the seen surface, z up.
+        normals: outward on the whole; single ones may be far off.
+        config: settings.
+
+    Raises:
+        InputError: there are too few points, or they lie in one place.
+    """
+    if len(points_m) < NEIGHBOURS or np.ptp(points_m, axis=0).min() <= 0.0 or not np.isfinite(points_m).all():
+        raise InputError(
+            f"the cloud has {len(points_m)} points that do not surround a solid; export more points of the object."
+        )
+    spacing_m = config.smoothing_radius_m / _THINNING
+    points, facing = thinned(np.asarray(points_m, float), np.asarray(normals, float), spacing_m)
+    if len(points) < NEIGHBOURS:
+        raise InputError(
+            f"only {len(points)} points are left at a smoothing radius of {config.smoothing_radius_m} m; the cloud is "
+            "too small for it: check that it is in metres, or lower the radius."
+        )
+    points, outward = smoothed(points, facing, config.smoothing_radius_m)
+    base_points, base_normals = find_base(points, outward, config.base_height_m).points(spacing_m)
+    return largest_piece(
+        _poisson(np.concatenate([points, base_points]), np.concatenate([outward, base_normals]), config.octree_depth)
+    )
+
+
+def _poisson(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int) -> Mesh:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    # Its warnings are of samples that the base has too many of.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth)
+    mesh.remove_degenerate_triangles()
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+
+
+def pieces(triangles: np.ndarray, vertices: int) -> np.ndarray:
+    """Number of the connected piece that each of so many vertices belongs to (by the triangles' edges)."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    graph = csr_array((np.ones(len(start), np.int8), (start, end)), shape=(vertices, vertices))
+    return connected_components(graph, directed=False)[1]
+
+
+def largest_piece(mesh: Mesh) -> Mesh:
+    """The connected piece with the most triangles, without vertices that none of them uses."""
+    piece = pieces(mesh.triangles, len(mesh.vertices))[mesh.triangles[:, 0]]
+    triangles = mesh.triangles[piece == np.bincount(piece).argmax()]
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return Mesh(mesh.vertices[used], renumbered.reshape(triangles.shape))
