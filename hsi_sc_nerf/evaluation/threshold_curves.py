@@ -104,7 +104,8 @@ def threshold_for_m(
     """
     candidates = np.sort(np.concatenate([to_reference_m, to_cloud_m]))
     curves = threshold_curves(to_reference_m, to_cloud_m, candidates)
-    return float(candidates[min(np.searchsorted(curves.f_score, percent - 1e-9), len(candidates) - 1)])
+    # Rounding must not keep 100 % from being reached.
+    return float(candidates[int(np.argmax(curves.f_score >= percent - 1e-9))])
 
 
 def distance_statistics(distances_m: Float[np.ndarray, "n"]) -> DistanceStatistics:

@@ -1,0 +1,65 @@
+"""Read what is compared: meshes (PLY, OBJ, STL) and point clouds (PLY), whoever wrote them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from plyfile import PlyData, PlyParseError
+
+from hsi_sc_nerf.errors import InputError
+
+FORMATS = (".ply", ".obj", ".stl")
+
+
+def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+    """Vertices, in the file's units, and triangles; a point cloud has 0 of these. Polygons are cut into fans.
+
+    Raises:
+        InputError: the file is missing, is of another kind, cannot be read, has no points, or points at no finite
+            place.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give a point cloud (PLY) or a mesh (PLY, OBJ, STL).")
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: is no file that can be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
+    try:
+        vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
+    except Exception as error:  # the readers fail in every way there is
+        raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
+    if not len(vertices):
+        raise InputError(f"{path}: has no points; export it again.")
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
+    return vertices, triangles
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    # Mapped, not read: of a spectral cloud's hundreds of columns three are wanted.
+    content = PlyData.read(path)
+    vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
+    if "face" not in content or not content["face"].count:
+        return vertices, np.zeros((0, 3), np.int64)
+    name = next((p.name for p in content["face"].properties if p.name in ("vertex_indices", "vertex_index")), None)
+    if name is None:
+        raise PlyParseError("its faces have no vertex_indices")
+    faces = content["face"][name]
+    corners = np.array([len(face) for face in faces])
+    fans = [
+        np.stack(faces[corners == count])[:, [0, step, step + 1]]
+        for count in np.unique(corners)
+        for step in range(1, count - 1)
+    ]
+    triangles = np.concatenate(fans).astype(np.int64) if fans else np.zeros((0, 3), np.int64)
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise PlyParseError("its faces name vertices that it has not")
+    return vertices, triangles
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    read = trimesh.load_mesh(path, process=False)
+    return np.asarray(read.vertices, float), np.asarray(read.faces, np.int64)
