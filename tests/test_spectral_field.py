@@ -183,3 +183,19 @@ def test_groups_have_their_own_densities_and_share_a_mean():
     (of_last_band,) = torch.autograd.grad(composited[:, -1].sum(), channels)
     assert (of_last_band[..., BANDS : BANDS + 2] == 0).all()
     assert (of_last_band[..., BANDS + 2] != 0).any()
+
+
+def test_spectra_depend_on_the_view_only_where_they_may():
+    along, back = rays(samples=1), rays(samples=1)
+    back.frustums.directions = -back.frustums.directions
+    # The same places seen from the other side.
+    back.frustums.origins = along.frustums.get_positions() - back.frustums.directions * (
+        (back.frustums.starts + back.frustums.ends) / 2.0
+    )
+    for start in (None, torch.zeros(3)):
+        fixed = field(view_dependent=False, coefficient_start=start)
+        torch.testing.assert_close(
+            fixed(along)[FieldHeadNames.RGB], fixed(back)[FieldHeadNames.RGB], rtol=1e-4, atol=1e-5
+        )
+        free = field(coefficient_start=start)
+        assert (free(along)[FieldHeadNames.RGB] - free(back)[FieldHeadNames.RGB]).abs().max() > 1e-2

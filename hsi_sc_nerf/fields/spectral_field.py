@@ -80,6 +80,7 @@ class SpectralField(NerfactoField):
         coefficient_start: coefficients of the mean spectrum in a basis (`SpectralSubspace.mean_coefficients`): the
             head has a linear channel for each and begins near these values. None: the direct head, whose channels
             end in a sigmoid.
+        view_dependent: let spectra depend on the direction from which they are seen.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         **nerfacto: everything else that `NerfactoField` takes.
@@ -90,13 +91,16 @@ class SpectralField(NerfactoField):
         aabb: Float[Tensor, "2 3"],
         num_bands: int,
         coefficient_start: Float[Tensor, "rank"] | None = None,
+        view_dependent: bool = True,
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
         **nerfacto,
     ) -> None:
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
+        self.view_dependent = view_dependent
+        direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
-            in_dim=self.direction_encoding.get_out_dim() + self.geo_feat_dim + self.appearance_embedding_dim,
+            in_dim=direction_channels + self.geo_feat_dim + self.appearance_embedding_dim,
             num_layers=num_layers_color,
             layer_width=hidden_dim_color,
             out_dim=num_bands if coefficient_start is None else len(coefficient_start),
@@ -152,9 +156,11 @@ class SpectralField(NerfactoField):
             positions = self.position_encoding(ray_samples.frustums.get_positions())
             hidden = self.mlp_pred_normals(torch.cat([positions, density_embedding], dim=-1))
             outputs[FieldHeadNames.PRED_NORMALS] = self.field_head_pred_normals(hidden)
-        directions = get_normalized_directions(ray_samples.frustums.directions[..., 0, :])
-        encoded = self.direction_encoding(directions)[..., None, :].expand(*density_embedding.shape[:-1], -1)
-        inputs = [encoded, density_embedding]
+        inputs = [density_embedding]
+        if self.view_dependent:
+            directions = get_normalized_directions(ray_samples.frustums.directions[..., 0, :])
+            encoded = self.direction_encoding(directions)[..., None, :]
+            inputs.insert(0, encoded.expand(*density_embedding.shape[:-1], -1))
         if self.embedding_appearance is not None:
             inputs.append(self._appearance(ray_samples).expand(*density_embedding.shape[:-1], -1))
         outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1))

@@ -53,6 +53,9 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the orientation loss on computed normals."""
     pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
     """Weight of the predicted-normal loss."""
+    view_dependent: bool = True
+    """Let a point's spectrum depend on the direction from which it is seen: it holds gloss, and the shading of lamps
+    that stand still while the object turns."""
     predict_normals: bool = False
     """Predict normals, as the paper does. It roughly doubles the time of a step, and the cloud's normals are those of
     the density in any case."""

@@ -83,6 +83,7 @@ class SpectralModel(NerfactoModel):
         self.field = (SpectralField if config.density_groups == 1 else BandGroupField)(
             self.scene_box.aabb,
             num_bands=len(self.wavelengths_nm),
+            view_dependent=config.view_dependent,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
             base_res=config.base_res,

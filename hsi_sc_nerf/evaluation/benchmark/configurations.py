@@ -26,6 +26,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours": (OURS, ""),
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
+    "ours-not-view-dependent": (OURS, "--pipeline.model.view-dependent False"),
     "ours-predicted-normals": (OURS, "--pipeline.model.predict-normals True"),
     "ours-nerfacto-grid": (
         OURS,
