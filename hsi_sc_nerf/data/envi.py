@@ -141,7 +141,7 @@ def write_cube(
     header_path: Path,
     cube: Num[np.ndarray, "lines samples bands"],
     *,
-    wavelengths_nm: Shaped[np.ndarray, "bands"],
+    wavelengths_nm: Shaped[np.ndarray, "bands"] | None,
     interleave: str = "bil",
     data_suffix: str = ".raw",
     byte_order: str = "little",
@@ -149,15 +149,19 @@ def write_cube(
 ) -> None:
     """Write an ENVI pair: ``header_path`` (ending in ``.hdr``) and the data file with ``data_suffix`` beside it.
 
-    Both appear whole or not at all, the data file first. The numbers keep the data type of ``cube``.
+    Both appear whole or not at all, the data file first. The numbers keep the data type of ``cube``. Where its bands
+    are no wavelengths, as those of a map, ``wavelengths_nm`` is None.
 
     Raises:
         InputError: the operating system refused to write (full disk, no permission).
         ValueError: one wavelength a band was not given.
     """
     header_path = Path(header_path)
-    if len(wavelengths_nm) != cube.shape[2]:
-        raise ValueError(f"{len(wavelengths_nm)} wavelengths for {cube.shape[2]} bands")
+    spectral: dict[str, Any] = {}
+    if wavelengths_nm is not None:
+        spectral = {"wavelength units": "nm", "wavelength": [float(w) for w in wavelengths_nm]}
+        if len(wavelengths_nm) != cube.shape[2]:
+            raise ValueError(f"{len(wavelengths_nm)} wavelengths for {cube.shape[2]} bands")
     stored = np.ascontiguousarray(cube.transpose(_AXES[interleave]))
     stored = stored.astype(stored.dtype.newbyteorder(">" if byte_order == "big" else "<"), copy=False)
     header = {
@@ -166,8 +170,7 @@ def write_cube(
         "data type": envi.dtype_to_envi[cube.dtype.char],
         "interleave": interleave,
         "byte order": 1 if byte_order == "big" else 0,
-        "wavelength units": "nm",
-        "wavelength": [float(w) for w in wavelengths_nm],
+        **spectral,
         **(extra_header or {}),
     }
     with atomic_write(header_path.with_suffix(data_suffix), header_path) as (temporary_data, temporary_header):

@@ -58,7 +58,7 @@ class TrainedRun:
 
     @torch.no_grad()
     def refined_poses_m(self) -> Float[np.ndarray, "frames 4 4"]:
-        """Camera-to-world of every frame, held-out ones included, as training has refined it (object frame, metres)."""
+        """Refined camera-to-world of every frame, held-out ones included (object frame, metres)."""
         poses = self.dataset.camera_to_worlds
         poses[:, :3, 3] = self.to_scene(poses[:, :3, 3])
         device = self.model.device

@@ -1,0 +1,92 @@
+"""``hsi-sc-nerf render``: rendered views as hyperspectral cubes, and videos of them."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf.errors import InputError
+
+
+@dataclass(frozen=True)
+class RenderCommand:
+    """Render what a trained run holds: views as ENVI cubes of reflectance, and videos of composites and indices.
+
+    Beside each cube NAME lies NAME_valid, a map that is 1 where the pixel shows something that turns and 0 where it
+    shows the chamber behind it; held-out and training frames get a picture of measured, rendered and error, too.
+    """
+
+    load_config: Path
+    """The config.yml of a trained run."""
+    output_dir: Path
+    """Folder to write to."""
+    views: Literal["held-out", "training", "orbit"] = "held-out"
+    """What to render. held-out: the frames that training did not see. training: those that it saw. orbit: one turn
+    before the session's camera."""
+    camera_path: Path | None = None
+    """Cameras to render instead: a path that nerfstudio's viewer exported (JSON)."""
+    orbit_views: int = 60
+    """Views in the turn of an orbit."""
+    orbit_size: float = 1.0
+    """Size of an orbit's images, as a factor on the camera's; 2 is twice as many pixels each way."""
+    cubes: Literal["float32", "uint16", "none"] = "float32"
+    """Numbers in the cubes. float32: reflectance. uint16: half as large, reflectance times the scale factor that the
+    header tells. none: no cubes."""
+    video: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Video (MP4) of a composite or an index by name, such as CIR or NDVI; may be given several times."""
+    frames_per_second: int = 15
+    """Speed of videos."""
+
+    def main(self) -> None:
+        """Run the command.
+
+        Raises:
+            InputError: the run, a camera path or a name cannot be used, or a result cannot be written.
+        """
+        if min(self.orbit_views, self.frames_per_second) < 1 or self.orbit_size <= 0.0:
+            raise InputError("--orbit-views, --orbit-size and --frames-per-second have to be positive; correct them.")
+        if self.cubes == "none" and not self.video:
+            raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
+        from hsi_sc_nerf.data.atomic import atomic_write
+        from hsi_sc_nerf.export.progress import progress_bar
+        from hsi_sc_nerf.export.render_cubes import render_view, write_view
+        from hsi_sc_nerf.export.render_pictures import eight_bit, find_look
+        from hsi_sc_nerf.export.render_report import compare, write_report
+        from hsi_sc_nerf.export.rendered_views import views_of_frames, views_of_orbit, views_of_path
+        from hsi_sc_nerf.export.trained_run import open_run
+        from hsi_sc_nerf.export.video import open_video
+
+        run = open_run(self.load_config)
+        looks = [find_look(name, run.dataset.wavelengths_nm) for name in self.video]
+        if self.camera_path is not None:
+            views = views_of_path(self.camera_path)
+        elif self.views == "orbit":
+            views = views_of_orbit(run, self.orbit_views, self.orbit_size)
+        else:
+            views = views_of_frames(run, self.views)
+
+        rows: list[dict[str, Any]] = []
+        files = [self.output_dir / f"{views.kind}-{look.name.replace(' ', '-')}.mp4" for look in looks]
+        with ExitStack() as stack:
+            growing = stack.enter_context(atomic_write(*files)) if files else []
+            videos = [stack.enter_context(open_video(path, self.frames_per_second)) for path in growing]
+            with progress_bar("rendering", "views", len(views)) as done:
+                for i, (name, camera) in enumerate(views):
+                    rendered = render_view(run.model, camera)
+                    if self.cubes != "none":
+                        write_view(self.output_dir, name, rendered, run.dataset, self.cubes)
+                    rows.append({"view": name, "valid": float(rendered.valid.float().mean())})
+                    if views.measured is not None:
+                        rows[-1] |= compare(self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands)
+                    for look, add in zip(looks, videos, strict=True):
+                        add(eight_bit(look.paint(rendered)))
+                    done(i + 1)
+        legends = {path.name: look.legend for path, look in zip(files, looks, strict=True)}
+        write_report(self.output_dir / "render", rows, legends)
+        Console().print(f"{len(views)} views: {escape(str(self.output_dir / 'render.md'))}")
