@@ -1,0 +1,160 @@
+"""The report of a run, gathered and written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from hsi_sc_nerf.data.atomic import atomic_write
+from hsi_sc_nerf.data.packed import PackedDataset
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
+from hsi_sc_nerf.report.blocks import CloudViewer, KeyFigure, Section
+from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
+from hsi_sc_nerf.report.comparison_section import comparison_key_figure, comparison_section
+from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section, read_json
+from hsi_sc_nerf.report.logs import read_scalars, stage_ends
+from hsi_sc_nerf.report.page import html_page
+from hsi_sc_nerf.report.rendering import HeldOutView
+from hsi_sc_nerf.report.settings import flat_settings, package_versions, settings_section
+from hsi_sc_nerf.report.training_section import training_section
+from hsi_sc_nerf.report.traits_section import traits_section
+from hsi_sc_nerf.report.view_sections import (
+    bands_section,
+    metric_key_figures,
+    spectra_section,
+    views_section,
+)
+
+CLOUD_POINTS = 50_000
+
+
+@dataclass(frozen=True)
+class ReportSources:
+    """What a report is made of, beside the run.
+
+    Attributes:
+        cloud: PLY of the run; None: ``point_cloud.ply`` in the run's folder, or else the surface is sampled.
+        comparison: ``comparison.json``; None: the one in the run's folder, if there is one.
+        traits: ``traits.json``; likewise.
+        views: how many held-out views to render; None for all.
+        points: how many points of the cloud to show.
+    """
+
+    cloud: Path | None = None
+    comparison: Path | None = None
+    traits: Path | None = None
+    views: int | None = None
+    points: int = CLOUD_POINTS
+
+
+def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
+    """Write the report of the run in ``folder``, whole or not at all.
+
+    Raises:
+        InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
+    """
+    if (sources.views is not None and sources.views < 1) or sources.points < 1:
+        raise InputError("--views and --points must be at least 1.")
+    comparison_path = _given_or_beside(sources.comparison, folder / "comparison.json", "hsi-sc-nerf compare")
+    traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
+    comparison, traits = (read_json(path) if path else None for path in (comparison_path, traits_path))
+    # What they lack is told before minutes are spent on rendering.
+    results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
+
+    from hsi_sc_nerf.export.trained_run import open_run
+
+    run = open_run(folder / "config.yml")
+    held_out = len(run.manager.eval_dataset)
+    cloud = _cloud(run, folder, sources)
+    views = _rendered(run, min(held_out, sources.views or held_out))
+    scores, dataset = [view.scores for view in views], run.dataset
+    sections = [
+        object_section(cloud, sources.points),
+        views_section(views, held_out),
+        bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
+        spectra_section(views[len(views) // 2], dataset.wavelengths_nm, dataset.uncertainty),
+        *results,
+        training_section(read_scalars(folder), stage_ends(folder)),
+        calibration_section(dataset),
+        masks_section(dataset),
+        poses_section(dataset),
+        _settings(folder),
+    ]
+    key_figures = [*metric_key_figures(scores), *_data_key_figures(dataset)]
+    if comparison is not None:
+        key_figures.append(comparison_key_figure(comparison))
+    page = html_page(
+        f"{dataset.object_name}: hyperspectral 3D reconstruction", _subtitle(dataset), key_figures, sections
+    )
+    with atomic_write(output) as (temporary,):
+        temporary.write_text(page, encoding="utf-8")
+
+
+def object_section(cloud: SpectralCloud, points: int) -> Section:
+    """The cloud in 3D, thinned to ``points``."""
+    shown = thinned(cloud, points)
+    spectra = compress_spectra(shown.spectra)
+    caption = (
+        f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
+        f"which changes reflectance by {spectra.rmse:.1e} (root mean square; at most {spectra.largest_error:.1e})."
+    )
+    return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)])
+
+
+def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path | None:
+    """The file that was asked for, or the one in the run's folder where there is one."""
+    if given is None:
+        return beside if beside.is_file() else None
+    if not given.is_file():
+        raise InputError(f"{given}: there is no such file; make it with `{command}`.")
+    return given
+
+
+def _cloud(run: Any, folder: Path, sources: ReportSources) -> SpectralCloud:
+    from hsi_sc_nerf.report.rendering import sample_cloud
+
+    path = sources.cloud or folder / "point_cloud.ply"
+    if sources.cloud is not None or path.is_file():
+        return read_spectral_ply(path)
+    return sample_cloud(run, sources.points)
+
+
+def _rendered(run: Any, count: int) -> Sequence[HeldOutView]:
+    """Held-out views, with a bar that tells the time left."""
+    from hsi_sc_nerf.report.rendering import render_held_out
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    with Progress(TextColumn("[bold]rendering held-out views"), *columns, console=Console(stderr=True)) as progress:
+        return list(progress.track(render_held_out(run, count), total=count))
+
+
+def _subtitle(dataset: PackedDataset) -> str:
+    low, high = dataset.wavelengths_nm.min(), dataset.wavelengths_nm.max()
+    return f"{len(dataset.frames)} frames of {dataset.intrinsics.w} x {dataset.intrinsics.h} pixels, " + (
+        f"{len(dataset.wavelengths_nm)} bands from {low:.0f} to {high:.0f} nm, dataset {dataset.root}"
+    )
+
+
+def _data_key_figures(dataset: PackedDataset) -> list[KeyFigure]:
+    errors = [e for frame in dataset.frames if (e := frame.reprojection_error_px) is not None]
+    if not errors:
+        return []
+    return [KeyFigure(f"{np.sqrt(np.mean(np.square(errors))):.3f} px", "reprojection error")]
+
+
+def _settings(folder: Path) -> Section:
+    import yaml
+    from nerfstudio.configs.method_configs import all_methods
+
+    from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
+
+    config = yaml.load((folder / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
+    defaults = flat_settings(all_methods[config.method_name])
+    return settings_section(flat_settings(config), defaults, describe_machine() | package_versions())

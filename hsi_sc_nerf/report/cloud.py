@@ -1,0 +1,166 @@
+"""A spectral cloud made small enough for a page: fewer points, and spectra as numbers of 16 bits in a basis."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int16, UInt16
+from matplotlib import colormaps
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.ply import SpectralCloud
+from hsi_sc_nerf.spectra.bands import covered
+from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.viewer.pictures import INDEX_COLOURS
+
+_INT16 = 32767
+_MISSING = 65535
+# Neither a screen nor an instrument shows less reflectance than this.
+TOLERANCE = 5e-4
+MAX_RANK = 32
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedSpectra:
+    """Spectra as ``mean + (coefficients * scale) @ basis``.
+
+    Attributes:
+        mean: mean spectrum.
+        basis: orthonormal rows, those of the largest variance first.
+        scale: reflectance of one count of each coefficient.
+        coefficients: counts.
+        rmse: root mean square of what was lost, reflectance.
+        largest_error: of any value, reflectance.
+    """
+
+    mean: Float[np.ndarray, "bands"]
+    basis: Float[np.ndarray, "rank bands"]
+    scale: Float[np.ndarray, "rank"]
+    coefficients: Int16[np.ndarray, "n rank"]
+    rmse: float
+    largest_error: float
+
+
+def compress_spectra(
+    spectra: Float[np.ndarray, "n bands"], tolerance: float = TOLERANCE, max_rank: int = MAX_RANK
+) -> CompressedSpectra:
+    """Principal components as many as it takes to bring the root mean square error of every band below ``tolerance``.
+
+    Spectra of natural surfaces need few: they are smooth. Noise needs all, so there is a largest rank; what was lost
+    is told.
+
+    Args:
+        spectra: reflectance, finite.
+        tolerance: reflectance.
+        max_rank: most components to take.
+    """
+    mean = spectra.mean(axis=0, dtype=float)
+    centred = spectra - mean
+    variances, vectors = np.linalg.eigh(centred.T @ centred / len(spectra))
+    variances, basis = np.maximum(variances[::-1], 0.0), vectors[:, ::-1].T
+    # Variance of each band that the components from each on hold together.
+    held = np.cumsum((variances[:, None] * basis**2)[::-1], axis=0)[::-1]
+    good = np.flatnonzero(np.append(held, np.zeros((1, held.shape[1])), axis=0).max(axis=1) <= tolerance**2)
+    rank = int(np.clip(good[0], 1, max_rank))
+    basis = basis[:rank]
+    coefficients = centred @ basis.T
+    scale = np.maximum(np.abs(coefficients).max(axis=0), np.finfo(np.float32).tiny) / _INT16
+    counts = np.rint(coefficients / scale).astype(np.int16)
+    lost = (counts * scale) @ basis - centred
+    return CompressedSpectra(
+        mean, basis, scale, counts, float(np.sqrt(np.mean(lost**2))), float(np.abs(lost).max(initial=0.0))
+    )
+
+
+def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], float, float]:
+    """Values in 65535 steps from their smallest to their largest, which follow; NaN and infinity are 65535."""
+    finite = np.isfinite(values)
+    low, high = (float(f(values[finite])) for f in (np.min, np.max)) if finite.any() else (0.0, 1.0)
+    shares = (np.where(finite, values, low) - low) / ((high - low) or 1.0)
+    return np.where(finite, np.rint(shares * (_MISSING - 1)), _MISSING).astype(np.uint16), low, high
+
+
+def thinned(cloud: SpectralCloud, max_points: int, seed: int = 0) -> SpectralCloud:
+    """At most ``max_points`` of the points that have a whole spectrum, drawn at random: an even cloud stays even.
+
+    Raises:
+        InputError: no point has a whole spectrum.
+    """
+    whole = np.flatnonzero(np.isfinite(cloud.spectra).all(axis=1) & np.isfinite(cloud.points).all(axis=1))
+    if not len(whole):
+        raise InputError("the cloud has no point with a spectrum; export it again from the run.")
+    if len(whole) > max_points:
+        whole = np.sort(np.random.default_rng(seed).choice(whole, max_points, replace=False))
+    return SpectralCloud(
+        cloud.points[whole],
+        cloud.normals[whole],
+        cloud.colours[whole],
+        cloud.spectra[whole],
+        cloud.wavelengths_nm,
+        {name: values[whole] for name, values in cloud.extra.items()},
+    )
+
+
+def _base64(array: np.ndarray) -> str:
+    """Bytes of an array, little-endian, in base64."""
+    return base64.b64encode(np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()).decode()
+
+
+def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequence[float] | None) -> dict[str, Any]:
+    """A number of each point; ``drawn`` is what the ends of the colour map stand for, all of them without it."""
+    counts, low, high = quantise(values)
+    return {
+        "name": name,
+        "tells": tells,
+        "data": _base64(counts),
+        "range": [low, high],
+        "drawn": drawn or [low, high],
+    }
+
+
+def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str, Any]:
+    """What the page's viewer reads (``templates/cloud_data.js``), ready for JSON.
+
+    Args:
+        cloud: the points to show (`thinned`).
+        spectra: of the same points.
+    """
+    order = np.argsort(cloud.wavelengths_nm)
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
+    lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
+    scalars = [
+        _scalar(
+            index.name,
+            f"{index.expression}: {index.tells}",
+            index_values(index, cloud.spectra, cloud.wavelengths_nm),
+            index.drawn_range,
+        )
+        for index in INDICES.values()
+        if covered(cloud.wavelengths_nm, index.wavelengths_nm).all()
+    ]
+    scalars += [_scalar(name, "column of the cloud", values, None) for name, values in cloud.extra.items()]
+    return {
+        "count": len(cloud.points),
+        "centre_m": centre.tolist(),
+        "reach_m": reach_m,
+        "positions": _base64(np.rint((cloud.points - centre) / reach_m * _INT16).astype(np.int16)),
+        "normals": _base64(np.rint(cloud.normals / lengths * 127.0).astype(np.int8)),
+        "wavelengths_nm": cloud.wavelengths_nm[order].tolist(),
+        "mean": spectra.mean[order].tolist(),
+        "rank": len(spectra.basis),
+        "basis": _base64((spectra.scale[:, None] * spectra.basis[:, order]).astype(np.float32)),
+        "coefficients": _base64(spectra.coefficients),
+        "composites": [
+            {"name": c.name, "tells": c.shows, "nm": list(c.wavelengths_nm)}
+            for c in COMPOSITES.values()
+            if covered(cloud.wavelengths_nm, c.wavelengths_nm).all()
+        ],
+        "scalars": scalars,
+        "colour_map": _base64(np.rint(255.0 * colormaps[INDEX_COLOURS](np.arange(256))[:, :3]).astype(np.uint8)),
+    }

@@ -1,0 +1,89 @@
+"""Section on the object's traits: what `hsi-sc-nerf traits` found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.report.blocks import Missing, Section, Table
+
+_UNITS = {"m": "m", "m2": "m²", "l": "L", "rad": "rad", "deg": "°", "nm": "nm", "percent": "%"}
+_COMMAND = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
+# How traits were measured is no trait.
+_NOT_SHOWN = ("settings", "version")
+
+Row = tuple[str, str, str, str]
+
+
+def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None) -> Section:
+    """Whatever was found of the object's shape and spectra.
+
+    Args:
+        traits: what ``traits.json`` holds; None where there is none.
+        source: that file, for the error's text.
+
+    Raises:
+        InputError: the file holds nothing that could be shown.
+    """
+    if traits is None:
+        return Section("traits", "Traits", [Missing("The object's traits were not measured.", _COMMAND)])
+    rows = list(trait_rows({key: part for key, part in traits.items() if key not in _NOT_SHOWN}))
+    if not rows:
+        raise InputError(f"{source}: holds no traits; make it again with `hsi-sc-nerf traits`.")
+    caption = "±: standard deviation, over resampled points for sizes and over the surface for spectra."
+    return Section("traits", "Traits", [Table(caption, ("", "value", "±", "unit"), rows)])
+
+
+def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> Iterator[Row]:
+    """Name, value, uncertainty and unit of everything in nested JSON.
+
+    An entry is a mapping with ``value`` (and perhaps ``uncertainty``, ``unit``, ``name``) or with ``mean`` and ``sd``,
+    or a bare value. What a mapping has under ``KEY_sd`` is the spread of what it has under ``KEY``. A bare value's
+    unit is the end of its key. What is null is left out.
+
+    Args:
+        content: the JSON.
+        path: keys that lead to it.
+        spread: of the same shape as ``content``, or None.
+    """
+    if isinstance(content, Mapping) and content.keys() & {"value", "mean"}:
+        value, sd = content.get("value", content.get("mean")), content.get("uncertainty", content.get("sd"))
+        name = str(content.get("name", _words(path)))
+        yield name, _text(value), _text(sd), str(content.get("unit", _unit(path)))
+    elif isinstance(content, Mapping):
+        for key, part in content.items():
+            if not (key.endswith("_sd") and key.removesuffix("_sd") in content):
+                inner = spread.get(key) if isinstance(spread, Mapping) else content.get(f"{key}_sd")
+                yield from trait_rows(part, (*path, key), inner)
+    elif isinstance(content, list) and any(isinstance(part, Mapping) for part in content):
+        for number, part in enumerate(content, start=1):
+            yield from trait_rows(part, (*path, str(number)))
+    elif content is not None:
+        yield _words(path), _text(content), _text(spread), _unit(path)
+
+
+def _unit(path: tuple[str, ...]) -> str:
+    """Of the innermost key that ends in one."""
+    return next((unit for key in reversed(path) if (unit := _UNITS.get(key.rpartition("_")[2]))), "")
+
+
+def _words(path: tuple[str, ...]) -> str:
+    """Keys as words, without their units."""
+    names = (key.rpartition("_")[0] if key.rpartition("_")[2] in _UNITS and "_" in key else key for key in path)
+    return ", ".join(name.replace("_", " ") for name in names)
+
+
+def _text(value: Any) -> str:
+    """Numbers with four digits, lists with commas, nothing for nothing."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(_text(part) for part in value)
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "-"
+    return str(value)

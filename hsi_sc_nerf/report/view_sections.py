@@ -1,0 +1,237 @@
+"""Sections on held-out views: pictures, tables, curves by band, spectra with their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from markupsafe import Markup
+
+from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.report.blocks import Block, Figure, KeyFigure, Paragraph, Section, Table
+from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
+from hsi_sc_nerf.report.embed import embedded_array
+from hsi_sc_nerf.report.places import PlaceSpectra
+from hsi_sc_nerf.report.rendering import HeldOutView
+from hsi_sc_nerf.report.scores import ViewScores, object_angles, over_views, spread_of_views
+from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, coloured
+
+PICTURED_VIEWS = 4
+_ERROR_DRAWN = (0.0, 0.1)
+_ERROR_COLOURS = "viridis"
+_MARGIN = 0.12
+_HISTOGRAM_BINS = 60
+_PERCENTILE_DRAWN = 99.5
+# The paper's table (section "Spectral Evaluation"), in its order and with its units, then other readings.
+_METRICS = {
+    "sam": ("SAM (rad)", "{:.4f}"),
+    "rmse": ("RMSE", "{:.4f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "psnr": ("PSNR (dB)", "{:.1f}"),
+    "rmse_pixel_mean": ("RMSE, mean over pixels", "{:.4f}"),
+    "ssim_windowed": ("SSIM, 11 px windows", "{:.3f}"),
+}
+# Okabe and Ito's colours as the style sheet has them, to mark places in pictures.
+_PLACE_RGB = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (0, 0, 0))
+_MARKED_PX = 480
+
+
+def mean_and_sd(views: Sequence[ViewScores], metric: str) -> tuple[float, float]:
+    """Of a metric over the views; the deviation of a sample, 0 for a single view."""
+    values = np.array([view.metrics[metric] for view in views])
+    return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else 0.0
+
+
+def metric_key_figures(views: Sequence[ViewScores]) -> list[KeyFigure]:
+    """The paper's four metrics of the object, for the head of the page."""
+    figures = []
+    for metric in ("sam", "rmse", "ssim", "psnr"):
+        name, pattern = _METRICS[metric]
+        mean, sd = mean_and_sd(views, metric)
+        figures.append(KeyFigure(f"{pattern.format(mean)} ± {pattern.format(sd)}", name))
+    return figures
+
+
+def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
+    """What was measured, what was rendered, and how they differ.
+
+    Args:
+        views: those that were rendered.
+        held_out: how many were held out.
+    """
+    number = f"all {held_out}" if held_out == len(views) else f"{len(views)} of the {held_out}"
+    blocks: list[Block] = [
+        Paragraph(f"The model has not seen these views. Scores are of {number} held-out views."),
+        _metrics_table([view.scores for view in views]),
+    ]
+    for index in spread_of_views(len(views), PICTURED_VIEWS):
+        view = views[index]
+        crop = around(view.scores.mask)
+        inside = torch.from_numpy(view.scores.mask[crop])
+        maps = (
+            (view.scores.angle_rad, ANGLE_DRAWN_RAD, ANGLE_COLOURS, "Map of the spectral angle"),
+            (view.scores.error, _ERROR_DRAWN, _ERROR_COLOURS, "Map of the error"),
+        )
+        pictures = [
+            embedded_array(view.measured_rgb[crop], f"{view.scores.name} as measured, pseudo-RGB"),
+            embedded_array(view.rendered_rgb[crop], f"{view.scores.name} as rendered, pseudo-RGB"),
+        ]
+        for values, drawn, colours, words in maps:
+            shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
+            picture = to_8_bit(coloured(shown, drawn, colours).numpy())
+            pictures.append(embedded_array(picture, f"{words} of {view.scores.name}"))
+        caption = (
+            f"{view.scores.name}: SAM {view.scores.metrics['sam']:.4f} rad, RMSE {view.scores.metrics['rmse']:.4f}. "
+            f"Angle from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad (light), error (root "
+            f"mean square over bands) from {_ERROR_DRAWN[0]:g} (dark) to {_ERROR_DRAWN[1]:g} (yellow); grey is not it."
+        )
+        blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error")))
+    return Section("views", "Held-out views", blocks)
+
+
+def around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+    """Lines and samples of the mask with a margin; everything where it is empty."""
+    lines, samples = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(lines):
+        return slice(None), slice(None)
+    margin = round(_MARGIN * max(np.ptp(lines), np.ptp(samples))) + 1
+    return tuple(slice(max(0, ends[0] - margin), ends[-1] + margin + 1) for ends in (lines, samples))  # type: ignore[return-value]
+
+
+def _metrics_table(views: Sequence[ViewScores]) -> Table:
+    rows = []
+    for metric, (name, pattern) in _METRICS.items():
+        cells = []
+        for prefix in ("", "full_"):
+            mean, sd = mean_and_sd(views, prefix + metric)
+            low, high = (f([view.metrics[prefix + metric] for view in views]) for f in (min, max))
+            cells += [f"{pattern.format(mean)} ± {pattern.format(sd)}"]
+            cells += [f"{pattern.format(low)} to {pattern.format(high)}"]
+        rows.append((name, *cells))
+    header = ("", "object: mean ± SD", "object: range", "whole frame: mean ± SD", "whole frame: range")
+    return Table(
+        "Metrics over the held-out views, as the paper defines them, and other readings below.", header, rows
+    )
+
+
+def bands_section(
+    views: Sequence[ViewScores],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    typical_uncertainty: Float[np.ndarray, "bands"] | None,
+) -> Section:
+    """Curves by band of the object's error, PSNR and SSIM, and the histogram of the spectral angle."""
+    rmse = [Curve("RMSE, mean ± SD over views", wavelengths_nm, *over_views([view.rmse for view in views]))]
+    caption = "Root mean square error of the object's reflectance by band."
+    if typical_uncertainty is not None:
+        rmse.append(Curve("noise of the measurement", wavelengths_nm, typical_uncertainty, dashed=True))
+        caption += " The measured pixels have noise of their own: no rendering can lie below the dashed line."
+    blocks: list[Block] = []
+    psnr, ssim = (
+        [Curve("mean ± SD over views", wavelengths_nm, *over_views([getattr(view, name) for view in views]))]
+        for name in ("psnr_db", "ssim")
+    )
+    for curves, y_label, words, from_zero in (
+        (rmse, "RMSE of reflectance", caption, True),
+        (
+            psnr,
+            "PSNR (dB)",
+            "Peak signal-to-noise ratio of the object's reflectance by band, for a peak of 1.",
+            False,
+        ),
+        (ssim, "SSIM", "Structural similarity of the object by band, moments over all of its pixels.", False),
+    ):
+        chart = line_chart(
+            curves, x_label="wavelength (nm)", y_label=y_label, alt=f"{y_label} by wavelength", from_zero=from_zero
+        )
+        blocks.append(Figure([chart], words))
+    angles = object_angles(views)
+    if len(angles):
+        blocks.append(Figure([_angle_histogram(angles)], _angles_in_words(angles)))
+    return Section("bands", "Accuracy by band and pixel", blocks)
+
+
+def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
+    top = max(float(np.percentile(angles, _PERCENTILE_DRAWN)), 1e-6)
+    counts, edges = np.histogram(angles, _HISTOGRAM_BINS, (0.0, top))
+    return bar_chart(
+        edges,
+        100.0 * counts / len(angles),
+        x_label="spectral angle (rad)",
+        y_label="share of pixels (%)",
+        alt="Histogram of the spectral angle over the object's pixels",
+        marks={"mean": float(angles.mean())},
+    )
+
+
+def _angles_in_words(angles: Float[np.ndarray, "n"]) -> str:
+    middle, high = np.percentile(angles, (50.0, 95.0))
+    return (
+        f"Spectral angle between measurement and rendering, {len(angles)} pixels of the object: mean "
+        f"{angles.mean():.4f}, median {middle:.4f}, 95th percentile {high:.4f} rad. The largest "
+        f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
+    )
+
+
+def spectra_section(
+    view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], uncertainty: ReflectanceUncertainty | None
+) -> Section:
+    """Measured and rendered spectra of some places of one view, with how much they vary there."""
+    pictures = [embedded_array(_marked(view), f"{view.scores.name} with the places marked")]
+    titles = [f"{view.scores.name}: the places"]
+    for i, place in enumerate(view.places):
+        pictures.append(_spectrum_chart(place, wavelengths_nm, uncertainty, i))
+        titles.append(f"{chr(ord('A') + i)}: line {place.line}, sample {place.sample}, {place.pixels} pixels")
+    caption = (
+        "Reflectance over wavelength. Solid with a band: measured, mean and standard deviation over the pixels of "
+        "the place, that is noise and texture together. Dashed: rendered, mean over the same pixels."
+    )
+    if uncertainty is not None:
+        caption += " Thin lines: the noise that one pixel should have by the calibration, around the mean."
+    return Section("spectra", "Spectra with uncertainty", [Figure(pictures, caption, titles)])
+
+
+def _spectrum_chart(
+    place: PlaceSpectra,
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    uncertainty: ReflectanceUncertainty | None,
+    colour: int,
+) -> Markup:
+    curves = [
+        Curve("measured, mean ± SD", wavelengths_nm, place.measured, place.measured_sd, colour=colour),
+        Curve("rendered", wavelengths_nm, place.rendered, dashed=True, colour=6),
+    ]
+    if uncertainty is not None:
+        noise = uncertainty.standard_deviation(place.measured)
+        curves += [
+            Curve(name, wavelengths_nm, place.measured + side * noise, colour=colour, thin=True)
+            for name, side in (("noise of a pixel", 1.0), ("", -1.0))
+        ]
+    return line_chart(
+        curves,
+        x_label="wavelength (nm)",
+        y_label="reflectance",
+        alt=f"Measured and rendered spectrum at line {place.line}, sample {place.sample}",
+        from_zero=True,
+    )
+
+
+def _marked(view: HeldOutView) -> UInt8[np.ndarray, "h w 3"]:
+    """The measured picture round the object, enlarged, with a lettered ring at each place."""
+    lines, samples = around(view.scores.mask)
+    crop = np.ascontiguousarray(view.measured_rgb[lines, samples])
+    scale = max(1, round(_MARKED_PX / crop.shape[0]))
+    image = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    first_line, first_sample = lines.start or 0, samples.start or 0
+    for i, place in enumerate(view.places):
+        centre = ((np.array([place.sample - first_sample, place.line - first_line]) + 0.5) * scale).astype(int)
+        radius = max(6, round(scale * np.sqrt(place.pixels / np.pi)))
+        x, y = (int(value) for value in centre)
+        letter, corner = chr(ord("A") + i), (x + radius + 3, y + 5)
+        for colour, width in (((255, 255, 255), 4), (_PLACE_RGB[i % len(_PLACE_RGB)], 2)):
+            cv2.circle(image, (x, y), radius, colour, width, cv2.LINE_AA)
+            cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
+    return image
