@@ -55,8 +55,8 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
     points, facing = thinned(np.asarray(points_m, float), np.asarray(normals, float), spacing_m)
     if len(points) < NEIGHBOURS:
         raise InputError(
-            f"only {len(points)} points are left at a smoothing radius of {config.smoothing_radius_m} m; the cloud is "
-            "too small for it: check that it is in metres, or lower the radius."
+            f"the cloud is too small for a smoothing radius of {config.smoothing_radius_m} m, which leaves "
+            f"{len(points)} points; check that it is in metres, or lower the radius."
         )
     points, outward = smoothed(points, facing, config.smoothing_radius_m)
     base_points, base_normals = find_base(points, outward, config.base_height_m).points(spacing_m)

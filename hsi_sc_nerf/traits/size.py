@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -72,7 +72,7 @@ def size_spread(
     config: MeshConfig,
     resamples: int,
     seed: int = 0,
-    track: Callable[[Iterable[int]], Iterable[int]] = iter,
+    done: Callable[[int], None] | None = None,
 ) -> Size:
     """Standard deviation of each size over bootstrap resamples of the points (Efron 1979).
 
@@ -86,13 +86,15 @@ def size_spread(
         config: of the mesh.
         resamples: how many, at least 2.
         seed: of the resampling.
-        track: wraps the numbers of the resamples, for a progress bar.
+        done: is told how many resamples are done, for a progress bar.
     """
     rng = np.random.default_rng(seed)
     config = replace(config, octree_depth=min(config.octree_depth, BOOTSTRAP_DEPTH))
     sizes = []
-    for _ in track(range(resamples)):
+    for number in range(resamples):
         chosen = rng.integers(len(points_m), size=len(points_m))
         mesh = closed_mesh(points_m[chosen], normals[chosen], config)
         sizes.append(list(asdict(size_of(mesh)).values()))
+        if done is not None:
+            done(number + 1)
     return Size(*np.std(sizes, axis=0, ddof=1).tolist())

@@ -1,0 +1,141 @@
+"""``hsi-sc-nerf traits``: a spectral cloud in, what a plant scientist reports out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.traits.poisson import MeshConfig
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.traits.analysis import Traits
+    from hsi_sc_nerf.traits.size import Size
+    from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
+
+
+@dataclass(frozen=True)
+class TraitsCommand:
+    """Measure an object's size, and the spectra, indices and classes on its surface, from its spectral cloud.
+
+    Writes traits.md (start here), traits.json, spectra.csv, mesh.ply and pictures.
+    """
+
+    cloud: tyro.conf.Positional[Path]
+    """Spectral point cloud (PLY, metres), as `ns-export pointcloud` writes it."""
+    output_dir: Path
+    """Folder to write the results to."""
+    data: Path | None = None
+    """The dataset that the cloud was reconstructed from: tells how high the container is that the object stands on,
+    unless --mesh.base-height-m does."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the mesh is made."""
+    resamples: int = 10
+    """How often the points are resampled for the uncertainty of area, volume and diameters; 0 leaves it out."""
+    library: Path | None = None
+    """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
+    nm, then a column a class)."""
+    classes: tuple[str, ...] = ()
+    """Names of the library's spectra to use; all where none is named."""
+    angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD
+    """Largest spectral angle, in radians, between a place's spectrum and its class's."""
+    smallest_region_cm2: float = 0.05
+    """Connected regions of a class below this area are not listed (their area still counts)."""
+    roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
+    """A region to report the spectrum of: its name, x, y and z of its middle and its radius, all in metres; give it
+    again for each region."""
+    roi_file: Path | None = None
+    """More such regions, as a YAML file with lines like `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
+
+    def main(self) -> None:
+        """Measure and write.
+
+        Raises:
+            InputError: a file or a number cannot be used, or the results cannot be written.
+        """
+        from hsi_sc_nerf.export.ply import read_spectral_ply
+        from hsi_sc_nerf.export.progress import progress_bar
+        from hsi_sc_nerf.traits.analysis import analyse, classified
+        from hsi_sc_nerf.traits.library import read_library
+        from hsi_sc_nerf.traits.poisson import closed_mesh
+        from hsi_sc_nerf.traits.regions import picked_region, read_regions
+        from hsi_sc_nerf.traits.size import size_of, size_spread
+        from hsi_sc_nerf.traits.spectral_mesh import with_spectra
+
+        self._check()
+        picked = [picked_region(*words) for words in self.roi]
+        picked += read_regions(self.roi_file) if self.roi_file else []
+        library = read_library(self.library) if self.library else None
+        if library is not None and self.classes:
+            library = library.only(self.classes)
+        config = replace(self.mesh, base_height_m=self._base_height_m())
+        cloud = read_spectral_ply(self.cloud)
+
+        console = Console(stderr=True)
+        with console.status("closing the surface"):
+            mesh = closed_mesh(cloud.points, cloud.normals, config)
+        size, spread = size_of(mesh), None
+        if self.resamples:
+            with progress_bar("resampling", "meshes", self.resamples) as done:
+                spread = size_spread(cloud.points, cloud.normals, config, self.resamples, done=done)
+        with console.status("spectra on the surface"):
+            surface = with_spectra(mesh, cloud, config.smoothing_radius_m)
+            found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
+            traits = analyse(surface, picked, found)
+        with console.status("tables and pictures"):
+            self._write(surface, size, spread, traits, config)
+        console.print(f"Traits, with pictures: {self.output_dir / 'traits.md'}", soft_wrap=True)
+
+    def _check(self) -> None:
+        """Refuse now what would fail after minutes."""
+        if self.resamples < 0 or self.resamples == 1:
+            raise InputError(f"--resamples is {self.resamples}; give 0 for none, or at least 2.")
+        if not 4 <= self.mesh.octree_depth <= 12:
+            raise InputError(f"--mesh.octree-depth is {self.mesh.octree_depth}; it must be from 4 to 12.")
+        if not self.mesh.smoothing_radius_m > 0.0:
+            raise InputError(f"--mesh.smoothing-radius-m is {self.mesh.smoothing_radius_m}; it must be more than 0.")
+        if self.classes and self.library is None:
+            raise InputError("--classes names spectra of a library; give it with --library.")
+
+    def _base_height_m(self) -> float | None:
+        """Height of what the object stands on, where it is known."""
+        if self.mesh.base_height_m is not None or self.data is None:
+            return self.mesh.base_height_m
+        from hsi_sc_nerf.data.packed import open_packed
+
+        container = open_packed(self.data).container
+        return container.height_m if container else None
+
+    def _write(
+        self, surface: SpectralMesh, size: Size, spread: Size | None, traits: Traits, config: MeshConfig
+    ) -> None:
+        """Pictures, the mesh and tables; the page, which names them, comes last."""
+        from hsi_sc_nerf.traits import pictures, report
+        from hsi_sc_nerf.traits.spectral_mesh import write_mesh
+
+        views = pictures.SideViews(surface.mesh)
+        drawn = {}
+        if traits.classes is not None:
+            drawn["Classes"] = "classes.png"
+            pictures.draw_classes(self.output_dir / "classes.png", traits.classes, surface, views)
+        drawn["Spectra of regions"] = "region_spectra.png"
+        pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
+        for caption, name, draw, table in (
+            ("Composites", "composites.png", pictures.draw_composites, traits.composites),
+            ("Indices", "indices.png", pictures.draw_indices, traits.indices),
+        ):
+            if any(table.values()):
+                draw(self.output_dir / name, surface, views, traits)
+                drawn[caption] = name
+        extra = {} if traits.classes is None else {"class": traits.classes.labels.astype("float32")}
+        write_mesh(self.output_dir / "mesh.ply", surface, extra)
+        report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
+        watertight = surface.mesh.is_watertight()
+        settings = {"cloud": self.cloud.name, **asdict(config), "resamples": self.resamples}
+        report.write_traits_json(self.output_dir / "traits.json", size, spread, watertight, traits, settings)
+        report.write_page(self.output_dir / "traits.md", self.cloud.name, size, spread, watertight, traits, drawn)
