@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
+from page import write_table
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -30,7 +31,6 @@ from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
-TABLE_STARTS, TABLE_ENDS = "<!-- calibration accuracy -->", "<!-- end of calibration accuracy -->"
 FALLOFF = "{illumination_falloff: {edge_loss: 0.2}}"
 DRIFT = "{lamp_drift: {percent: -6, temperature_change_k: -80}}"
 SENSOR = (
@@ -89,11 +89,7 @@ class CalibrationAccuracy:
         Console().print(table)
         print(json.dumps({name: asdict(score) for name, score in scores.items()}))
         if self.page is not None:
-            lines = [COLUMNS, ["---"] * len(COLUMNS), *rows]
-            text = "\n".join(f"| {' | '.join(row)} |" for row in lines)
-            before, rest = self.page.read_text(encoding="utf-8").split(TABLE_STARTS)
-            after = rest.split(TABLE_ENDS)[1]
-            self.page.write_text(f"{before}{TABLE_STARTS}\n{text}\n{TABLE_ENDS}{after}", encoding="utf-8")
+            write_table(self.page, "calibration accuracy", COLUMNS, rows)
 
     def _score(self, effects: tuple[str, ...], config: CalibrationConfig) -> CalibrationScore:
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects)

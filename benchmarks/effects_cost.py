@@ -18,6 +18,7 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Bool, Float
+from page import write_table
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -27,7 +28,6 @@ from hsi_sc_nerf.simulate.effects import EFFECTS
 from hsi_sc_nerf.simulate.frames import Capture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 
-TABLE_STARTS, TABLE_ENDS = "<!-- table -->", "<!-- end of table -->"
 COLUMNS = [
     "scene",
     "effect",
@@ -65,11 +65,7 @@ class EffectsCost:
                 made = _make(override(scene, effects=(effect,)))
                 rows.append({"scene": name, "effect": effect, **_compare(plain, made)})
         self.page.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        text = self.page.read_text(encoding="utf-8")
-        before, rest = text.split(TABLE_STARTS)
-        table = "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *_cells(rows)))
-        after = rest.split(TABLE_ENDS)[1]
-        self.page.write_text(f"{before}{TABLE_STARTS}\n{table}\n{TABLE_ENDS}{after}", encoding="utf-8")
+        write_table(self.page, "table", COLUMNS, _cells(rows))
         shown = Table(*COLUMNS)
         for cells in _cells(rows):
             shown.add_row(*cells)

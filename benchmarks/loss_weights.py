@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from page import write_table
 from rich.console import Console
 from rich.table import Table
 
@@ -20,12 +21,10 @@ from hsi_sc_nerf.data.process import process_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.benchmark.configurations import Configuration, named_configuration
 from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
-from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_words, markdown_table
+from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_words
 from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
-
-TABLE_STARTS, TABLE_ENDS = "<!-- loss weights -->", "<!-- end of loss weights -->"
 
 METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 2)}
 
@@ -117,22 +116,18 @@ class LossWeights:
             shown.add_row(*row)
         Console(width=200).print(shown)
         if self.page is not None:
-            self._write(markdown_table(titles, rows), runs)
+            write_table(self.page, "loss weights", titles, rows, self._caption(runs))
 
-    def _write(self, table: str, runs: list[TrainedRun]) -> None:
+    def _caption(self, runs: list[TrainedRun]) -> str:
         ends = [run.checkpoints[-1] for run in runs]
         iterations = sorted(end.iteration for end in ends)
         seconds = sorted(end.train_seconds for end in ends)
         method = named_configuration(self.base).method
-        told = (
+        return (
             f"{self.frames} frames of {self.size} x {self.size} x {self.bands}; {method} {self.common}, "
             f"{iterations[0]} to {iterations[-1]} iterations in {seconds[0]:.0f} to {seconds[-1]:.0f} s of training; "
             f"{describe_in_words(describe_machine())}."
         )
-        assert self.page is not None
-        before, rest = self.page.read_text(encoding="utf-8").split(TABLE_STARTS)
-        after = rest.split(TABLE_ENDS)[1]
-        self.page.write_text(f"{before}{TABLE_STARTS}\n{table}\n\n{told}\n{TABLE_ENDS}{after}", encoding="utf-8")
 
 
 def weighted(base: str, angular: float, hsi: float) -> Configuration:

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
+from page import write_table
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -31,7 +32,6 @@ from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged, write_packed_cube
 from hsi_sc_nerf.data.pixels import PixelReader
 
-TABLE_STARTS, TABLE_ENDS = "<!-- pixel fetch -->", "<!-- end of pixel fetch -->"
 COLUMNS = ["read from", "cold, ms", "warm, ms", "warm, of float32 in RAM", "memory taken, MiB"]
 # Share of the free memory that the frames in RAM may take.
 RAM_SHARE = 0.7
@@ -139,12 +139,8 @@ class PixelFetch:
             table.add_row(*cells)
         Console(width=118).print(table)
         if self.page is not None:
-            text = self.page.read_text(encoding="utf-8")
-            before, rest = text.split(TABLE_STARTS)
-            lines = [f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
-            content = "\n".join([f"{title}; median of {self.repeats} batches.", "", *lines])
-            after = rest.split(TABLE_ENDS)[1]
-            self.page.write_text(f"{before}{TABLE_STARTS}\n{content}\n{TABLE_ENDS}{after}", encoding="utf-8")
+            caption = f"{title}; median of {self.repeats} batches."
+            write_table(self.page, "pixel fetch", COLUMNS, rows, caption)
 
 
 def _spy_pixels(headers: Sequence[Path]) -> Fetch:

@@ -9,7 +9,7 @@ camera's rotation and place, the error of the focal length, the reprojection err
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import tyro
 from jaxtyping import Float, UInt8
+from page import write_table
 from rich.console import Console
 from rich.table import Table
 
@@ -254,15 +255,6 @@ class PoseHardCases:
             f"{posed.seconds:.0f}",
             "; ".join([poses.model, *poses.report()["warnings"]]),
         )
-
-
-def write_table(page: Path, name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Put the rows between the page's two marks ``<!-- NAME -->`` and ``<!-- end of NAME -->``."""
-    starts, ends = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    before, rest = page.read_text(encoding="utf-8").split(starts)
-    after = rest.split(ends)[1]
-    table = "\n".join(f"| {' | '.join(cells)} |" for cells in (columns, ["---"] * len(columns), *rows))
-    page.write_text(f"{before}{starts}\n{table}\n{ends}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

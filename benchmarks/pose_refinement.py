@@ -24,6 +24,7 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
+from page import write_table
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
@@ -41,7 +42,6 @@ from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
-TABLE_STARTS, TABLE_ENDS = "<!-- pose refinement -->", "<!-- end of pose refinement -->"
 COLUMNS = {
     "poses": "{poses}",
     "refinement": "{mode}",
@@ -136,10 +136,7 @@ class PoseRefinementBenchmark:
             shown.add_row(*cells[-1])
         Console(width=160).print(shown)
         if self.page is not None:
-            before, rest = self.page.read_text(encoding="utf-8").split(TABLE_STARTS)
-            lines = "\n".join(f"| {' | '.join(line)} |" for line in (COLUMNS, ["---"] * len(COLUMNS), *cells))
-            after = rest.split(TABLE_ENDS)[1]
-            self.page.write_text(f"{before}{TABLE_STARTS}\n{lines}\n{TABLE_ENDS}{after}", encoding="utf-8")
+            write_table(self.page, "pose refinement", list(COLUMNS), cells)
 
     def _datasets(self) -> tuple[dict[Poses, Path], Truth]:
         """The session's dataset with each kind of poses, and the truth; the pixels are linked, not copied."""

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from pose_hard_cases import Case, grey_images, scene_of, write_table
+from page import write_table
+from pose_hard_cases import Case, grey_images, scene_of
 from poses_speed import pose_errors
 from rich.console import Console
 from rich.table import Table

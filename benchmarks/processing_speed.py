@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from page import write_table
 from rich.console import Console
 from rich.table import Table
 from spectral.io import envi
@@ -42,7 +43,6 @@ from hsi_sc_nerf.data.frames import FramePaths, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.session import Capture, Session, open_session
 
-TABLE_STARTS, TABLE_ENDS = "<!-- processing speed -->", "<!-- end of processing speed -->"
 COLUMNS = ["way", "frames", "workers", "a frame, ms", "of copying", "processor, ms", "of copying", "peak memory, MiB"]
 DARK_COUNTS, WHITE_COUNTS = 100, 3000
 MARKER_RANGE_NM = (450.0, 700.0)
@@ -103,11 +103,7 @@ class ProcessingSpeed:
             table.add_row(*line)
         Console(width=118).print(table)
         if self.page is not None:
-            text = self.page.read_text(encoding="utf-8")
-            before, rest = text.split(TABLE_STARTS)
-            lines = "\n".join(f"| {' | '.join(line)} |" for line in (COLUMNS, ["---"] * len(COLUMNS), *cells))
-            after = rest.split(TABLE_ENDS)[1]
-            self.page.write_text(f"{before}{TABLE_STARTS}\n{lines}\n{TABLE_ENDS}{after}", encoding="utf-8")
+            write_table(self.page, "processing speed", COLUMNS, cells)
 
 
 WAYS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}

@@ -1,0 +1,19 @@
+"""Tables of figures in the pages that tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def write_table(
+    page: Path, name: str, columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str | None = None
+) -> None:
+    """Put a table, and a line below it, between a page's two marks ``<!-- NAME -->`` and ``<!-- end of NAME -->``."""
+    starts, ends = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    before, rest = page.read_text(encoding="utf-8").split(starts)
+    after = rest.split(ends)[1]
+    lines = [f"| {' | '.join(cells)} |" for cells in (columns, ["---"] * len(columns), *rows)]
+    if caption is not None:
+        lines += ["", caption]
+    page.write_text("\n".join([before + starts, *lines, ends + after]), encoding="utf-8")
