@@ -40,9 +40,9 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None)
 def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> Iterator[Row]:
     """Name, value, uncertainty and unit of everything in nested JSON.
 
-    An entry is a mapping with ``value`` (and perhaps ``uncertainty``, ``unit``, ``name``) or with ``mean`` and ``sd``,
-    or a bare value. What a mapping has under ``KEY_sd`` is the spread of what it has under ``KEY``. A bare value's
-    unit is the end of its key. What is null is left out.
+    An entry is a mapping with ``value`` (and perhaps ``uncertainty``, ``unit``, ``name``) or with ``mean`` and
+    ``sd``, or it is a bare value. What a mapping has under ``KEY_sd`` is the spread of what it has under ``KEY``. A
+    bare value's unit is the end of its key. What is null is left out.
 
     Args:
         content: the JSON.

@@ -87,7 +87,7 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
         caption = (
             f"{view.scores.name}: SAM {view.scores.metrics['sam']:.4f} rad, RMSE {view.scores.metrics['rmse']:.4f}. "
             f"Angle from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad (light), error (root "
-            f"mean square over bands) from {_ERROR_DRAWN[0]:g} (dark) to {_ERROR_DRAWN[1]:g} (yellow); grey is not it."
+            f"mean square of bands) from {_ERROR_DRAWN[0]:g} (dark) to {_ERROR_DRAWN[1]:g} (yellow); grey is not it."
         )
         blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error")))
     return Section("views", "Held-out views", blocks)
