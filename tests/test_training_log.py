@@ -25,7 +25,7 @@ def events(tiny_dataset, tmp_path, monkeypatch):
 def test_events_of_a_run(events):
     tags = events.Tags()
     losses = ["hsi_loss", "angular_loss", "interlevel_loss", "distortion_loss"]
-    metrics = ["psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
+    metrics = ["sam", "rmse", "psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
     expected = {
         *(f"Train Loss Dict/{name}" for name in [*losses, "camera_opt_regularizer"]),
         *(f"Train Metrics Dict/{name}" for name in metrics),
@@ -34,7 +34,7 @@ def test_events_of_a_run(events):
         *("Eval Images Metrics Dict (all images)/sam", "Eval Metrics Dict/psnr", "Train Rays / Sec"),
     }
     assert expected <= set(tags["scalars"])
-    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "spectra")} <= set(tags["images"])
+    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error", "spectra")} <= set(tags["images"])
 
     rates = [event.value for event in events.Scalars("learning_rate/fields")]
     assert rates == pytest.approx([1e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each

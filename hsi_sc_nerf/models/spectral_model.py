@@ -30,12 +30,18 @@ from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalFie
 from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
 from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid, training_subspace
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
-from hsi_sc_nerf.models.metrics import spectral_angle_map, spectral_metrics
+from hsi_sc_nerf.models.metrics import (
+    spectral_angle_map,
+    spectral_angle_mapper,
+    spectral_metrics,
+    spectral_rmse,
+    squared_error_map,
+)
 from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement
 from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.viewer.panel import SpectralPanel
-from hsi_sc_nerf.viewer.pictures import ANGLE_DRAWN_RAD
+from hsi_sc_nerf.viewer.pictures import ANGLE_DRAWN_RAD, ERROR_DRAWN
 
 
 class SpectralModel(NerfactoModel):
@@ -195,10 +201,13 @@ class SpectralModel(NerfactoModel):
         return batch["spectral"].to(self.device), None if valid is None else valid.to(self.device)
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
-        """PSNR of the batch over all bands, distortion, size of the pose corrections."""
+        """SAM, RMSE and PSNR of the batch over all bands, distortion, size of the pose corrections."""
         with torch.no_grad():
             target, valid = self._measured(batch)
-            metrics = {"psnr": -10.0 * safe_log10(hsi_loss(outputs["spectral"], target, valid=valid))}
+            # As a picture of one line.
+            line = outputs["spectral"][None], target[None], None, None if valid is None else valid[None]
+            metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
+            metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
             metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
         self.camera_optimizer.get_metrics_dict(metrics)
@@ -239,9 +248,11 @@ class SpectralModel(NerfactoModel):
         metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth, None, valid).items()}
 
         angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_DRAWN_RAD[1]
+        error = squared_error_map(rendered, truth, valid).nan_to_num().sqrt()[..., None] / ERROR_DRAWN[1]
         images = {
             "img": torch.cat([truth[..., self.rgb_bands], rendered[..., self.rgb_bands]], dim=1).clamp(0.0, 1.0),
             "spectral_angle": colormaps.apply_colormap(angle.clamp(0.0, 1.0)),
+            "error": colormaps.apply_colormap(error.float().clamp(0.0, 1.0)),
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }

@@ -16,6 +16,8 @@ INDEX_COLOURS = "viridis"
 ANGLE_COLOURS = "magma"
 ANGLE_DRAWN_RAD = (0.0, 0.2)
 """Spectral angles at the two ends of the colours; twice ENVI's threshold for another material is white."""
+ERROR_DRAWN = (0.0, 0.1)
+"""Root mean squared errors of reflectance over the bands at the two ends of the colours."""
 BLANK = (0.25, 0.25, 0.25)
 """Colour of what has no value."""
 

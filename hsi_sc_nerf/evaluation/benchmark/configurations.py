@@ -20,10 +20,17 @@ if TYPE_CHECKING:
 OURS = "hsi-sc-nerf"
 PAPER = "hsi-sc-nerf-paper"
 
-# name: (method, words as after `ns-train METHOD`). After `ours`: ours with one departure from the paper taken away.
+# name: (method, words as after `ns-train METHOD`). After `ours`: ours with a departure from the paper taken away, then
+# with one option that it does without.
 CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "paper": (PAPER, ""),
     "ours": (OURS, ""),
+    "ours-unbounded-scene": (
+        OURS,
+        "--pipeline.datamanager.dataparser.scene cameras --pipeline.model.disable-scene-contraction False "
+        "--pipeline.model.proposal-initial-sampler piecewise --pipeline.model.far-plane 5.0 "
+        "--pipeline.model.num-proposal-samples-per-ray 256 96 --pipeline.model.num-nerf-samples-per-ray 48",
+    ),
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
     "ours-not-view-dependent": (OURS, "--pipeline.model.view-dependent False"),
@@ -35,6 +42,11 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-foreground-only": (OURS, "--masked.foreground-share 1.0"),
     "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
     "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
+    "ours-measured-poses": (OURS, "--pipeline.model.camera-optimizer.mode off"),
+    "ours-learned-basis": (OURS, "--pipeline.model.learn-basis True"),
+    "ours-averaged-weights": (OURS, "--ema-decay 0.99"),
+    "ours-weighted-bands": (OURS, "--pipeline.model.weigh-bands True"),
+    "ours-robust-losses": (OURS, "--pipeline.model.hsi-loss charbonnier --pipeline.model.angular-loss angle"),
 }
 
 
