@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 OURS = "hsi-sc-nerf"
 PAPER = "hsi-sc-nerf-paper"
 
-# name: (method, words as after `ns-train METHOD`). After `ours`: ours with a departure from the paper taken away, then
-# with one option that it does without.
+# name: (method, words as after `ns-train METHOD`). After `ours`: ours with one departure from the paper taken away,
+# then with one option that it does without.
 CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "paper": (PAPER, ""),
     "ours": (OURS, ""),
