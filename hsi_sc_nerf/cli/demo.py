@@ -12,11 +12,9 @@ from rich.console import Console
 from hsi_sc_nerf.cli.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
 from hsi_sc_nerf.errors import InputError
 
-# A smaller model than the method's default, for two cores.
+# Fewer rays a step than the method's default, for two cores, and schedules for a run of some hundred steps.
 DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
-    "pipeline.model.num-proposal-samples-per-ray": "48 24",
-    "pipeline.model.num-nerf-samples-per-ray": "24",
     "pipeline.model.proposal-warmup": "200",
     "pipeline.model.proposal-weights-anneal-max-num-iters": "100",
     "evaluate-stages": "False",
