@@ -46,13 +46,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures or charts that stand side by side, with a caption that tells their units."""
+    """Pictures or charts with a caption that tells their units."""
 
     kind: ClassVar[str] = "figure"
     pictures: Sequence[Markup]
     caption: str
     titles: Sequence[str] = ()
     """Of each picture, where they have any."""
+    columns: int = 1
+    """How many stand side by side on a wide screen."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 66.0, 14.0, 12.0, 46.0
 _LEGEND_ROW, _LETTER = 20.0, 7.0
 _TICKS = 6
 # Of the largest value that a logarithmic axis reaches down to: below, a curve that touches zero would use it all up.
-_SMALLEST_SHARE = 1e-7
+_SMALLEST_SHARE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,12 @@ def _log_ticks(low: float, high: float) -> list[float]:
     return ticks[:: max(1, math.ceil(len(ticks) / _TICKS))] if len(ticks) > 1 else [low, high]
 
 
-def _label(value: float, ticks: Sequence[float]) -> str:
+def _label(value: float, ticks: Sequence[float], logarithmic: bool = False) -> str:
     """A tick's number with as many digits as it takes to tell it from its neighbours."""
     if value == 0.0:
         return "0"
+    if logarithmic:
+        return f"{value:.2g}".replace("e-0", "e-")
     step = min((abs(b - a) for a, b in pairwise(ticks)), default=abs(value))
     if abs(value) >= 1e6 or abs(value) < 1e-4:
         return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
@@ -160,7 +162,7 @@ def _frame(x: _Axis, y: _Axis, x_label: str, y_label: str) -> Markup:
         at = float(y.place(tick))
         parts.append(Markup('<path class="grid" d="M{:.1f} {:.1f}H{:.1f}"/>').format(x.start, at, x.end))
         text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="end">{}</text>')
-        parts.append(text.format(x.start - 6.0, at + 4.0, _label(tick, y.ticks)))
+        parts.append(text.format(x.start - 6.0, at + 4.0, _label(tick, y.ticks, y.logarithmic)))
     for tick in x.ticks:
         at = float(x.place(tick))
         text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="middle">{}</text>')
@@ -178,14 +180,16 @@ def _frame(x: _Axis, y: _Axis, x_label: str, y_label: str) -> Markup:
 def _marks(marks: Mapping[str, float], x: _Axis, y: _Axis) -> Markup:
     """Named vertical lines."""
     parts = []
-    for name, value in marks.items():
+    for row, (name, value) in enumerate(marks.items()):
         if not x.low <= value <= x.high:
             continue
         at = float(x.place(value))
         right = at > (x.start + x.end) / 2.0
         parts.append(Markup('<path class="mark" d="M{:.1f} {:.1f}V{:.1f}"/>').format(at, y.start, y.end))
         text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>')
-        parts.append(text.format(at + (-4.0 if right else 4.0), y.end + 11.0, "end" if right else "start", name))
+        parts.append(
+            text.format(at + (-4.0 if right else 4.0), y.end + 11.0 + 14.0 * row, "end" if right else "start", name)
+        )
     return Markup("").join(parts)
 
 

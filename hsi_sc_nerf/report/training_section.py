@@ -6,13 +6,28 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hsi_sc_nerf.report.blocks import Block, Figure, Missing, Section
+from hsi_sc_nerf.report.blocks import Figure, Missing, Section
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.logs import Scalars, shortened
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
-_TRAIN_PSNR = "Train Metrics Dict/psnr"
-_CORRECTIONS = ("Train Metrics Dict/camera_opt_rotation_deg", "Train Metrics Dict/camera_opt_angle_max_deg")
+_CORRECTIONS = {
+    "Train Metrics Dict/camera_opt_rotation_deg": "rotation of the camera",
+    "Train Metrics Dict/camera_opt_angle_max_deg": "largest of the table's angles",
+}
+# Terms of the loss that never reach this share of its largest value say nothing.
+_LEAST_SHARE = 1e-5
+_PSNR = {
+    "Train Metrics Dict/psnr": "training rays",
+    "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
+    "Eval Images Metrics/psnr": "one held-out view",
+}
+_CORRECTIONS = {
+    "Train Metrics Dict/camera_opt_rotation_deg": "rotation of the camera",
+    "Train Metrics Dict/camera_opt_angle_max_deg": "largest of the table's angles",
+}
+# Terms of the loss that never reach this share of its largest value say nothing.
+_LEAST_SHARE = 1e-5
 _HELD_OUT_PSNR = ("Eval Images Metrics Dict (all images)/psnr", "Eval Images Metrics/psnr")
 
 
@@ -31,40 +46,36 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     def named(prefix: str) -> dict[str, str]:
         return {tag: tag.removeprefix(prefix).replace("_", " ") for tag in scalars if tag.startswith(prefix)}
 
-    charts = (
-        (
-            {"Train Loss": "sum"} | named(_LOSSES),
-            "loss",
-            True,
-            "Loss of the training batches: the weighted terms and their sum; no unit.",
-        ),
-        (
-            {_TRAIN_PSNR: "training rays", **dict.fromkeys(_HELD_OUT_PSNR, "held-out views")},
-            "PSNR (dB)",
-            False,
-            "Peak signal-to-noise ratio over all bands, dB. In the masked stage most rays are the object's, which is "
-            "harder than the chamber: the curve drops there.",
-        ),
-        (named(_RATES), "learning rate", True, "Learning rates of the groups of parameters."),
-        (
-            {tag: tag.rpartition("/")[2].removeprefix("camera_opt_").replace("_", " ") for tag in _CORRECTIONS},
-            "correction (degrees)",
-            False,
-            "Corrections of the poses: of the camera's rotation, and the largest of the turntable's angles.",
-        ),
-    )
-    blocks: list[Block] = []
-    for tags, y_label, logarithmic, caption in charts:
-        curves = [
-            Curve(name, *shortened(*scalars[tag])) for tag, name in tags.items() if np.any(_values(scalars, tag) != 0)
-        ]
+    charts, titles = [], []
+    for title, y_label, tags, logarithmic in (
+        ("Loss of training batches", "weighted loss", {"Train Loss": "sum"} | named(_LOSSES), True),
+        ("Peak signal-to-noise ratio", "PSNR (dB)", _PSNR, False),
+        ("Learning rates", "learning rate", named(_RATES), True),
+        ("Corrections of the poses", "correction (degrees)", _CORRECTIONS, False),
+    ):
+        curves = _curves(scalars, tags)
         if curves:
-            alt = f"{y_label} over the training steps"
-            chart = line_chart(curves, x_label="step", y_label=y_label, alt=alt, logarithmic=logarithmic, marks=marks)
-            blocks.append(Figure([chart], caption))
-    return Section("training", "Training", blocks)
+            charts.append(
+                line_chart(
+                    curves,
+                    x_label="step",
+                    y_label=y_label,
+                    alt=f"{title} over the training steps",
+                    logarithmic=logarithmic,
+                    marks=marks,
+                )
+            )
+            titles.append(title)
+    caption = (
+        "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage most "
+        "training rays are the object's: its loss and PSNR do not compare with those of whole frames."
+    )
+    return Section("training", "Training", [Figure(charts, caption, titles, columns=2)])
 
 
-def _values(scalars: Scalars, tag: str) -> np.ndarray:
-    """Values of a tag, none where it was not logged."""
-    return scalars[tag][1] if tag in scalars else np.zeros(0)
+def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
+    """Curves of the tags that were logged, but for those that stay tiny beside the largest."""
+    found = {name: scalars[tag] for tag, name in tags.items() if tag in scalars}
+    heights = {name: np.nanmax(np.abs(values), initial=0.0) for name, (_, values) in found.items()}
+    least = _LEAST_SHARE * max(heights.values(), default=0.0)
+    return [Curve(name, *shortened(*curve)) for name, curve in found.items() if heights[name] > least]

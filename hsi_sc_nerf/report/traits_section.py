@@ -60,7 +60,8 @@ def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> 
                 yield from trait_rows(part, (*path, key), inner)
     elif isinstance(content, list) and any(isinstance(part, Mapping) for part in content):
         for number, part in enumerate(content, start=1):
-            yield from trait_rows(part, (*path, str(number)))
+            label = f"{part['label']} {number}" if isinstance(part, Mapping) and "label" in part else str(number)
+            yield from trait_rows(part, (*path, label))
     elif content is not None:
         yield _words(path), _text(content), _text(spread), _unit(path)
 

@@ -67,6 +67,11 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
     blocks: list[Block] = [
         Paragraph(f"The model has not seen these views. Scores are of {number} held-out views."),
         _metrics_table([view.scores for view in views]),
+        Paragraph(
+            f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
+            f"(light), the error, root mean square over bands, from {_ERROR_DRAWN[0]:g} (dark) to "
+            f"{_ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object."
+        ),
     ]
     for index in spread_of_views(len(views), PICTURED_VIEWS):
         view = views[index]
@@ -84,12 +89,9 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
             shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
             picture = to_8_bit(coloured(shown, drawn, colours).numpy())
             pictures.append(embedded_array(picture, f"{words} of {view.scores.name}"))
-        caption = (
-            f"{view.scores.name}: SAM {view.scores.metrics['sam']:.4f} rad, RMSE {view.scores.metrics['rmse']:.4f}. "
-            f"Angle from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad (light), error (root "
-            f"mean square of bands) from {_ERROR_DRAWN[0]:g} (dark) to {_ERROR_DRAWN[1]:g} (yellow); grey is not it."
-        )
-        blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error")))
+        metrics = view.scores.metrics
+        caption = f"{view.scores.name}: SAM {metrics['sam']:.4f} rad, RMSE {metrics['rmse']:.4f}."
+        blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
     return Section("views", "Held-out views", blocks)
 
 
@@ -124,34 +126,33 @@ def bands_section(
     typical_uncertainty: Float[np.ndarray, "bands"] | None,
 ) -> Section:
     """Curves by band of the object's error, PSNR and SSIM, and the histogram of the spectral angle."""
-    rmse = [Curve("RMSE, mean ± SD over views", wavelengths_nm, *over_views([view.rmse for view in views]))]
-    caption = "Root mean square error of the object's reflectance by band."
+    rmse, psnr, ssim = (
+        [Curve("mean ± SD over views", wavelengths_nm, *over_views([getattr(view, name) for view in views]))]
+        for name in ("rmse", "psnr_db", "ssim")
+    )
+    caption = (
+        "Root mean square error of the object's reflectance, peak signal-to-noise ratio for a peak of 1, and "
+        "structural similarity with moments over all of the object's pixels."
+    )
     if typical_uncertainty is not None:
         rmse.append(Curve("noise of the measurement", wavelengths_nm, typical_uncertainty, dashed=True))
-        caption += " The measured pixels have noise of their own: no rendering can lie below the dashed line."
-    blocks: list[Block] = []
-    psnr, ssim = (
-        [Curve("mean ± SD over views", wavelengths_nm, *over_views([getattr(view, name) for view in views]))]
-        for name in ("psnr_db", "ssim")
-    )
-    for curves, y_label, words, from_zero in (
-        (rmse, "RMSE of reflectance", caption, True),
-        (
-            psnr,
-            "PSNR (dB)",
-            "Peak signal-to-noise ratio of the object's reflectance by band, for a peak of 1.",
-            False,
-        ),
-        (ssim, "SSIM", "Structural similarity of the object by band, moments over all of its pixels.", False),
-    ):
-        chart = line_chart(
+        caption += " Measured pixels have noise of their own (dashed), which no rendering can repeat."
+    charts = {
+        y_label: line_chart(
             curves, x_label="wavelength (nm)", y_label=y_label, alt=f"{y_label} by wavelength", from_zero=from_zero
         )
-        blocks.append(Figure([chart], words))
+        for curves, y_label, from_zero in (
+            (rmse, "RMSE of reflectance", True),
+            (psnr, "PSNR (dB)", False),
+            (ssim, "SSIM", False),
+        )
+    }
     angles = object_angles(views)
     if len(angles):
-        blocks.append(Figure([_angle_histogram(angles)], _angles_in_words(angles)))
-    return Section("bands", "Accuracy by band and pixel", blocks)
+        charts["Spectral angle"] = _angle_histogram(angles)
+        caption += f" {_angles_in_words(angles)}"
+    figure = Figure(list(charts.values()), caption, list(charts), columns=2)
+    return Section("bands", "Accuracy by band and pixel", [figure])
 
 
 def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
@@ -180,18 +181,26 @@ def spectra_section(
     view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], uncertainty: ReflectanceUncertainty | None
 ) -> Section:
     """Measured and rendered spectra of some places of one view, with how much they vary there."""
-    pictures = [embedded_array(_marked(view), f"{view.scores.name} with the places marked")]
-    titles = [f"{view.scores.name}: the places"]
-    for i, place in enumerate(view.places):
-        pictures.append(_spectrum_chart(place, wavelengths_nm, uncertainty, i))
-        titles.append(f"{chr(ord('A') + i)}: line {place.line}, sample {place.sample}, {place.pixels} pixels")
+    picture = embedded_array(_marked(view), f"{view.scores.name} with the places marked")
+    charts = [_spectrum_chart(place, wavelengths_nm, uncertainty, i) for i, place in enumerate(view.places)]
+    titles = [
+        f"{chr(ord('A') + i)}: line {place.line}, sample {place.sample}, {place.pixels} pixels"
+        for i, place in enumerate(view.places)
+    ]
     caption = (
         "Reflectance over wavelength. Solid with a band: measured, mean and standard deviation over the pixels of "
         "the place, that is noise and texture together. Dashed: rendered, mean over the same pixels."
     )
     if uncertainty is not None:
         caption += " Thin lines: the noise that one pixel should have by the calibration, around the mean."
-    return Section("spectra", "Spectra with uncertainty", [Figure(pictures, caption, titles)])
+    return Section(
+        "spectra",
+        "Spectra with uncertainty",
+        [
+            Figure([picture], f"Places in {view.scores.name}, as measured."),
+            Figure(charts, caption, titles, columns=2),
+        ],
+    )
 
 
 def _spectrum_chart(

@@ -28,7 +28,7 @@ class Renderer {
     const gl = canvas.getContext("webgl", { antialias: true, preserveDrawingBuffer: true });
     if (!gl) throw new Error("this browser has no WebGL");
     this.canvas = canvas; this.gl = gl; this.cloud = cloud;
-    this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0];
+    this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0.08];
     this.size = 1; this.shading = 0; this.marks = [];
     const program = gl.createProgram();
     for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
