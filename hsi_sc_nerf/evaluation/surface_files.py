@@ -30,7 +30,7 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     except Exception as error:  # the readers fail in every way there is
         raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
     if not len(vertices):
-        raise InputError(f"{path}: has no points; export it again.")
+        raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
     return vertices, triangles
