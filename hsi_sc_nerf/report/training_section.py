@@ -67,8 +67,8 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
             )
             titles.append(title)
     caption = (
-        "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage most "
-        "training rays are the object's: its loss and PSNR do not compare with those of whole frames."
+        "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage "
+        "most training rays are the object's: its loss and PSNR do not compare with those of whole frames."
     )
     return Section("training", "Training", [Figure(charts, caption, titles, columns=2)])
 

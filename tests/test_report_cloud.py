@@ -1,0 +1,94 @@
+"""The cloud inside the report: what is lost on the way into the page."""
+
+import base64
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.ply import SpectralCloud
+from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, quantise, thinned
+
+
+def restored(spectra):
+    return spectra.mean + (spectra.coefficients * spectra.scale) @ spectra.basis
+
+
+def ball(count=500, bands=20, seed=0):
+    """A cloud of a ball whose spectra are mixtures of three smooth ones."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    wavelengths_nm = np.linspace(400.0, 1000.0, bands)
+    smooth = np.stack([0.5 + 0.3 * np.sin(wavelengths_nm / scale) for scale in (50.0, 90.0, 200.0)])
+    spectra = rng.dirichlet(np.ones(3), count) @ smooth
+    colours = np.zeros((count, 3), np.uint8)
+    return SpectralCloud(0.03 * normals + [0.0, 0.0, 0.1], normals, colours, spectra, wavelengths_nm)
+
+
+def test_smooth_spectra_need_few_components_and_come_back():
+    spectra = ball(bands=204).spectra
+    compressed = compress_spectra(spectra)
+    assert len(compressed.basis) <= 2  # mixtures that sum to one: two degrees of freedom
+    error = restored(compressed) - spectra
+    assert np.abs(error).max() == pytest.approx(compressed.largest_error)
+    assert np.sqrt(np.mean(error**2, axis=0)).max() <= TOLERANCE + 1e-5
+
+
+def test_noise_is_cut_at_the_largest_rank_and_what_is_lost_is_told():
+    rng = np.random.default_rng(1)
+    spectra = 0.5 + 0.1 * rng.normal(size=(400, 50))
+    compressed = compress_spectra(spectra, max_rank=8)
+    assert len(compressed.basis) == 8
+    assert np.sqrt(np.mean((restored(compressed) - spectra) ** 2)) == pytest.approx(compressed.rmse)
+    assert compressed.rmse > 0.05
+    assert compress_spectra(spectra, max_rank=50).rmse < TOLERANCE
+
+
+def test_equal_spectra_come_back():
+    spectra = np.tile(np.linspace(0.1, 0.9, 7), (5, 1))
+    np.testing.assert_allclose(restored(compress_spectra(spectra)), spectra, atol=1e-6)
+
+
+def test_quantised_numbers_come_back_and_missing_ones_are_marked():
+    values = np.array([-1.0, 0.25, 3.0, np.nan, np.inf])
+    counts, low, high = quantise(values)
+    assert (low, high) == (-1.0, 3.0)
+    np.testing.assert_allclose(low + counts[:3] / 65534 * (high - low), values[:3], atol=1e-4)
+    assert counts[3:].tolist() == [65535, 65535]
+
+
+def test_thinning_keeps_whole_points_with_what_belongs_to_them():
+    cloud = ball()
+    cloud.spectra[::2, 3] = np.nan
+    cloud.extra["height"] = cloud.points[:, 2].copy()
+    thin = thinned(cloud, 100)
+    assert len(thin.points) == len(np.unique(thin.points, axis=0)) == 100
+    assert np.isfinite(thin.spectra).all()
+    np.testing.assert_array_equal(thin.extra["height"], thin.points[:, 2])
+    assert len(thinned(cloud, 10_000).points) == 250
+    cloud.spectra[:] = np.nan
+    with pytest.raises(InputError, match="no point with a spectrum"):
+        thinned(cloud, 100)
+
+
+def test_the_payload_holds_the_cloud_with_its_bands_in_order():
+    cloud = ball()
+    shuffled = np.random.default_rng(2).permutation(20)
+    cloud = SpectralCloud(
+        cloud.points, cloud.normals, cloud.colours, cloud.spectra[:, shuffled], cloud.wavelengths_nm[shuffled]
+    )
+    payload = cloud_payload(cloud, compress_spectra(cloud.spectra))
+
+    def array(text, kind, *shape):
+        return np.frombuffer(base64.b64decode(text), kind).reshape(*shape)
+
+    positions = array(payload["positions"], "<i2", 500, 3) / 32767 * payload["reach_m"] + payload["centre_m"]
+    np.testing.assert_allclose(positions, cloud.points, atol=1e-6)
+    np.testing.assert_allclose(array(payload["normals"], "i1", 500, 3) / 127, cloud.normals, atol=4e-3)
+    assert payload["wavelengths_nm"] == sorted(cloud.wavelengths_nm)
+    basis = array(payload["basis"], "<f4", payload["rank"], 20)
+    coefficients = array(payload["coefficients"], "<i2", 500, payload["rank"])
+    spectra = payload["mean"] + coefficients @ basis
+    np.testing.assert_allclose(spectra, cloud.spectra[:, np.argsort(cloud.wavelengths_nm)], atol=2e-3)
+    assert [scalar["name"] for scalar in payload["scalars"]] == ["NDVI", "red-edge NDVI", "water index"]

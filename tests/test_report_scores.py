@@ -1,0 +1,126 @@
+"""Scores, spectra of places, training curves and settings in the report, against what is known."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import torch
+
+from hsi_sc_nerf.report.logs import read_scalars, shortened, stage_ends
+from hsi_sc_nerf.report.places import inner_places, place_spectra
+from hsi_sc_nerf.report.scores import object_angles, over_views, score_view, spread_of_views
+from hsi_sc_nerf.report.settings import changed_settings, flat_settings
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_view_that_is_off_by_a_constant(device):
+    measured = torch.rand(6, 5, 4, generator=torch.Generator().manual_seed(0))
+    mask = torch.zeros(6, 5, dtype=torch.bool)
+    mask[1:4, 2:] = True
+    rendered = measured.clone()
+    rendered[mask] += 0.1
+    valid = torch.ones_like(measured, dtype=torch.bool)
+    valid[..., 2] = False
+    view = score_view("a", *(t.to(device) for t in (rendered, measured, mask, valid)))
+    np.testing.assert_allclose(view.rmse, [0.1, 0.1, np.nan, 0.1], atol=1e-6)
+    np.testing.assert_allclose(view.psnr_db, [20.0, 20.0, np.nan, 20.0], atol=1e-3)
+    assert np.isnan(view.ssim).tolist() == [False, False, True, False]
+    assert view.metrics["rmse"] == pytest.approx(0.1, abs=1e-6)
+    assert view.metrics["full_rmse"] == pytest.approx(0.1 * np.sqrt(9 / 30), abs=1e-6)
+    np.testing.assert_allclose(view.error, np.where(mask, 0.1, 0.0), atol=1e-6)
+    assert len(object_angles([view, view])) == 18
+    assert object_angles([view]).mean() == pytest.approx(view.metrics["sam"], abs=1e-6)
+
+
+def test_mean_and_deviation_over_the_views_that_have_a_band():
+    mean, sd = over_views([np.array([1.0, np.nan, 5.0]), np.array([3.0, np.nan, np.nan])])
+    np.testing.assert_allclose(mean, [2.0, np.nan, 5.0])
+    np.testing.assert_allclose(sd, [np.sqrt(2.0), np.nan, 0.0])
+
+
+@pytest.mark.parametrize(("count", "wanted", "expected"), [(6, 2, [1, 4]), (3, 9, [0, 1, 2]), (5, 1, [2])])
+def test_views_are_spread_evenly(count, wanted, expected):
+    assert spread_of_views(count, wanted) == expected
+
+
+def test_spectra_of_a_place_are_those_of_its_valid_pixels():
+    rng = np.random.default_rng(0)
+    measured = 0.5 + 0.02 * rng.normal(size=(40, 40, 3))
+    rendered = np.full((40, 40, 3), 0.4)
+    mask = np.zeros((40, 40), bool)
+    mask[:, :20] = True
+    measured[~mask] = 9.0
+    valid = np.ones_like(measured, bool)
+    valid[..., 1] = False
+    valid[18, :, 2] = False
+    (place,) = place_spectra(measured, rendered, mask, [(20, 18)], 6.0, valid)
+    lines, samples = np.indices(mask.shape)
+    inside = ((lines - 20) ** 2 + (samples - 18) ** 2 <= 36) & mask
+    assert place.pixels == inside.sum()
+    np.testing.assert_allclose(place.measured[0], measured[inside, 0].mean())
+    np.testing.assert_allclose(place.measured_sd[0], measured[inside, 0].std(ddof=1))
+    np.testing.assert_allclose(place.measured[2], measured[inside & (lines != 18), 2].mean())
+    np.testing.assert_allclose(place.rendered, [0.4, np.nan, 0.4])
+    assert np.isnan(place.measured_sd).tolist() == [False, True, False]
+
+
+def test_places_lie_well_inside_the_object():
+    mask = np.zeros((60, 60), bool)
+    mask[10:50, 20:45] = True
+    places = inner_places(mask, 4, 5)
+    assert len(set(places)) == 4
+    assert all(14 <= line < 46 and 24 <= sample < 41 for line, sample in places)
+    assert len(inner_places(np.pad(np.ones((1, 3), bool), 4), 2, 5)) == 2
+    assert inner_places(np.zeros((5, 5), bool), 3, 2) == []
+
+
+def test_curves_of_a_resumed_run_have_one_value_a_step(tmp_path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    assert read_scalars(tmp_path) == {}
+    for part, steps in enumerate((range(5), range(3, 8))):
+        with SummaryWriter(str(tmp_path), filename_suffix=str(part)) as writer:
+            for step in steps:
+                writer.add_scalar("Train Loss", 1.0 / (step + 1), step)
+    steps, values = read_scalars(tmp_path)["Train Loss"]
+    np.testing.assert_array_equal(steps, np.arange(8))
+    np.testing.assert_allclose(values, 1.0 / (steps + 1), rtol=1e-6)
+
+
+def test_long_curves_are_shortened_to_means():
+    steps = np.arange(1000.0)
+    short_steps, short_values = shortened(steps, 3.0 * steps, 100)
+    np.testing.assert_allclose(short_steps, np.arange(100) * 10 + 4.5)
+    np.testing.assert_allclose(short_values, 3.0 * short_steps)
+    assert shortened(steps, steps, 2000)[0] is steps
+
+
+def test_stages_in_the_order_of_their_ends(tmp_path):
+    for name, step in (("masked", 99), ("full-frame", 49)):
+        (tmp_path / f"stage-{name}").mkdir()
+        (tmp_path / f"stage-{name}" / f"step-{step:09d}.ckpt").touch()
+    assert stage_ends(tmp_path) == {"full-frame": 50, "masked": 100}
+
+
+@dataclass
+class Inner:
+    _target: type = dict
+    rate: float = 0.1
+
+
+@dataclass
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    groups: dict = field(default_factory=lambda: {"fields": Inner()})
+    empty: dict = field(default_factory=dict)
+
+
+def test_settings_by_their_dotted_names_and_those_that_were_changed():
+    settings = flat_settings(Outer(inner=Inner(rate=0.2)))
+    assert settings == {"inner.rate": "0.2", "groups.fields.rate": "0.1", "empty": "{}"}
+    assert changed_settings(settings | {"new": "1"}, flat_settings(Outer())) == {
+        "inner.rate": ("0.2", "0.1"),
+        "new": ("1", "-"),
+    }
