@@ -133,7 +133,8 @@ class LossWeights:
 def weighted(base: str, angular: float, hsi: float) -> Configuration:
     """A known configuration with these loss weights."""
     known = named_configuration(base)
-    words = ("--pipeline.model.angular-loss-mult", str(angular), "--pipeline.model.hsi-loss-mult", str(hsi))
+    weights = ("--pipeline.model.angular-loss-mult", str(angular), "--pipeline.model.hsi-loss-mult", str(hsi))
+    words = ("--pipeline.model.angular-loss", "cosine", *weights)
     return Configuration(f"{base}-angular-{angular:g}-hsi-{hsi:g}", known.method, known.words + words)
 
 

@@ -37,11 +37,12 @@ class SpectralModelConfig(NerfactoModelConfig):
     first stage. last-sample: nothing but what the ray met last, as nerfacto does."""
     hsi_loss: Literal["squared", "charbonnier"] = "squared"
     """How errors of reflectance count: their squares (the paper), or linearly where they are large."""
-    angular_loss: Literal["cosine", "angle"] = "cosine"
-    """How spectral angles count: one minus their cosine (the paper), or the angles themselves."""
+    angular_loss: Literal["cosine", "angle"] = "angle"
+    """How spectral angles count: one minus their cosine (the paper), which hardly pulls at small angles, or the angles
+    themselves, in radians, which want a weight some ten times smaller."""
     weigh_bands: bool = False
     """Let bands count by how well they were measured."""
-    angular_loss_mult: float = paper.ANGULAR_LOSS_WEIGHT
+    angular_loss_mult: float = 0.03
     """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
     """Weight of the reflectance errors over pixels and bands."""

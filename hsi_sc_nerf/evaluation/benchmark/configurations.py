@@ -34,6 +34,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
     "ours-not-view-dependent": (OURS, "--pipeline.model.view-dependent False"),
+    "ours-cosine-loss": (OURS, "--pipeline.model.angular-loss cosine --pipeline.model.angular-loss-mult 0.25"),
     "ours-predicted-normals": (OURS, "--pipeline.model.predict-normals True"),
     "ours-nerfacto-grid": (
         OURS,
@@ -46,7 +47,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-learned-basis": (OURS, "--pipeline.model.learn-basis True"),
     "ours-averaged-weights": (OURS, "--ema-decay 0.99"),
     "ours-weighted-bands": (OURS, "--pipeline.model.weigh-bands True"),
-    "ours-robust-losses": (OURS, "--pipeline.model.hsi-loss charbonnier --pipeline.model.angular-loss angle"),
+    "ours-charbonnier-loss": (OURS, "--pipeline.model.hsi-loss charbonnier"),
 }
 
 
