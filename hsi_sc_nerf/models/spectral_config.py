@@ -38,8 +38,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     hsi_loss: Literal["squared", "charbonnier"] = "squared"
     """How errors of reflectance count: their squares (the paper), or linearly where they are large."""
     angular_loss: Literal["cosine", "angle"] = "angle"
-    """How spectral angles count: one minus their cosine (the paper), which hardly pulls at small angles, or the angles
-    themselves, in radians, which want a weight some ten times smaller."""
+    """How spectral angles count: one minus their cosine (the paper), which hardly pulls at small angles, or the
+    angles themselves, in radians, which want a weight some ten times smaller."""
     weigh_bands: bool = False
     """Let bands count by how well they were measured."""
     angular_loss_mult: float = 0.03
