@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -31,6 +31,9 @@ from hsi_sc_nerf.report.view_sections import (
     spectra_section,
     views_section,
 )
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.export.trained_run import TrainedRun
 
 CLOUD_POINTS = 50_000
 
@@ -68,9 +71,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     # What they lack is told before minutes are spent on rendering.
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
 
-    from hsi_sc_nerf.export.trained_run import open_run
-
-    run = open_run(folder / "config.yml")
+    run = _opened(folder)
     held_out = len(run.manager.eval_dataset)
     cloud = _cloud(run, folder, sources)
     views = _rendered(run, min(held_out, sources.views or held_out))
@@ -117,7 +118,13 @@ def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path | N
     return given
 
 
-def _cloud(run: Any, folder: Path, sources: ReportSources) -> SpectralCloud:
+def _opened(folder: Path) -> TrainedRun:
+    from hsi_sc_nerf.export.trained_run import open_run
+
+    return open_run(folder / "config.yml")
+
+
+def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralCloud:
     from hsi_sc_nerf.report.rendering import sample_cloud
 
     path = sources.cloud or folder / "point_cloud.ply"
@@ -126,7 +133,7 @@ def _cloud(run: Any, folder: Path, sources: ReportSources) -> SpectralCloud:
     return sample_cloud(run, sources.points)
 
 
-def _rendered(run: Any, count: int) -> Sequence[HeldOutView]:
+def _rendered(run: TrainedRun, count: int) -> Sequence[HeldOutView]:
     """Held-out views, with a bar that tells the time left."""
     from hsi_sc_nerf.report.rendering import render_held_out
 

@@ -19,7 +19,7 @@ SERIES_COLOURS = 7
 """How many colours the style sheet has; further curves begin anew."""
 _WIDTH, _HEIGHT = 640.0, 300.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 66.0, 14.0, 12.0, 46.0
-_LEGEND_ROW, _LETTER = 20.0, 7.0
+_LEGEND_ROW, _LETTER = 20.0, 7.4
 _TICKS = 6
 # Of the largest value that a logarithmic axis reaches down to: below, a curve that touches zero would use it all up.
 _SMALLEST_SHARE = 1e-6

@@ -18,6 +18,7 @@ from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
 from hsi_sc_nerf.report.embed import embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
+_DIRECTIONS = {"ccw": "counter-clockwise", "cw": "clockwise"}
 _FLAGGED = {
     "clipped_low": "clipped at 0",
     "clipped_high": "clipped at 1",
@@ -152,7 +153,7 @@ def masks_section(dataset: PackedDataset) -> Section:
         ("largest", f"{areas_px.max()} ({dataset.frames[int(areas_px.argmax())].capture})"),
     ]
     chart = bar_chart(
-        np.arange(len(areas_px) + 1.0),
+        np.arange(len(areas_px) + 1.0) - 0.5,
         areas_px.astype(float),
         x_label="frame",
         y_label="pixels",
@@ -183,7 +184,7 @@ def poses_section(dataset: PackedDataset) -> Section:
     errors = np.array([np.nan if (e := f.reprojection_error_px) is None else e for f in dataset.frames])
     if np.isfinite(errors).any():
         chart = bar_chart(
-            np.arange(len(errors) + 1.0),
+            np.arange(len(errors) + 1.0) - 0.5,
             errors,
             x_label="frame",
             y_label="reprojection error (px)",
@@ -224,7 +225,7 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("frames used", "{} of " + str(frames.get("total")), frames.get("used")),
         ("reprojection error", "{:.3f} px", error.get("overall")),
         ("target of the paper", "{:g} px", error.get("target")),
-        ("direction", "{}", (found.get("direction") or {}).get("found")),
+        ("direction, from above", "{}", _DIRECTIONS.get(str((found.get("direction") or {}).get("found")))),
         ("median step", "{:.3f}°", steps.get("median")),
         ("loop closes to", "{:.3f}°", found.get("loop_closure_deg")),
         ("camera looks down", "{:.2f}°", found.get("camera_looks_down_deg")),
