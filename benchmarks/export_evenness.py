@@ -1,0 +1,93 @@
+"""How evenly an exported cloud covers the true surface of a simulated session.
+
+    uv run python benchmarks/export_evenness.py SESSION point_cloud.ply
+
+The part of the true mesh that at least one frame sees is cut into patches around evenly spread centres. The spread of
+points per area over the patches is compared with chance (points thrown at the surface independently) and with rays
+through random pixels, whose density is the sum of cos / distance^2 over the frames that see a place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.evaluation.visible_surface import views_of_points
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.surface_mesh import SurfaceMesh
+from hsi_sc_nerf.simulate.truth import load_truth
+
+REFERENCE_POINTS = 200_000
+
+
+def coefficient_of_variation(
+    weights: Float[np.ndarray, "n"], patches: np.ndarray, areas: Float[np.ndarray, "patches"]
+) -> float:
+    """Of the weights' sum per area over patches, patches weighted by their area."""
+    density = np.bincount(patches, weights, minlength=len(areas)) / areas
+    mean = np.average(density, weights=areas)
+    return float(np.sqrt(np.average((density - mean) ** 2, weights=areas)) / mean)
+
+
+@dataclass(frozen=True)
+class ExportEvenness:
+    """Measure how evenly a cloud covers what the frames see of the true surface."""
+
+    session: tyro.conf.Positional[Path]
+    """The simulated session."""
+    cloud: tyro.conf.Positional[Path]
+    """The exported cloud."""
+    patches: int = 200
+    """Patches of about equal area."""
+
+    def main(self) -> None:
+        """Measure and print."""
+        truth, cloud = load_truth(self.session), read_spectral_ply(self.cloud)
+        mesh = truth.mesh()
+        surface, normals = _surface(mesh.vertices, mesh.triangles)
+        density = np.zeros(len(surface))
+        seen = np.zeros(len(surface), bool)
+        for pose in truth.camera_to_world:
+            way = pose[:3, 3] - surface
+            distance = np.linalg.norm(way, axis=1)
+            cosine = (way * normals).sum(axis=1) / distance
+            views = views_of_points(surface, mesh.vertices, mesh.triangles, pose[None], truth.intrinsics)
+            visible = (views > 0) & (cosine > 0.0)
+            density += np.where(visible, cosine / distance**2, 0.0)
+            seen |= visible
+        centres = cKDTree(_spread(surface[seen], self.patches))
+        patch = centres.query(surface[seen])[1]
+        areas = np.bincount(patch, minlength=self.patches).astype(float)
+        points = centres.query(cloud.points)[1]
+        print(f"{len(points):,} points, {self.patches} patches; spread of points per area:")
+        print(f"  this cloud           {coefficient_of_variation(np.ones(len(points)), points, areas):.3f}")
+        print(f"  chance               {np.sqrt(self.patches / len(points)):.3f}")
+        print(f"  rays through pixels  {coefficient_of_variation(density[seen], patch, areas):.3f} beside chance")
+
+
+def _surface(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points spread evenly over a mesh, and the outward unit normals there."""
+    points = sample_surface(vertices, triangles, REFERENCE_POINTS)
+    return points, SurfaceMesh(np.asarray(vertices, float), triangles).normals_at(points)
+
+
+def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "{count} 3"]:
+    """Points far from one another: each the farthest from those before (Gonzalez 1985)."""
+    chosen = [points[0]]
+    distance = np.linalg.norm(points - chosen[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(points[distance.argmax()])
+        distance = np.minimum(distance, np.linalg.norm(points - chosen[-1], axis=1))
+    return np.stack(chosen)
+
+
+if __name__ == "__main__":
+    tyro.cli(ExportEvenness).main()

@@ -1,0 +1,139 @@
+"""How good traits are, on a simulated object whose sizes, spectra and materials are known, as a table.
+
+    uv run python benchmarks/traits_accuracy.py SESSION --cloud EXPORT/point_cloud.ply
+
+Without a cloud, one that an ideal reconstruction would give is sampled from the true mesh: even, of what the cameras
+see, with true spectra and 0.3 mm of noise. The object stands where the container ends.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.atomic import atomic_write
+from hsi_sc_nerf.evaluation.benchmark.report import markdown_table
+from hsi_sc_nerf.evaluation.traits import TrueSurface, relative_rms
+from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.traits.analysis import classified
+from hsi_sc_nerf.traits.library import SpectralLibrary
+from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh
+from hsi_sc_nerf.traits.regions import PickedRegion, region_spectrum
+from hsi_sc_nerf.traits.size import size_of
+from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh, with_spectra
+
+EVERY_KTH_CAMERA = 5
+ROI_RADIUS_M = 0.005
+ROIS = 12
+
+
+@dataclass(frozen=True)
+class TraitsAccuracy:
+    """Compare the traits of a cloud with the truth of the simulated session that it shows."""
+
+    session: tyro.conf.Positional[Path]
+    """Simulated session."""
+    cloud: Path | None = None
+    """Spectral cloud reconstructed from it; without it, an ideal cloud."""
+    points: int = 100_000
+    """Of the ideal cloud."""
+    noise_m: float = 0.0003
+    """Of the ideal cloud, in each direction."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the mesh is made."""
+    output: Path | None = None
+    """Markdown file for the table; it is printed in any case."""
+
+    def main(self) -> None:
+        """Measure, print and write."""
+        truth = load_truth(self.session)
+        true = TrueSurface.of(truth)
+        eyes_m = truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3]
+        cloud = read_spectral_ply(self.cloud) if self.cloud else true.cloud(self.points, eyes_m, self.noise_m)
+        stands_at_m = float(true.mesh.vertices[:, 2].min())
+        started = time.perf_counter()
+        config = replace(self.mesh, base_height_m=stands_at_m)
+        mesh = closed_mesh(cloud.points, cloud.normals, config)
+        surface = with_spectra(mesh, cloud, config.smoothing_radius_m)
+        seconds = time.perf_counter() - started
+
+        vertices = true.mesh.vertices
+        everything = np.ones(len(vertices), bool)
+        ideal = SpectralMesh(
+            true.mesh, true.reflectance(everything), true.wavelengths_nm, true.seen(vertices, eyes_m)
+        )
+        library = SpectralLibrary(
+            tuple(name for name in truth.materials if truth.materials.index(name) < true.weights.shape[1]),
+            true.wavelengths_nm,
+            true.endmembers,
+        )
+        rows = [*_size_rows(surface, ideal, cloud), *_roi_rows(surface, ideal), *_class_rows(surface, ideal, library)]
+        page = markdown_table(["trait", "measured", "true", "error"], rows)
+        page += f"\n\nwatertight: {mesh.is_watertight()}; {len(cloud.points)} points; {seconds:.0f} s"
+        print(page)
+        if self.output:
+            with atomic_write(self.output) as (temporary,):
+                temporary.write_text(page + "\n", encoding="utf-8")
+
+
+def _size_rows(surface: SpectralMesh, ideal: SpectralMesh, cloud: SpectralCloud) -> list[list[str]]:
+    measured, true = size_of(surface.mesh), size_of(ideal.mesh)
+    rows = [
+        [name, f"{a:.5g}", f"{b:.5g}", f"{100.0 * (a / b - 1.0):+.2f} %"]
+        for name in vars(true)
+        for a, b in [(getattr(measured, name), getattr(true, name))]
+    ]
+    # Without knowing where the object stands: closed where the cloud ends.
+    unknown = size_of(closed_mesh(cloud.points, cloud.normals, MeshConfig()))
+    rows += [
+        [f"{name}, base height unknown", f"{a:.5g}", f"{b:.5g}", f"{100.0 * (a / b - 1.0):+.2f} %"]
+        for name in ("area_m2", "volume_l")
+        for a, b in [(getattr(unknown, name), getattr(true, name))]
+    ]
+    seen = [float(one.areas_m2[one.seen].sum()) for one in (surface, ideal)]
+    return [
+        *rows,
+        ["seen area_m2", f"{seen[0]:.5g}", f"{seen[1]:.5g}", f"{100.0 * (seen[0] / seen[1] - 1.0):+.2f} %"],
+    ]
+
+
+def _roi_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
+    """Mean spectra of spots all over the seen surface."""
+    rng = np.random.default_rng(0)
+    chances = np.where(ideal.seen, ideal.areas_m2, 0.0)
+    centres = ideal.mesh.vertices[rng.choice(len(chances), ROIS, p=chances / chances.sum())]
+    errors = []
+    for centre in centres:
+        spot = PickedRegion("spot", tuple(centre.tolist()), ROI_RADIUS_M)
+        measured, true = (region_spectrum("spot", one, spot.of(one)).mean for one in (surface, ideal))
+        errors.append(relative_rms(measured, true))
+    median, worst = 100.0 * np.median(errors), 100.0 * np.max(errors)
+    return [
+        [
+            f"spectra of {ROIS} spots of {2000 * ROI_RADIUS_M:g} mm, RMS",
+            "",
+            "",
+            f"{median:.2f} %, worst {worst:.2f} %",
+        ]
+    ]
+
+
+def _class_rows(surface: SpectralMesh, ideal: SpectralMesh, library: SpectralLibrary) -> list[list[str]]:
+    """Areas of classes, against the same classification of the true spectra on the true mesh."""
+    found, true = (classified(one, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0) for one in (surface, ideal))
+    return [
+        [f"{name}, cm²", f"{1e4 * a:.2f}", f"{1e4 * b:.2f}", f"{100.0 * (a / b - 1.0):+.1f} %"]
+        for name, a, b in zip(library.names, found.areas_m2, true.areas_m2, strict=True)
+        if b > 0.0
+    ]
+
+
+if __name__ == "__main__":
+    tyro.cli(TraitsAccuracy, description=__doc__).main()
