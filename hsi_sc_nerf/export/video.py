@@ -26,7 +26,8 @@ def open_video(path: Path, frames_per_second: int) -> Iterator[Callable[[UInt8[n
 
         def add(image: np.ndarray) -> None:
             even = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
-            stream.height, stream.width = even.shape[:2]
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = even.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
 
         yield add

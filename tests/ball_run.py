@@ -1,0 +1,108 @@
+"""A run whose model is a ball of one spectrum before a flat background: what it renders is known.
+
+The ball is `capture_factory`'s; everything but the field is the model that training would have.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+
+import capture_factory as factory
+import cv2
+import numpy as np
+import torch
+import yaml
+from nerfstudio.field_components.field_heads import FieldHeadNames
+
+from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame, write_transforms
+from hsi_sc_nerf.data.packed_cube import pack, write_packed_cube
+from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint
+
+ANGLES_DEG = np.arange(0.0, 360.0, 36.0)
+DENSITY = 400.0  # opaque within some hundredths of the scene's unit
+
+
+def write_ball_dataset(root: Path) -> Path:
+    frames = []
+    for i, angle_deg in enumerate(ANGLES_DEG):
+        pose = factory.true_pose(angle_deg)
+        mask = factory.sphere_mask(pose)
+        reflectance = np.where(mask[..., None], factory.PLANT, factory.BACKGROUND)
+        paths = {kind: root / kind / f"ball_{i}.png" for kind in ("images", "masks", "flags")}
+        pictures = {
+            "images": np.rint(255 * reflectance[..., [5, 3, 1]]),
+            "masks": 255 * mask,
+            "flags": np.zeros_like(mask),
+        }
+        for kind, path in paths.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), pictures[kind].astype(np.uint8))
+        cube_path = root / "cubes" / f"ball_{i}.hdr"
+        write_packed_cube(cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
+        frames.append(
+            PackedFrame(
+                capture=f"ball_{i}",
+                image_path=paths["images"],
+                mask_path=paths["masks"],
+                cube_path=cube_path,
+                flags_path=paths["flags"],
+                angle_deg=angle_deg,
+                reprojection_error_px=None,
+                camera_to_world=pose,
+            )
+        )
+    reach = np.full(3, factory.SPHERE_RADIUS_M)
+    box = np.stack([factory.SPHERE_CENTRE_M - reach, factory.SPHERE_CENTRE_M + reach])
+    write_transforms(
+        PackedDataset(
+            root=root,
+            intrinsics=factory.INTRINSICS,
+            distortion=np.zeros(4),
+            wavelengths_nm=factory.WAVELENGTHS_NM,
+            pseudo_rgb_nm=factory.WAVELENGTHS_NM[[5, 3, 1]],
+            object_name="ball",
+            scene_box_m=np.array([[-0.06, -0.06, 0.0], [0.06, 0.06, 0.16]]),
+            object_box_m=box,
+            background_reflectance=np.full(factory.BANDS, factory.BACKGROUND),
+            container=None,
+            fwhm_nm=np.full(factory.BANDS, 7.0),
+            frames=tuple(frames),
+        )
+    )
+    return root
+
+
+def write_untrained_run(data: Path, output_dir: Path) -> Path:
+    """The config.yml of a run with one checkpoint."""
+    from hsi_sc_nerf.config import hsi_sc_nerf
+
+    config = deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = output_dir, "ball", "run"
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = data
+    config.pipeline.model.head, config.pipeline.model.background = "direct", "spectrum"
+    torch.manual_seed(0)
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    state = {"step": 0, "pipeline": pipeline.state_dict()}
+    write_checkpoint(checkpoint_path(config.get_checkpoint_dir(), 0), state)
+    path = config.get_base_dir() / "config.yml"
+    path.write_text(yaml.dump(config))
+    return path
+
+
+def fill_with_ball(run) -> None:
+    """Put the ball in the place of the model's densities and spectra."""
+    model = run.model
+    centre = torch.from_numpy(run.to_scene(factory.SPHERE_CENTRE_M)).float().to(model.device)
+    radius = factory.SPHERE_RADIUS_M * run.scale
+    spectrum = torch.from_numpy(factory.PLANT).float().to(model.device)
+
+    def density(positions, times=None):
+        return DENSITY * ((positions - centre).norm(dim=-1, keepdim=True) < radius)
+
+    def field(samples, compute_normals=False):
+        densities = density(samples.frustums.get_positions())
+        return {FieldHeadNames.DENSITY: densities, FieldHeadNames.RGB: spectrum.expand(*densities.shape[:-1], -1)}
+
+    model.field.forward, model.field.density_fn = field, density
+    model.density_fns = [density] * len(model.density_fns)
