@@ -39,7 +39,7 @@ class TraitsCommand:
     """How often the points are resampled for the uncertainty of area, volume and diameters; 0 leaves it out."""
     library: Path | None = None
     """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
-    nm, then a column a class)."""
+    nm, then a column a spectrum). Spectra of one name are references of one class."""
     classes: tuple[str, ...] = ()
     """Names of the library's spectra to use; all where none is named."""
     angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD

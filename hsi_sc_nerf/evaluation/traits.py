@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,12 +26,14 @@ class TrueSurface:
     """A closed mesh with known materials.
 
     Attributes:
+        materials: names.
         mesh: metres, object frame.
         weights: share of each material at each vertex.
         endmembers: reflectance of each material.
         wavelengths_nm: band centres.
     """
 
+    materials: tuple[str, ...]
     mesh: Mesh
     weights: Float[np.ndarray, "v materials"]
     endmembers: Float[np.ndarray, "materials bands"]
@@ -42,7 +45,9 @@ class TrueSurface:
         vertex = PlyData.read(str(truth.mesh_path))["vertex"]
         columns = {p.name.removeprefix("weight_"): vertex[p.name] for p in vertex.properties if "weight_" in p.name}
         endmembers = truth.endmembers[[truth.materials.index(name) for name in columns]]
-        return cls(truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm)
+        return cls(
+            tuple(columns), truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm
+        )
 
     def reflectance(self, chosen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "n bands"]:
         """True spectra of the chosen vertices."""
@@ -101,7 +106,7 @@ class TrueSurface:
             points.astype(np.float32), normals.astype(np.float32), colours, spectra, self.wavelengths_nm
         )
 
-    def _scene(self):
+    def _scene(self) -> Any:
         import open3d as o3d
 
         scene = o3d.t.geometry.RaycastingScene()

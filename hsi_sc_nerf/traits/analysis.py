@@ -74,17 +74,22 @@ def classified(
 ) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 
+    A class is what the library has under one name; a place belongs to the class of its nearest reference.
+
     Raises:
         InputError: the library does not cover the bands, or the threshold is no angle.
     """
     if not 0.0 < threshold_rad <= np.pi:
         raise InputError(f"the spectral angle's threshold is {threshold_rad} rad; give more than 0 (0.1 is usual).")
     references = library.at(surface.wavelengths_nm).spectra
+    names = tuple(dict.fromkeys(library.names))
+    # The last entry is what the index -1 finds.
+    class_of = np.array([*(names.index(name) for name in library.names), UNCLASSIFIED])
     labels = np.full(len(surface.seen), UNCLASSIFIED)
-    labels[surface.seen] = classify(surface.spectra[surface.seen], references, threshold_rad)
-    areas = np.array([surface.areas_m2[labels == index].sum() for index in range(len(references))])
+    labels[surface.seen] = class_of[classify(surface.spectra[surface.seen], references, threshold_rad)]
+    areas = np.array([surface.areas_m2[labels == index].sum() for index in range(len(names))])
     return Classes(
-        names=library.names,
+        names=names,
         labels=labels,
         threshold_rad=threshold_rad,
         areas_m2=areas,

@@ -18,11 +18,17 @@ _SMALLEST_NM = 100.0
 
 @dataclass(frozen=True)
 class SpectralLibrary:
-    """Named reference spectra."""
+    """Named reference spectra; those of equal name are references of one class.
+
+    Attributes:
+        names: of each spectrum.
+        wavelengths_nm: band centres.
+        spectra: reflectance.
+    """
 
     names: tuple[str, ...]
     wavelengths_nm: Float[np.ndarray, "bands"]
-    spectra: Float[np.ndarray, "classes bands"]
+    spectra: Float[np.ndarray, "references bands"]
 
     def at(self, wavelengths_nm: Float[np.ndarray, "other"]) -> SpectralLibrary:
         """The library at other wavelengths, straight between its own.
@@ -43,16 +49,17 @@ class SpectralLibrary:
         return SpectralLibrary(self.names, wavelengths_nm, spectra)
 
     def only(self, names: tuple[str, ...]) -> SpectralLibrary:
-        """The named spectra, in that order.
+        """The spectra of these names, in the library's order.
 
         Raises:
             InputError: a name is not in the library.
         """
         unknown = [name for name in names if name not in self.names]
         if unknown:
-            raise InputError(f"the spectral library has no {', '.join(unknown)}; it has {', '.join(self.names)}.")
-        rows = [self.names.index(name) for name in names]
-        return SpectralLibrary(names, self.wavelengths_nm, self.spectra[rows])
+            known = ", ".join(dict.fromkeys(self.names))
+            raise InputError(f"the spectral library has no {', '.join(unknown)}; it has {known}.")
+        rows = [row for row, name in enumerate(self.names) if name in names]
+        return SpectralLibrary(tuple(self.names[row] for row in rows), self.wavelengths_nm, self.spectra[rows])
 
 
 def read_library(path: Path) -> SpectralLibrary:

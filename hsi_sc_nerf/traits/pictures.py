@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps, rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
 from hsi_sc_nerf.evaluation.pictures import _COLOURS, _STYLE, _figure, _save, _show
 from hsi_sc_nerf.simulate.mesh import Mesh
-from hsi_sc_nerf.spectra.composites import composite
+from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.traits.analysis import WHOLE, Classes, Traits
 from hsi_sc_nerf.traits.classes import UNCLASSIFIED
@@ -22,6 +24,8 @@ SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "b
 _HEIGHT_PX = 420
 _GREY = 0.85
 """What was not seen."""
+_NEAR_WHITE = 0.97
+"""What is in no class."""
 
 
 class SideViews:
@@ -75,8 +79,6 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits:
         views: of the mesh.
         traits: say which composites the bands can show.
     """
-    from hsi_sc_nerf.spectra.composites import COMPOSITES
-
     rows = {}
     for name in traits.composites[WHOLE]:
         one = COMPOSITES[name]
@@ -102,9 +104,8 @@ def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Tr
         low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
         coloured = colormaps["viridis"](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
         coloured[~surface.seen | ~np.isfinite(values)] = _GREY
-        rows[f"{name}\n{INDICES[name].expression}"] = [
-            np.where(np.isnan(picture), 1.0, picture) for picture in views.of(coloured)
-        ]
+        expression = INDICES[name].expression.replace(" / (", " /\n(")
+        rows[f"{name}\n{expression}"] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(coloured)]
         scales.append((low, high))
     _draw_rows(path, rows, scales)
 
@@ -112,9 +113,6 @@ def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Tr
 def _draw_rows(
     path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float]] = ()
 ) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     first = next(iter(rows.values()))[0]
     width_in = 1.75
     figure = _figure(width_in * len(SIDES_DEG) + 1.0, width_in * first.shape[0] / first.shape[1] * len(rows) + 0.35)
@@ -134,10 +132,8 @@ def _draw_rows(
 @rc_context(_STYLE)
 def draw_classes(path: Path, classes: Classes, surface: SpectralMesh, views: SideViews) -> None:
     """The classes on the surface, with their areas; white is in no class, grey was not seen."""
-    colours = np.array(
-        [[int(_COLOURS[i % len(_COLOURS)][k : k + 2], 16) / 255 for k in (1, 3, 5)] for i in range(99)]
-    )
-    painted = np.where(classes.labels[:, None] == UNCLASSIFIED, 0.97, colours[classes.labels % 99])
+    colours = np.array([to_rgb(_COLOURS[index % len(_COLOURS)]) for index in range(len(classes.names))])
+    painted = np.where(classes.labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[classes.labels])
     painted[~surface.seen] = _GREY
     pictures = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(painted)]
     height, width = pictures[0].shape[:2]
@@ -151,7 +147,10 @@ def draw_classes(path: Path, classes: Classes, surface: SpectralMesh, views: Sid
         if area > 0
     ]
     rest = f"in no class: {classes.unclassified_m2 * 1e4:.2f} cm²"
-    patches += [Patch(facecolor="0.97", edgecolor="0.5", label=rest), Patch(color=str(_GREY), label="not seen")]
+    patches += [
+        Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest),
+        Patch(color=str(_GREY), label="not seen"),
+    ]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     _save(figure, path)
 
@@ -159,7 +158,7 @@ def draw_classes(path: Path, classes: Classes, surface: SpectralMesh, views: Sid
 @rc_context(_STYLE)
 def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
     """Mean spectrum of each region with a band of one standard deviation over its surface."""
-    figure = _figure(7.5, 4.0)
+    figure = _figure(9.0, 4.0)
     axes = figure.subplots()
     order = np.argsort(wavelengths_nm)
     nm = wavelengths_nm[order]
@@ -169,5 +168,5 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
         axes.plot(nm, mean, color=colour, linewidth=1.5, label=f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)")
     axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", xlim=(nm[0], nm[-1]), ylim=(0, None))
-    axes.legend(loc="upper left", fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     _save(figure, path)
