@@ -12,7 +12,8 @@ from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation import comparison
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
-from hsi_sc_nerf.evaluation.registration import SymmetricShapeError
+from hsi_sc_nerf.evaluation.comparison_report import write_comparison
+from hsi_sc_nerf.evaluation.registration import Registration, Rival, Similarity
 from hsi_sc_nerf.evaluation.seen_surface import seen_points
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.evaluation.surface_files import read_surface
@@ -142,13 +143,14 @@ def test_icp_brings_a_shifted_cloud_back(mesh: Path, tmp_path: Path) -> None:
     assert found.to_reference_m.max() < 2e-4
 
 
-def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def symmetric(*_: object) -> None:
-        raise SymmetricShapeError("fits as well when turned by 90 degrees (RMS 0.1 mm against 0.1 mm)")
-
-    monkeypatch.setattr(comparison, "align_by_features", symmetric)
-    with pytest.raises(InputError, match=r"because it fits as well when turned by 90 degrees .* --align icp"):
+def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Registration(Similarity(), 0.001, Rival(90.0, 0.0001, 0.0001))
+    monkeypatch.setattr(comparison, "align_by_features", lambda *_: found)
+    with pytest.raises(InputError, match=r"turned by 90 degrees it fits as well .* --align icp"):
         compare(mesh, mesh, CompareConfig(points=500))
+    accepted = compare(mesh, mesh, CompareConfig(points=500, accept_symmetric=True))
+    write_comparison(tmp_path / "out", accepted, "cloud", "reference")
+    assert "Turned by 90 degrees it fits as well" in (tmp_path / "out" / "comparison.md").read_text()
 
 
 def test_polygons_are_cut_into_triangles(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import (
     Registration,
     Similarity,
-    SymmetricShapeError,
     align_by_features,
     refine,
     robust_radius,
@@ -51,6 +50,9 @@ class CompareConfig:
     this option: none for a simulated session, whose truth is in the cloud's own frame, and features for a file."""
     with_scale: bool = False
     """Let the alignment change the cloud's size, too, for a reference (or a cloud) that is not to scale."""
+    accept_symmetric: bool = False
+    """With features: go on where the shape is (nearly) symmetric and fits equally well in several attitudes, and take
+    one of them. Scores hold for each of them, but a place on the cloud need not be that place on the object."""
     reference_unit: Literal["m", "mm"] = "m"
     """Unit of length of the reference file."""
     distances: DistanceKind = "surface"
@@ -241,19 +243,21 @@ def _registered(
         return None
     if alignment == "icp":
         return refine(cloud.points_m, reference.points_m, with_scale=config.with_scale, seed=config.seed)
-    try:
-        return align_by_features(
-            cloud.points_m,
-            reference.points_m,
-            config.with_scale,
-            config.seed,
-            lambda starts: track(starts, "Trying other attitudes"),
-        )
-    except SymmetricShapeError as error:
+    found = align_by_features(
+        cloud.points_m,
+        reference.points_m,
+        config.with_scale,
+        config.seed,
+        lambda starts: track(starts, "Trying other attitudes"),
+    )
+    if found.rival is not None and not config.accept_symmetric:
         raise InputError(
-            f"{cloud_path}: cannot be aligned with {reference_path} by features, because it {error}: the shape is "
-            "symmetric; bring the two together by hand and use --align icp, or --align none."
-        ) from error
+            f"{cloud_path}: features do not say how it lies in {reference_path}, because turned by "
+            f"{found.rival.turn_deg:.0f} degrees it fits as well (RMS {1000 * found.rival.rms_m:.2f} mm against "
+            f"{1000 * found.rival.taken_rms_m:.2f} mm); bring the two together by hand and use --align icp, or take "
+            "either attitude with --accept-symmetric."
+        )
+    return found
 
 
 def _moved(shape: Shape, transform: Similarity) -> Shape:

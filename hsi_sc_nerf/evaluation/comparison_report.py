@@ -100,6 +100,7 @@ def _alignment(comparison: Comparison) -> dict[str, Any]:
         "cloud_to_reference": registration.transform.matrix().tolist(),
         "turn_deg": registration.transform.turn_deg(),
         "scale": registration.transform.scale,
+        "rival": None if registration.rival is None else asdict(registration.rival),
         "within_m": registration.within_m,
         "matched_share": len(matched) / len(comparison.to_reference_m),
         "matched_rms_m": distance_statistics(matched).rms_m if len(matched) else None,
@@ -174,10 +175,18 @@ def _told_alignment(alignment: dict[str, Any]) -> str:
         return "The cloud was compared where it lies, without alignment."
     ways = {"features": "features, then ICP", "icp": "ICP"}
     rms = "none" if alignment["matched_rms_m"] is None else f"{1000 * alignment['matched_rms_m']:.3f} mm"
+    rival = alignment["rival"]
+    ambiguous = (
+        ""
+        if rival is None
+        else f" **Turned by {rival['turn_deg']:.0f} degrees it fits as well** (RMS {1000 * rival['rms_m']:.2f} mm "
+        f"against {1000 * rival['taken_rms_m']:.2f} mm): the scores hold for either, but a place on the cloud need "
+        "not be that place on the reference."
+    )
     return (
         f"The cloud was aligned by {ways[alignment['way']]}: turned by {alignment['turn_deg']:.2f} degrees, scaled "
         f"by {alignment['scale']:.5f}. RMS after ICP: {rms}, of the {100 * alignment['matched_share']:.1f} % of its "
-        f"points within {1000 * alignment['within_m']:.2f} mm."
+        f"points within {1000 * alignment['within_m']:.2f} mm.{ambiguous}"
     )
 
 
