@@ -9,7 +9,7 @@ through random pixels, whose density is the sum of cos / distance^2 over the fra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,13 @@ import tyro
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.evaluation.seen_surface import seen_points
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.evaluation.visible_surface import views_of_points
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.surface_mesh import SurfaceMesh
 from hsi_sc_nerf.simulate.truth import load_truth
 
-REFERENCE_POINTS = 200_000
+REFERENCE_POINTS = 100_000
 
 
 def coefficient_of_variation(
@@ -53,13 +53,12 @@ class ExportEvenness:
         surface, normals = _surface(mesh.vertices, mesh.triangles)
         density = np.zeros(len(surface))
         seen = np.zeros(len(surface), bool)
-        for pose in truth.camera_to_world:
+        for capture, pose in zip(truth.captures, truth.camera_to_world, strict=True):
+            alone = replace(truth, captures=(capture,), camera_to_world=pose[None])
+            visible = seen_points(alone, surface, mesh.vertices, mesh.triangles)
             way = pose[:3, 3] - surface
             distance = np.linalg.norm(way, axis=1)
-            cosine = (way * normals).sum(axis=1) / distance
-            views = views_of_points(surface, mesh.vertices, mesh.triangles, pose[None], truth.intrinsics)
-            visible = (views > 0) & (cosine > 0.0)
-            density += np.where(visible, cosine / distance**2, 0.0)
+            density += np.where(visible, (way * normals).sum(axis=1).clip(0.0) / distance**3, 0.0)
             seen |= visible
         centres = cKDTree(_spread(surface[seen], self.patches))
         patch = centres.query(surface[seen])[1]

@@ -1,52 +1,219 @@
-"""Points on the object's surface with their spectra, from a trained model."""
+"""Points on the object's surface, evenly spread over it, from a trained model; all lengths in scene units.
+
+The training frames' depth maps make a mesh. Places that are spread evenly over its area are moved,
+each along the ray of the frame that sees it most from the front, to where the model has its surface; what no frame
+sees is left out. The spectrum of a point is that ray's: seen from the front, as the white reference was.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.surface import opacity_crossing_depth
+from hsi_sc_nerf.export.camera_views import (
+    MIN_OPACITY,
+    SEARCH_DEPTH,
+    SeenSurface,
+    camera_rays,
+    look_from_cameras,
+    model_output,
+    surface_along,
+)
+from hsi_sc_nerf.export.even_points import even_points
+from hsi_sc_nerf.export.progress import progress_bar
+from hsi_sc_nerf.export.regions import in_box
+from hsi_sc_nerf.export.surface_mesh import SurfaceMesh, fuse_depth_maps
+from hsi_sc_nerf.export.visibility import DepthMaps, most_frontal
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
-MIN_OPACITY = 0.5
-"""Rays that collect less than this hit no surface (released settings of the paper)."""
-SURFACE_OPACITY = 0.25
-"""The surface is where a ray has collected this much. Other views keep the space outside the object empty, so the
-density begins at the true surface; how far into the object a ray reaches before it is half absorbed says how long the
-model was trained. On the demo's pear, half the opacity lies 1.5 mm below the true surface, a quarter 0.3 mm."""
-SEARCH_DEPTH = 0.1
-"""The surface is sought this far around the median depth, scene units (about a centimetre)."""
-SEARCH_STEPS = 40
-_MAX_FRUITLESS_BATCHES = 50
+_LEAST_OPACITY = 1e-3
 
 
 @dataclass(eq=False)
 class SurfacePoints:
-    """Points of the surface, in scene units or metres as the function that returns them says.
+    """Points of the surface, and how the training frames see them.
 
     Attributes:
-        points: positions.
-        normals: unit vectors out of the surface.
-        colours: pseudo-RGB.
-        spectra: reflectance.
+        points: positions, scene units.
+        facing: unit normals of the mesh that the points were spread on, outwards.
+        frames: the training frame that sees each most from the front.
+        places: where it is in that frame's picture, (x, y) in pixels from its corner.
     """
 
     points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    colours: UInt8[np.ndarray, "n 3"]
-    spectra: Float[np.ndarray, "n bands"]
+    facing: Float[np.ndarray, "n 3"]
+    frames: Int[np.ndarray, "n"]
+    places: Float[np.ndarray, "n 2"]
 
-    def select(self, keep: np.ndarray) -> SurfacePoints:
-        """The points that an index or boolean array selects."""
-        return SurfacePoints(self.points[keep], self.normals[keep], self.colours[keep], self.spectra[keep])
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: np.ndarray | slice) -> SurfacePoints:
+        """The points that a slice, an index or a boolean array selects."""
+        return SurfacePoints(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def join(parts: list[SurfacePoints]) -> SurfacePoints:
+    """The points of all parts, in their order."""
+    return SurfacePoints(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(SurfacePoints))
+    )
+
+
+Region = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
+"""Which points (scene units, with outward unit normals) are wanted."""
+
+
+def everywhere(points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """The region that holds every point."""
+    return np.ones(len(points), bool)
+
+
+def spread_points(
+    model: SpectralModel,
+    seen: SeenSurface,
+    num_points: int,
+    rays_per_batch: int,
+    box: Float[np.ndarray, "2 3"],
+    region: Region,
+    seed: int = 0,
+) -> SurfacePoints:
+    """Points spread evenly over the surface that at least one training frame sees.
+
+    Args:
+        model: trained model, in evaluation mode.
+        seen: what its training cameras see.
+        num_points: how many points to return.
+        rays_per_batch: rays searched at a time.
+        box: the surface is sought in this box, scene units: it cuts the container away.
+        region: which points are wanted.
+        seed: of the random places.
+
+    Raises:
+        InputError: the model holds no object, or nothing of it is wanted.
+    """
+    mesh = fuse_depth_maps(seen.maps, seen.points[in_box(seen.points, box)], box)
+    if mesh is None:
+        raise InputError(
+            f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
+            "longer, and look at the masks in the dataset's report folder."
+        )
+
+    placed = 0
+
+    def keep(places: Float[np.ndarray, "n 3"]) -> SurfacePoints:
+        nonlocal placed
+        parts = []
+        for start in range(0, len(places), rays_per_batch):
+            moved = _moved_to_surface(model, seen.maps, mesh, places[start : start + rays_per_batch])
+            parts.append(moved.select(in_box(moved.points, box) & region(moved.points, moved.facing)))
+            placed += len(parts[-1])
+            done(placed)
+        return join(parts)
+
+    with progress_bar("spreading points", "points", num_points) as done:
+        found = even_points(mesh.vertices, mesh.triangles, num_points, keep, seed)
+    if not found:
+        raise InputError("no point of the object lies in the region that was asked for; make it larger.")
+    return join(found)
+
+
+@torch.no_grad()
+def _moved_to_surface(
+    model: SpectralModel, maps: DepthMaps, mesh: SurfaceMesh, places: Float[np.ndarray, "n 3"]
+) -> SurfacePoints:
+    """Places near the surface, moved on to it along the rays that see them from the front; the others left out."""
+    points = torch.from_numpy(places).float().to(model.device)
+    facing = mesh.normals_at(places)
+    frames, pixels = most_frontal(maps, points, torch.from_numpy(facing).to(points))
+    chosen = frames >= 0
+    points, frames, pixels = points[chosen], frames[chosen], pixels[chosen]
+    origins = maps.camera_to_world[frames, :3, 3]
+    away = points - origins
+    distances = away.norm(dim=-1, keepdim=True)
+    directions = away / distances
+    depth, opacity = surface_along(model, origins, directions, distances)
+    # What lies at the end of the search is something else, or nothing.
+    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() < 0.5 * SEARCH_DEPTH)[:, 0]
+    found = (origins + directions * depth)[met]
+    return SurfacePoints(
+        found.cpu().numpy(),
+        facing[chosen.cpu().numpy()][met.cpu().numpy()],
+        frames[met].cpu().numpy(),
+        pixels[met].cpu().numpy(),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedPoints:
+    """What the rays see that end at points of the surface.
+
+    Attributes:
+        spectra: reflectance, without the background's share.
+        opacity: what the rays collect, in [0, 1].
+        colours: red, green, blue in [0, 1].
+        normals: unit vectors.
+    """
+
+    spectra: Float[Tensor, "n bands"]
+    opacity: Float[Tensor, "n"]
+    colours: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+
+
+@torch.no_grad()
+def render_points(
+    model: SpectralModel,
+    cameras: Cameras,
+    cloud: SurfacePoints,
+    rgb_output_name: str = "rgb",
+    normal_output_name: str = "normals",
+    reorient_normals: bool = True,
+) -> RenderedPoints:
+    """Render the ray of each point.
+
+    Args:
+        model: trained model, in evaluation mode.
+        cameras: the training cameras.
+        cloud: points of the surface.
+        rgb_output_name: the output shown as colours; ``rgb`` is three bands of the spectra.
+        normal_output_name: ``normals`` are those of the density, other names the model's outputs.
+        reorient_normals: turn the normals to the side that the ray comes from.
+
+    Raises:
+        InputError: the model has no such output.
+    """
+    rays = camera_rays(cameras, cloud.frames, cloud.places, model.device)
+    background = model.spectra_behind(rays)  # before the model corrects the rays
+    outputs = model(rays)
+    opacity = outputs["accumulation"]
+    # What the ray collected beside the background's share is the object's own spectrum.
+    spectra = (outputs["spectral"] - background * (1.0 - opacity)) / opacity.clamp_min(_LEAST_OPACITY)
+    spectra = spectra.clamp(0.0, 1.0)
+    if rgb_output_name == "rgb":
+        colours = spectra[:, model.rgb_bands]
+    else:
+        colours = model_output(outputs, rgb_output_name, "rgb")
+        if colours.shape[1:] != (3,):
+            raise InputError(f"--rgb-output-name {rgb_output_name}: is no picture of red, green and blue; take rgb.")
+    if normal_output_name == "normals":
+        points = torch.from_numpy(cloud.points).float().to(model.device)
+        normals = -functional.normalize(model.field.density_gradient(points), dim=-1)
+    else:
+        # The model's outputs are pictures: -1 to 1 is shown as 0 to 1.
+        normals = functional.normalize(2.0 * model_output(outputs, normal_output_name, "normal") - 1.0, dim=-1)
+    if reorient_normals:
+        away = (normals * rays.directions).sum(dim=-1, keepdim=True) > 0.0
+        normals = torch.where(away, -normals, normals)
+    return RenderedPoints(spectra, opacity[:, 0], colours.clamp(0.0, 1.0), normals)
 
 
 def sample_surface_points(
@@ -55,90 +222,13 @@ def sample_surface_points(
     masks: Bool[np.ndarray, "frames lines samples"],
     num_points: int,
     rays_per_batch: int,
-    box: Float[torch.Tensor, "2 3"],
+    box: Float[Tensor, "2 3"],
     seed: int = 0,
 ) -> SurfacePoints:
-    """Shoot rays through random places of the foreground and keep where they meet the surface (scene units).
-
-    Args:
-        model: trained model, in evaluation mode.
-        cameras: the training cameras.
-        masks: foreground of each camera's frame.
-        num_points: how many points to return.
-        rays_per_batch: rays rendered at a time.
-        box: only points inside this box (scene units) are kept: it cuts the container away.
-        seed: of the random places.
+    """`look_from_cameras`, then `spread_points` over all that lies in the box (scene units).
 
     Raises:
-        InputError: the rays meet no surface, so the model holds no object.
+        InputError: the model holds no object.
     """
-    rng = np.random.default_rng(seed)
-    foreground = np.flatnonzero(masks)
-    kept: list[SurfacePoints] = []
-    found = fruitless = 0
-    with Progress(
-        TextColumn("[bold]sampling the surface"),
-        BarColumn(),
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f} points"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    ) as progress:
-        task = progress.add_task("", total=num_points)
-        while found < num_points:
-            chosen = rng.choice(foreground, min(rays_per_batch, model.config.eval_num_rays_per_chunk))
-            rays = _rays_through(cameras, np.stack(np.unravel_index(chosen, masks.shape), axis=1), rng)
-            batch = _surface_of_rays(model, rays.to(model.device), box.to(model.device))
-            kept.append(batch)
-            found += len(batch.points)
-            fruitless = 0 if len(batch.points) else fruitless + 1
-            if fruitless >= _MAX_FRUITLESS_BATCHES:
-                raise InputError(
-                    "the model holds no object: no ray through the foreground reaches an opacity of "
-                    f"{MIN_OPACITY}; train longer, and look at the masks in the dataset's report folder."
-                )
-            progress.update(task, completed=min(found, num_points))
-    joined = SurfacePoints(*(np.concatenate(parts) for parts in zip(*(vars(b).values() for b in kept), strict=True)))
-    return joined.select(np.arange(num_points))
-
-
-def _rays_through(cameras: Cameras, pixels: np.ndarray, rng: np.random.Generator) -> RayBundle:
-    """Rays through a random place inside each (frame, line, sample) pixel."""
-    places = pixels[:, 1:] + rng.random((len(pixels), 2))
-    return cameras.generate_rays(
-        camera_indices=torch.from_numpy(pixels[:, :1]), coords=torch.from_numpy(places).float()
-    )
-
-
-def _surface_depth(
-    model: SpectralModel, rays: RayBundle, median_depth: Float[torch.Tensor, "n 1"]
-) -> Float[torch.Tensor, "n 1"]:
-    """Depth of the surface, sought in fine steps around the median depth of the rendering."""
-    offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=median_depth.device)
-    edges = (median_depth + offsets).clamp_min(0.0)
-    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
-    positions = rays.origins[:, None] + rays.directions[:, None] * middles[..., None]
-    densities = model.field.density_fn(positions)[..., 0]
-    return opacity_crossing_depth(edges, densities, SURFACE_OPACITY)[:, None]
-
-
-@torch.no_grad()
-def _surface_of_rays(model: SpectralModel, rays: RayBundle, box: Float[torch.Tensor, "2 3"]) -> SurfacePoints:
-    """The surface points that rays hit inside the box."""
-    background = model.spectra_behind(rays)  # before the model corrects the rays
-    outputs = model(rays)
-    points = rays.origins + rays.directions * _surface_depth(model, rays, outputs["depth"])
-    opacity = outputs["accumulation"]
-    hit = (opacity[:, 0] > MIN_OPACITY) & ((points > box[0]) & (points < box[1])).all(dim=-1)
-    points, opacity = points[hit], opacity[hit]
-    # What the ray collected beside the background's share is the object's own spectrum.
-    spectra = ((outputs["spectral"][hit] - background[hit] * (1.0 - opacity)) / opacity).clamp(0.0, 1.0)
-    normals = -torch.nn.functional.normalize(model.field.density_gradient(points), dim=-1)
-    facing = (normals * rays.directions[hit]).sum(dim=-1, keepdim=True) <= 0
-    return SurfacePoints(
-        points=points.cpu().numpy(),
-        normals=torch.where(facing, normals, -normals).cpu().numpy(),
-        colours=(spectra[:, model.rgb_bands] * 255.0).round().byte().cpu().numpy(),
-        spectra=spectra.cpu().numpy(),
-    )
+    seen = look_from_cameras(model, cameras, masks, rays_per_batch)
+    return spread_points(model, seen, num_points, rays_per_batch, box.cpu().numpy(), everywhere, seed)

@@ -1,66 +1,165 @@
-"""What ``ns-export pointcloud`` does for a run of hsi-sc-nerf."""
+"""The spectral cloud of a trained run, written piece by piece: what `ns-export pointcloud` and our command do."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.scripts.exporter import ExportPointCloud
-from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.camera_views import SeenSurface, look_from_cameras
 from hsi_sc_nerf.export.clean import estimate_normals, statistical_inliers
-from hsi_sc_nerf.export.ply import write_spectral_ply
-from hsi_sc_nerf.export.point_cloud import SurfacePoints, sample_surface_points
-from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
+from hsi_sc_nerf.export.formats import require_format, write_cloud
+from hsi_sc_nerf.export.options import CloudOptions
+from hsi_sc_nerf.export.point_cloud import Region, SurfacePoints, everywhere, render_points, spread_points
+from hsi_sc_nerf.export.progress import progress_bar
+from hsi_sc_nerf.export.regions import chosen_bands, in_box, in_cylinder
+from hsi_sc_nerf.export.roi_masks import in_roi_masks, read_roi_masks
+from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
+from hsi_sc_nerf.export.view_spread import COLUMNS, MeasuredFrames, spread_over_views
+
+if TYPE_CHECKING:
+    from nerfstudio.scripts.exporter import ExportPointCloud
+
+NAME = "point_cloud"
 
 
 def export_spectral_point_cloud(options: ExportPointCloud) -> None:
-    """Write ``point_cloud.ply`` in metres and the object frame, with a property for each band.
+    """What `ns-export pointcloud` does for a run of hsi-sc-nerf: ``point_cloud.ply``, metres, object frame.
 
     Raises:
         SystemExit: with one sentence, where the model holds no object or the file cannot be written.
     """
-    _, pipeline, _, _ = eval_setup(options.load_config)
-    manager = cast(SpectralDataManager, pipeline.datamanager)
-    model = cast(SpectralModel, pipeline.model)
-    scene = manager.train_dataparser_outputs
     try:
-        cloud = sample_surface_points(
-            model,
-            manager.train_dataset.cameras,
-            manager.train_pixel_sampler.masks,
-            options.num_points,
-            options.num_rays_per_batch,
-            box=scene.metadata["object_box"],
-        )
-        cloud = _finish(cloud, options)
-        centre = -scene.dataparser_transform[:, 3].numpy()
-        points_m = np.asarray(cloud.points / scene.dataparser_scale + centre, np.float32)
-        path = Path(options.output_dir) / "point_cloud.ply"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        wavelengths_nm = model.wavelengths_nm
-        write_spectral_ply(path, points_m, cloud.normals, cloud.colours, cloud.spectra, wavelengths_nm)
+        export_cloud(open_run(options.load_config), options.output_dir, CloudOptions.from_nerfstudio(options))
     except InputError as error:
         raise SystemExit(f"hsi-sc-nerf: {error}") from error
-    CONSOLE.print(f"[bold green]{len(points_m):,} points with {len(wavelengths_nm)} bands, in metres: {path}")
 
 
-def _finish(cloud: SurfacePoints, options: ExportPointCloud) -> SurfacePoints:
-    """Crop, clean and give normals as nerfstudio's options say."""
+def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Path:
+    """Write the cloud of a run to ``OUTPUT_DIR/point_cloud.*`` (metres, object frame) and return its path.
+
+    Columns beside spectra, normals and colours: ``opacity`` of the point's ray, and `view_spread.COLUMNS`.
+
+    Raises:
+        InputError: the model holds no object, an option cannot be met, or the file cannot be written.
+    """
+    require_format(options.format)
+    bands = chosen_bands(run.model.wavelengths_nm, options.bands)
+    sampler = run.manager.train_pixel_sampler
+    masks = np.ones_like(sampler.masks) if options.keep_turntable else sampler.masks
+    batch = min(options.num_rays_per_batch, run.model.config.eval_num_rays_per_chunk)
+    cameras = run.manager.train_dataset.cameras
+    seen = look_from_cameras(run.model, cameras, masks, batch, options.depth_output_name)
+    box_m = run.dataset.scene_box_m if options.keep_turntable else run.dataset.object_box_m
+    surface = spread_points(
+        run.model, seen, options.num_points, batch, run.to_scene(box_m), _region(run, seen, options)
+    )
+    if options.remove_outliers:
+        surface = surface.select(statistical_inliers(surface.points, options.std_ratio))
+    normals = None
+    if options.normal_method == "open3d":
+        facing = surface.facing if options.reorient_normals else np.zeros_like(surface.facing)
+        normals = estimate_normals(surface.points, facing)
+    flags = None
+    if run.dataset.flagged_values:
+        flags = np.stack([frame.flags() for frame in run.manager.train_dataset.frames])
+    pieces = _Pieces(run, seen, MeasuredFrames(sampler.reader, flags), surface, normals, bands, options, batch)
+    wavelengths_nm = run.model.wavelengths_nm[bands]
+    cloud = CloudStream(len(surface), wavelengths_nm, ("opacity", *COLUMNS), pieces)
+    path = write_cloud(Path(output_dir) / NAME, cloud, options.format)
+    CONSOLE.print(f"[bold green]{cloud.count:,} points with {len(bands)} bands, in metres: {path}", soft_wrap=True)
+    return path
+
+
+def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region:
+    """Which points the options keep."""
+    tests: list[Region] = []
     if options.obb_center is not None and options.obb_rotation is not None and options.obb_scale is not None:
         crop = OrientedBox.from_params(options.obb_center, options.obb_rotation, options.obb_scale)
-        cloud = cloud.select(crop.within(torch.from_numpy(cloud.points)).numpy())
-        if len(cloud.points) == 0:
-            raise InputError("the oriented box holds no point of the object; check --obb-center and --obb-scale.")
-    if options.remove_outliers:
-        cloud = cloud.select(statistical_inliers(cloud.points, options.std_ratio))
-    if options.normal_method == "open3d":
-        cloud = replace(cloud, normals=estimate_normals(cloud.points, facing=cloud.normals))
-    return cloud
+        tests.append(lambda points, _: crop.within(torch.from_numpy(points).float()).numpy())
+    if options.roi_box is not None:
+        box_m = np.reshape(options.roi_box, (2, 3))
+        tests.append(lambda points, _: in_box(run.to_metres(points), box_m))
+    if options.roi_cylinder is not None:
+        x, y, radius_m, *z_m = options.roi_cylinder
+        tests.append(lambda points, _: in_cylinder(run.to_metres(points), (x, y), radius_m, (z_m[0], z_m[1])))
+    if options.roi_masks is not None:
+        device, (lines, samples) = run.model.device, seen.maps.masks.shape[1:]
+        painted = read_roi_masks(options.roi_masks, run.manager.train_dataset.frames, (lines, samples))
+        masks = {frame: torch.from_numpy(mask).to(device) for frame, mask in painted.items()}
+
+        def in_painted(points: np.ndarray, facing: np.ndarray) -> np.ndarray:
+            where, outwards = (torch.from_numpy(array).float().to(device) for array in (points, facing))
+            return in_roi_masks(masks, seen.maps, where, outwards).cpu().numpy()
+
+        tests.append(in_painted)
+
+    def region(points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        return np.logical_and.reduce([test(points, facing) for test in (everywhere, *tests)])
+
+    return region
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """The cloud's pieces, rendered when they are asked for."""
+
+    run: TrainedRun
+    seen: SeenSurface
+    measured: MeasuredFrames
+    surface: SurfacePoints
+    normals: Float[np.ndarray, "n 3"] | None
+    bands: Int[np.ndarray, "bands"]
+    options: CloudOptions
+    batch: int
+
+    def __iter__(self) -> Iterator[SpectralCloud]:
+        with progress_bar("rendering spectra", "points", len(self.surface)) as done:
+            for start in range(0, len(self.surface), CHUNK_POINTS):
+                rows = slice(start, start + CHUNK_POINTS)
+                piece = self.surface.select(rows)
+                yield self._rendered(piece, None if self.normals is None else self.normals[rows])
+                done(start + len(piece))
+
+    def _rendered(self, piece: SurfacePoints, normals: np.ndarray | None) -> SpectralCloud:
+        model, options = self.run.model, self.options
+        rendered = SpectralCloud(
+            np.asarray(self.run.to_metres(piece.points), np.float32),
+            np.empty((len(piece), 3), np.float32),
+            np.empty((len(piece), 3), np.uint8),
+            np.empty((len(piece), len(self.bands)), np.float32),
+            model.wavelengths_nm[self.bands],
+            {"opacity": np.empty(len(piece), np.float32)},
+        )
+        bands = torch.from_numpy(self.bands).to(model.device)
+        for start in range(0, len(piece), self.batch):
+            rows = slice(start, start + self.batch)
+            rays = render_points(
+                model,
+                self.run.manager.train_dataset.cameras,
+                piece.select(rows),
+                options.rgb_output_name,
+                options.normal_output_name,
+                options.reorient_normals,
+            )
+            rendered.spectra[rows] = rays.spectra[:, bands].cpu().numpy()
+            rendered.extra["opacity"][rows] = rays.opacity.cpu().numpy()
+            rendered.colours[rows] = to_8_bit(rays.colours.cpu().numpy())
+            rendered.normals[rows] = rays.normals.cpu().numpy()
+        if normals is not None:
+            rendered.normals[:] = normals
+        points, facing = (torch.from_numpy(a).float().to(model.device) for a in (piece.points, piece.facing))
+        rendered.extra.update(
+            spread_over_views(points, facing, rendered.spectra, self.bands, self.seen.maps, self.measured)
+        )
+        return rendered
