@@ -13,8 +13,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation import comparison
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
 from hsi_sc_nerf.evaluation.comparison_report import write_comparison
-from hsi_sc_nerf.evaluation.registration import Registration, Rival, Similarity
+from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.seen_surface import seen_points
+from hsi_sc_nerf.evaluation.similarity import Similarity
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.evaluation.threshold_curves import score_at

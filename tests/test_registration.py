@@ -6,12 +6,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.evaluation.registration import (
-    Similarity,
     align_by_features,
     plane_step,
     refine,
     robust_radius,
 )
+from hsi_sc_nerf.evaluation.similarity import Similarity
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 
 

@@ -15,11 +15,11 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import (
     Registration,
-    Similarity,
     align_by_features,
     refine,
     robust_radius,
 )
+from hsi_sc_nerf.evaluation.similarity import Similarity
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.evaluation.threshold_curves import (
