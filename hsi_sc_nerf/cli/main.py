@@ -10,24 +10,34 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
+from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
+from hsi_sc_nerf.cli.export import ExportCommand
 from hsi_sc_nerf.cli.process import ProcessCommand
+from hsi_sc_nerf.cli.render import RenderCommand
+from hsi_sc_nerf.cli.report import ReportCommand
+from hsi_sc_nerf.cli.sample import SampleCommand
 from hsi_sc_nerf.cli.simulate import SimulateCommand
+from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 
 Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
+    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
+    | Annotated[SampleCommand, tyro.conf.subcommand("sample")]
+    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
+    | Annotated[TraitsCommand, tyro.conf.subcommand("traits")]
+    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
     | Annotated[BenchmarkCommand, tyro.conf.subcommand("benchmark")]
 )
 
 
 def main() -> None:
     """Run the command that the user asked for; bad input ends in one sentence and status 2."""
-    command: DemoCommand | SimulateCommand | ProcessCommand | BenchmarkCommand = tyro.cli(
-        Commands, description=__doc__
-    )
+    command = tyro.cli(Commands, description=__doc__)  # type: ignore[var-annotated]
     try:
         command.main()
     except InputError as error:
