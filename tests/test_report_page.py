@@ -168,6 +168,7 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run):
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser")
 def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
     """No message in the console, colours that follow from the numbers, the spectrum of the point under a click."""

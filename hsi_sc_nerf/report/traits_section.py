@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.report.blocks import Missing, Section, Table
+from hsi_sc_nerf.report.blocks import Block, Folded, Missing, Section, Table
 
 _UNITS = {"m": "m", "m2": "m²", "l": "L", "rad": "rad", "deg": "°", "nm": "nm", "percent": "%"}
 _COMMAND = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
@@ -30,11 +30,28 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None)
     """
     if traits is None:
         return Section("traits", "Traits", [Missing("The object's traits were not measured.", _COMMAND)])
-    rows = list(trait_rows({key: part for key, part in traits.items() if key not in _NOT_SHOWN}))
-    if not rows:
+    shown = {key: part for key, part in traits.items() if key not in _NOT_SHOWN}
+    everything, summary = list(trait_rows(shown)), list(trait_rows(_without_lists(shown)))
+    if not everything:
         raise InputError(f"{source}: holds no traits; make it again with `hsi-sc-nerf traits`.")
     caption = "±: standard deviation, over resampled points for sizes and over the surface for spectra."
-    return Section("traits", "Traits", [Table(caption, ("", "value", "±", "unit"), rows)])
+    header = ("", "value", "±", "unit")
+    blocks: list[Block] = [Table(caption, header, summary)]
+    if len(everything) > len(summary):
+        blocks.append(Folded("All entries, each region by itself", [Table(caption, header, everything)]))
+    return Section("traits", "Traits", blocks)
+
+
+def _without_lists(content: Any) -> Any:
+    """Nested mappings without what they hold in lists of mappings."""
+    if not isinstance(content, Mapping):
+        return content
+    parts = {key: part for key, part in content.items() if not _lists_mappings(part)}
+    return {key: _without_lists(part) for key, part in parts.items()}
+
+
+def _lists_mappings(content: Any) -> bool:
+    return isinstance(content, list) and any(isinstance(part, Mapping) for part in content)
 
 
 def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> Iterator[Row]:
@@ -58,7 +75,7 @@ def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> 
             if not (key.endswith("_sd") and key.removesuffix("_sd") in content):
                 inner = spread.get(key) if isinstance(spread, Mapping) else content.get(f"{key}_sd")
                 yield from trait_rows(part, (*path, key), inner)
-    elif isinstance(content, list) and any(isinstance(part, Mapping) for part in content):
+    elif _lists_mappings(content):
         for number, part in enumerate(content, start=1):
             label = f"{part['label']} {number}" if isinstance(part, Mapping) and "label" in part else str(number)
             yield from trait_rows(part, (*path, label))

@@ -9,7 +9,7 @@ void main() {
   gl_PointSize = max(1.0, size / gl_Position.w);
   vec3 to_eye = normalize(eye - position);
   float facing = dot(normal, to_eye) / max(length(normal), 0.001);
-  if (facing < -0.15 && length(normal) > 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  if (facing < -0.3 && length(normal) > 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   shown = colour * mix(1.0, 0.35 + 0.65 * max(facing, 0.0), shading);
 }`;
 const FRAGMENT_SHADER = `
@@ -28,7 +28,7 @@ class Renderer {
     const gl = canvas.getContext("webgl", { antialias: true, preserveDrawingBuffer: true });
     if (!gl) throw new Error("this browser has no WebGL");
     this.canvas = canvas; this.gl = gl; this.cloud = cloud;
-    this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0.08];
+    this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0];
     this.size = 1; this.shading = 0; this.marks = [];
     const program = gl.createProgram();
     for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
@@ -48,7 +48,7 @@ class Renderer {
     this.colourBuffer = this.attribute("colour", new Uint8Array(3 * cloud.count), gl.UNSIGNED_BYTE);
     gl.enable(gl.DEPTH_TEST);
     // Some times the distance of neighbours on a surface of about the object's area covers the gaps between them.
-    this.spacing = 2.8 * Math.sqrt((4 * Math.PI * 0.3) / cloud.count);
+    this.spacing = 3.2 * Math.sqrt((4 * Math.PI * 0.3) / cloud.count);
   }
 
   attribute(name, values, type) {
