@@ -18,6 +18,7 @@ FINEST_VOXEL = 1 / 160
 cell of the depth maps covers on the surface."""
 BAND_VOXELS = 4
 """Signed distances are kept this far around the surface."""
+NORMAL_VERTICES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,13 @@ class SurfaceMesh:
     triangles: Int[np.ndarray, "t 3"]
 
     def normals_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Outward unit normals of the vertices nearest to the points: of their triangles, weighted by area."""
-        return self._vertex_normals[self._nearest.query(points)[1]]
+        """Outward unit normals: mean of the triangles at the ``NORMAL_VERTICES`` nearest vertices, weighted by area.
+
+        One vertex's own are as rough as the voxels, above all where the mesh ends.
+        """
+        _, nearest = self._nearest.query(points, k=min(NORMAL_VERTICES, len(self.vertices)))
+        normals = self._vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
     @cached_property
     def _nearest(self) -> cKDTree:
@@ -42,7 +48,7 @@ class SurfaceMesh:
         normals = np.zeros_like(self.vertices)
         for corner in range(3):
             np.add.at(normals, self.triangles[:, corner], doubled_areas)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        return normals
 
 
 @torch.no_grad()
