@@ -3,10 +3,10 @@
     uv run python benchmarks/export_evenness.py SESSION point_cloud.ply
 
 The part of the true mesh that at least one frame sees, less than 80 degrees from the front, is cut into patches
-around evenly spread centres. The spread of points per area over the patches is compared with chance (points thrown at the
-surface independently) and with rays through random pixels, whose density is the sum of cos / distance^2 over frames
-that see a place. What is uneven is told by height: a stalk that the model makes too thick gets more points, and what
-the dataset's masks leave out, less.
+around evenly spread centres. The spread of points per area over the patches is compared with chance (points thrown
+at the surface independently) and with rays through random pixels, whose density is the sum of cos / distance^2 over
+frames that see a place. What is uneven is told by height: a stalk that the model makes too thick gets more points,
+and what the dataset's masks leave out, less.
 """
 
 from __future__ import annotations
