@@ -103,9 +103,10 @@ def _size_rows(surface: SpectralMesh, ideal: SpectralMesh, cloud: SpectralCloud)
 
 
 def _roi_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
-    """Mean spectra of spots all over the seen surface."""
+    """Mean spectra of spots all over the seen surface, clear of the base."""
     rng = np.random.default_rng(0)
-    chances = np.where(ideal.seen, ideal.areas_m2, 0.0)
+    height_m = ideal.mesh.vertices[:, 2] - ideal.mesh.vertices[:, 2].min()
+    chances = np.where(ideal.seen & (height_m > 2.0 * ROI_RADIUS_M), ideal.areas_m2, 0.0)
     centres = ideal.mesh.vertices[rng.choice(len(chances), ROIS, p=chances / chances.sum())]
     errors = []
     for centre in centres:

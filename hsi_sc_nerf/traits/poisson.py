@@ -70,9 +70,9 @@ def _poisson(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
     cloud.normals = o3d.utility.Vector3dVector(normals)
-    # Its warnings are of samples that the base has too many of.
+    # On several threads Open3D's reconstruction now and then crashes (Open3D issue 6828), and no two runs agree.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth)
+        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     mesh.remove_degenerate_triangles()
     return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
 
