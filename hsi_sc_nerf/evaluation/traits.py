@@ -18,7 +18,7 @@ from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra.composites import composite
 
 # A surface point is seen where a camera's ray ends at it, to within this.
-_OCCLUSION_M = 0.0003
+_OCCLUSION_M = 0.0001
 
 
 @dataclass(frozen=True)
