@@ -24,7 +24,7 @@ from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.traits.analysis import classified
 from hsi_sc_nerf.traits.library import SpectralLibrary
-from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh
+from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.traits.regions import PickedRegion, region_spectrum
 from hsi_sc_nerf.traits.size import size_of
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh, with_spectra
@@ -74,7 +74,7 @@ class TraitsAccuracy:
         )
         rows = [*_size_rows(surface, ideal, cloud), *_roi_rows(surface, ideal), *_class_rows(surface, true, ideal)]
         page = markdown_table(["trait", "measured", "true", "error"], rows)
-        page += f"\n\nwatertight: {mesh.is_watertight()}; {len(cloud.points)} points; {seconds:.0f} s"
+        page += f"\n\nopen edges: {open_edges(mesh)}; {len(cloud.points)} points; {seconds:.0f} s"
         print(page)
         if self.output:
             with atomic_write(self.output) as (temporary,):

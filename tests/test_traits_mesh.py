@@ -6,12 +6,14 @@ import pytest
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.mesh import Mesh, cylinder
 from hsi_sc_nerf.traits.base import SECTORS, find_base
-from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh, largest_piece
+from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh, open_edges, solid_pieces
 from hsi_sc_nerf.traits.size import feret_diameters, size_of, size_spread
 from hsi_sc_nerf.traits.smoothing import smoothed, thinned
 
 RADIUS_M = 0.03
 STAND_M = 0.07
+SPECK = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+"""A tetrahedron."""
 
 
 def sphere_points(count, seed=0, noise_m=0.0, above=-1.0):
@@ -82,7 +84,7 @@ def test_closed_sphere_has_its_area_and_volume(noise_m):
     points, normals = sphere_points(20000, noise_m=noise_m, above=-0.93)
     mesh = closed_mesh(points, normals, MeshConfig(octree_depth=6, base_height_m=STAND_M))
     size = size_of(mesh)
-    assert mesh.is_watertight()
+    assert open_edges(mesh) == 0
     assert size.area_m2 == pytest.approx(4.0 * np.pi * RADIUS_M**2, rel=0.01)
     assert size.volume_l == pytest.approx(4000.0 / 3.0 * np.pi * RADIUS_M**3, rel=0.01)
     assert size.height_m == pytest.approx(2.0 * RADIUS_M, rel=0.01)
@@ -90,16 +92,36 @@ def test_closed_sphere_has_its_area_and_volume(noise_m):
         assert diameter_m == pytest.approx(2.0 * RADIUS_M, rel=0.015)
 
 
-def test_what_floats_beside_the_object_is_left_out():
-    one, other = cylinder(0.02, 0.03, segments=16), cylinder(0.01, 0.01, segments=8).moved(np.array([0.1, 0.0, 0.0]))
-    both = Mesh(
-        np.concatenate([other.vertices, one.vertices]),
-        np.concatenate([other.triangles, one.triangles + len(other.vertices)]),
-    )
-    kept = largest_piece(both)
-    assert len(kept.vertices) == len(one.vertices)
+def joined(*meshes):
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    triangles = [mesh.triangles + start for mesh, start in zip(meshes, first, strict=True)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles))
+
+
+def test_a_loose_stem_stays_and_specks_and_bubbles_go():
+    fruit = cylinder(0.06, 0.06, segments=64, step_m=0.002)
+    stem = cylinder(0.004, 0.01, segments=16).moved(np.array([0.0, 0.0, 0.07]))
+    speck = Mesh(np.array([[0.1, 0, 0], [0.11, 0, 0], [0.1, 0.01, 0], [0.1, 0, 0.01]]), SPECK)
+    bubble = cylinder(0.02, 0.02, segments=64).moved(np.array([0.0, 0.0, 0.02]))
+    inside_out = Mesh(bubble.vertices, bubble.triangles[:, ::-1])
+    kept = solid_pieces(joined(speck, stem, inside_out, fruit))
+    assert len(kept.vertices) == len(fruit.vertices) + len(stem.vertices)
+    assert kept.volume_m3() == pytest.approx(fruit.volume_m3() + stem.volume_m3())
     assert kept.is_watertight()
-    assert kept.volume_m3() == pytest.approx(one.volume_m3())
+
+
+def test_open_edges_are_those_of_a_hole():
+    mesh = cylinder(0.02, 0.03, segments=16)
+    assert open_edges(mesh) == 0
+    assert open_edges(Mesh(mesh.vertices, mesh.triangles[1:])) == 3
+    # Two wedges that touch along an edge: four triangles meet there.
+    other = Mesh(np.array([[1.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 2.0]]), SPECK)
+    mirrored = Mesh(2.0 - other.vertices + [0.0, 0.0, 1.0], SPECK[:, ::-1])
+    pinched = joined(other, mirrored)
+    shared = pinched.triangles.copy()
+    shared[shared == 4 + 3], shared[shared == 4] = 0, 3
+    assert open_edges(Mesh(pinched.vertices, shared)) == 0
+    assert not Mesh(pinched.vertices, shared).is_watertight()
 
 
 def test_sizes_of_a_cylinder():
@@ -120,12 +142,12 @@ def test_feret_diameters_of_a_turned_rectangle():
 
 def test_bootstrap_spread_is_that_of_independent_clouds():
     config = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
-    clouds = [sphere_points(3000, seed, 0.0005, above=-0.93) for seed in range(13)]
+    clouds = [sphere_points(3000, seed, 0.0005, above=-0.93) for seed in range(9)]
     volumes = [size_of(closed_mesh(*cloud, config)).volume_l for cloud in clouds[1:]]
     told = []
-    spread = size_spread(*clouds[0], config, resamples=12, done=told.append)
-    assert told == list(range(1, 13))
-    # Twelve of each: the ratio of two such standard deviations lies within 0.53 to 1.9 nineteen times in twenty.
+    spread = size_spread(*clouds[0], config, resamples=8, done=told.append)
+    assert told == list(range(1, 9))
+    # The ratio of two standard deviations from eight each lies within 0.45 to 2.2 nineteen times in twenty.
     assert 0.4 < spread.volume_l / np.std(volumes, ddof=1) < 2.5
 
 

@@ -116,6 +116,7 @@ class TraitsCommand:
     ) -> None:
         """Pictures, the mesh and tables; the page, which names them, comes last."""
         from hsi_sc_nerf.traits import pictures, report
+        from hsi_sc_nerf.traits.poisson import open_edges
         from hsi_sc_nerf.traits.spectral_mesh import write_mesh
 
         views = pictures.SideViews(surface.mesh)
@@ -135,7 +136,7 @@ class TraitsCommand:
         extra = {} if traits.classes is None else {"class": traits.classes.labels.astype("float32")}
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
-        watertight = surface.mesh.is_watertight()
+        watertight = open_edges(surface.mesh) == 0
         settings = {"cloud": self.cloud.name, **asdict(config), "resamples": self.resamples}
         report.write_traits_json(self.output_dir / "traits.json", size, spread, watertight, traits, settings)
         report.write_page(self.output_dir / "traits.md", self.cloud.name, size, spread, watertight, traits, drawn)

@@ -17,6 +17,8 @@ from hsi_sc_nerf.traits.smoothing import NEIGHBOURS, smoothed, thinned
 
 # Points that a quadric is fitted to lie a third of its radius apart: about thirty weigh in.
 _THINNING = 3.0
+# Share of the triangles below which a piece is a speck.
+_SMALLEST_PIECE = 0.001
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,7 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
     """The closed surface of an object that stands upright, its base flat.
 
     The points are thinned and smoothed, the base that no camera saw is closed (`find_base`), and the whole goes
-    through screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D). What floats beside the largest piece is
-    left out.
+    through screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D), of which specks are left out.
 
     Args:
         points_m: the seen surface, z up.
@@ -60,7 +61,7 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
         )
     points, outward = smoothed(points, facing, config.smoothing_radius_m)
     base_points, base_normals = find_base(points, outward, config.base_height_m).points(spacing_m)
-    return largest_piece(
+    return solid_pieces(
         _poisson(np.concatenate([points, base_points]), np.concatenate([outward, base_normals]), config.octree_depth)
     )
 
@@ -84,9 +85,27 @@ def pieces(triangles: np.ndarray, vertices: int) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def largest_piece(mesh: Mesh) -> Mesh:
-    """The connected piece with the most triangles, without vertices that none of them uses."""
+def solid_pieces(mesh: Mesh) -> Mesh:
+    """The connected pieces that are solid and not tiny, without vertices that none of their triangles uses.
+
+    A stem that the cloud does not join to its fruit stays; specks, and bubbles inside the object, whose volume is
+    negative, go.
+    """
     piece = pieces(mesh.triangles, len(mesh.vertices))[mesh.triangles[:, 0]]
-    triangles = mesh.triangles[piece == np.bincount(piece).argmax()]
+    share = np.bincount(piece) / len(piece)
+    a, b, c = (mesh.vertices[corner] for corner in mesh.triangles.T)
+    volume = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    triangles = mesh.triangles[((share >= _SMALLEST_PIECE) & (volume > 0.0))[piece]]
     used, renumbered = np.unique(triangles, return_inverse=True)
     return Mesh(mesh.vertices[used], renumbered.reshape(triangles.shape))
+
+
+def open_edges(mesh: Mesh) -> int:
+    """How many edges are not run along as often one way as the other; a mesh with none encloses a volume.
+
+    Unlike `Mesh.is_watertight`, this lets four triangles meet in an edge, as where two parts of a surface touch.
+    """
+    t = mesh.triangles.astype(np.int64)
+    start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
+    edge, which = np.unique(np.minimum(start, end) * len(mesh.vertices) + np.maximum(start, end), return_inverse=True)
+    return int(np.count_nonzero(np.bincount(which, np.where(start < end, 1.0, -1.0), minlength=len(edge))))

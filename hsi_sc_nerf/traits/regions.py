@@ -90,10 +90,11 @@ def read_regions(path: Path) -> list[PickedRegion]:
     """
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        return [
-            picked_region(str(name), *map(float, entry["centre_m"]), float(entry["radius_m"]))
-            for name, entry in content.items()
-        ]
+        regions = []
+        for name, entry in content.items():
+            x_m, y_m, z_m = map(float, entry["centre_m"])
+            regions.append(picked_region(str(name), x_m, y_m, z_m, float(entry["radius_m"])))
+        return regions
     except FileNotFoundError as error:
         raise InputError(f"{path}: there is no such file; give a YAML file of regions.") from error
     except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:

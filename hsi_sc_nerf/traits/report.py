@@ -168,7 +168,9 @@ def _plus_minus(mean: np.ndarray, sd: np.ndarray, digits: int) -> str:
 
 
 def _plain(value: np.ndarray) -> Any:
-    return np.where(np.isfinite(value), value, None).tolist()
+    if np.ndim(value):
+        return [_plain(one) for one in value]
+    return float(value) if np.isfinite(value) else None
 
 
 def _picture(caption: str, name: str) -> str:
