@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.surface import opacity_crossing_depth
@@ -30,6 +31,8 @@ SEARCH_DEPTH = 0.1
 SEARCH_STEPS = 40
 DEPTH_RAYS = 300_000
 """Rays of all depth maps together; where frames have more pixels on the object, cells of several pixels share one."""
+CELLS_AROUND = 5
+"""Depth maps reach this far beyond the masks."""
 _DEPTH_TOLERANCE = 0.02
 """Scene units: about 2 mm."""
 
@@ -76,7 +79,7 @@ class SeenSurface:
 
     Attributes:
         maps: depth maps.
-        points: where the rays of the depth maps meet something, scene units.
+        points: where rays in the masks meet something, scene units.
     """
 
     maps: DepthMaps
@@ -91,7 +94,10 @@ def look_from_cameras(
     rays_per_batch: int,
     depth_output_name: str = "depth",
 ) -> SeenSurface:
-    """Depth maps of training cameras, in the cells that the masks touch.
+    """Depth maps of training cameras, in the cells that the masks touch and a little beyond them.
+
+    What a ray just beside the object passes through is known to be empty; without these rays, what is thinner than
+    the mesh's band of distances would swell.
 
     Args:
         model: trained model, in evaluation mode.
@@ -105,10 +111,10 @@ def look_from_cameras(
     """
     lines, samples = masks.shape[1:]
     cell_px = max(1, int(np.ceil(np.sqrt(masks.sum() / DEPTH_RAYS))))
-    down, across = -(-lines // cell_px), -(-samples // cell_px)
-    padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
-    cells = np.argwhere(padded.reshape(len(masks), down, cell_px, across, cell_px).any(axis=(2, 4)))
-    depths = torch.full((len(masks), down, across), torch.inf, device=model.device)
+    in_mask = _touched_cells(masks, cell_px)
+    around = np.stack([dilate(mask, 2 * CELLS_AROUND + 1) for mask in in_mask])
+    cells = np.argwhere(around)
+    depths = torch.full(around.shape, torch.nan, device=model.device)
     met = [np.zeros((0, 3), np.float32)]
     with progress_bar("seeking the surface", "rays", len(cells)) as done:
         for start in range(0, len(cells), rays_per_batch):
@@ -120,7 +126,8 @@ def look_from_cameras(
             depth, _ = surface_along(model, rays.origins, rays.directions, near_depth)
             hit = outputs["accumulation"][:, 0] > MIN_OPACITY
             depths[frame, line, sample] = torch.where(hit, depth[:, 0], torch.inf)
-            met.append((rays.origins + rays.directions * depth)[hit].cpu().numpy())
+            wanted = hit & torch.from_numpy(in_mask[frame, line, sample]).to(hit.device)
+            met.append((rays.origins + rays.directions * depth)[wanted].cpu().numpy())
             done(start + rays_per_batch)
     lens = PinholeIntrinsics(
         samples, lines, *(float(getattr(cameras, name)[0, 0]) for name in ("fx", "fy", "cx", "cy"))
@@ -136,6 +143,16 @@ def look_from_cameras(
         tolerance=_DEPTH_TOLERANCE,
     )
     return SeenSurface(maps, np.concatenate(met))
+
+
+def _touched_cells(
+    masks: Bool[np.ndarray, "frames lines samples"], cell_px: int
+) -> Bool[np.ndarray, "frames cells_down cells_across"]:
+    """Cells of some pixels' side that hold a pixel of the masks."""
+    frames, lines, samples = masks.shape
+    down, across = -(-lines // cell_px), -(-samples // cell_px)
+    padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
+    return padded.reshape(frames, down, cell_px, across, cell_px).any(axis=(2, 4))
 
 
 def model_output(outputs: dict[str, Tensor], name: str, option: str) -> Tensor:

@@ -20,7 +20,6 @@ from torch.nn import functional
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.camera_views import (
     MIN_OPACITY,
-    SEARCH_DEPTH,
     SeenSurface,
     camera_rays,
     look_from_cameras,
@@ -34,6 +33,8 @@ from hsi_sc_nerf.export.surface_mesh import SurfaceMesh, fuse_depth_maps
 from hsi_sc_nerf.export.visibility import DepthMaps, most_frontal
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
+FARTHEST_MOVE = 0.02
+"""Places are moved on to the surface by no more than this, scene units (about 2 mm)."""
 _LEAST_OPACITY = 1e-3
 
 
@@ -141,8 +142,8 @@ def _moved_to_surface(
     distances = away.norm(dim=-1, keepdim=True)
     directions = away / distances
     depth, opacity = surface_along(model, origins, directions, distances)
-    # What lies at the end of the search is something else, or nothing.
-    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() < 0.5 * SEARCH_DEPTH)[:, 0]
+    # What lies farther away is another part of the surface, which has its own places.
+    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() < FARTHEST_MOVE)[:, 0]
     found = (origins + directions * depth)[met]
     return SurfacePoints(
         found.cpu().numpy(),

@@ -57,8 +57,8 @@ def fuse_depth_maps(
 ) -> SurfaceMesh | None:
     """Mesh of the zero level of the mean truncated signed distance (Curless and Levoy 1996, SIGGRAPH).
 
-    There is a surface only where frames see one: nothing is closed. A frame says nothing of what its mask leaves out
-    or what lies more than ``BAND_VOXELS`` behind what it sees.
+    There is a surface only where frames see one: nothing is closed. A frame says nothing of where nobody looked or
+    what lies more than ``BAND_VOXELS`` behind what it sees.
 
     Args:
         maps: depth maps of all frames.
@@ -87,7 +87,7 @@ def fuse_depth_maps(
     for frame in range(len(maps.depths)):
         distances, depths = maps.depth_behind(frame, centres)
         signed = depths - distances
-        counts = signed > -band
+        counts = signed > -band  # NaN: nobody looked
         total += torch.where(counts, signed.clamp(max=band), 0.0)
         count += counts
     known = (count > 0).cpu().numpy()

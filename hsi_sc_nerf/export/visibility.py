@@ -26,7 +26,8 @@ class DepthMaps:
         camera_to_world: poses (OpenGL axes), refined.
         intrinsics: of the one camera.
         distortion: k1, k2, p1, p2 (OpenCV).
-        depths: distance from the camera to what it sees in the middle of each cell; infinite where it sees nothing.
+        depths: distance from the camera to what it sees in the middle of each cell; infinite where it sees nothing,
+            NaN where nobody looked.
         cell_px: side of the cells, pixels.
         masks: pixels in which points may be seen.
         tolerance: a point this far behind what the camera sees still counts as that.
@@ -48,6 +49,7 @@ class DepthMaps:
     def seen_in(self, frame: int, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> FrameView:
         """What one frame sees of points with outward unit normals."""
         to_point, distance, places, inside, pixels = self._projected(frame, points)
+        inside &= self.masks[frame, pixels[:, 1], pixels[:, 0]]
         cosines = -(normals * to_point).sum(dim=-1) / distance
         cosine = cosines.clamp_min(MIN_COSINE)
         slope = (1.0 - cosine.square()).clamp_min(0.0).sqrt() / cosine
@@ -57,19 +59,18 @@ class DepthMaps:
         return FrameView(visible, cosines, places, pixels)
 
     def depth_behind(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Distances of points from a frame's camera, and the depth in their cells: -inf outside picture and mask."""
+        """Distances of points from a frame's camera, and the depth in their cells; NaN where nobody looked."""
         _, distance, _, inside, pixels = self._projected(frame, points)
-        return distance, torch.where(inside, self._depths_at(frame, pixels), -torch.inf)
+        return distance, torch.where(inside, self._depths_at(frame, pixels), torch.nan)
 
     def _projected(self, frame: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Vectors from the camera, their lengths, places in the picture, which lie in its mask, their pixels."""
+        """Vectors from the camera, their lengths, places in the picture, which lie in it, their pixels."""
         pose, lens = self.camera_to_world[frame], self.intrinsics
         to_point = points - pose[:3, 3]
         rotation = pose[:3, :3].reshape(9).expand(len(points), 9)
         places, forward = image_coordinates(in_camera_frame(to_point, rotation), lens, self.distortion)
         inside = forward & ((places >= 0.0) & (places < places.new_tensor([lens.w, lens.h]))).all(dim=-1)
         pixels = torch.where(inside[:, None], places, 0.0).long()
-        inside &= self.masks[frame, pixels[:, 1], pixels[:, 0]]
         return to_point, to_point.norm(dim=-1), places, inside, pixels
 
     def _depths_at(self, frame: int, pixels: Tensor) -> Tensor:
