@@ -152,7 +152,7 @@ def _touched_cells(
     frames, lines, samples = masks.shape
     down, across = -(-lines // cell_px), -(-samples // cell_px)
     padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
-    return padded.reshape(frames, down, cell_px, across, cell_px).any(axis=(2, 4))
+    return padded.reshape(frames, down, cell_px, across, cell_px).max(axis=(2, 4))
 
 
 def model_output(outputs: dict[str, Tensor], name: str, option: str) -> Tensor:
