@@ -110,7 +110,7 @@ def test_command_writes_all_results(tmp_path):
         tmp_path / "cloud.ply",
         tmp_path / "out",
         mesh=MeshConfig(octree_depth=6, base_height_m=STAND_M),
-        resamples=2,
+        splits=1,
         library=tmp_path / "library.csv",
         roi=(("spot", 0.0, 0.02, STAND_M + 0.025, 0.006),),
     ).main()
@@ -139,7 +139,7 @@ def test_command_writes_all_results(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"resamples": 1}, "--resamples is 1"),
+        ({"splits": -1}, "--splits is -1"),
         ({"classes": ("bruise",)}, "give it with --library"),
         ({"mesh": MeshConfig(octree_depth=20)}, "octree-depth is 20"),
         ({"mesh": MeshConfig(smoothing_radius_m=0.0)}, "smoothing-radius-m is 0.0"),

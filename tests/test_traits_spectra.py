@@ -109,6 +109,16 @@ def test_indices_and_composites_of_regions():
     assert traits.spectra[1].area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
 
 
+def test_means_are_weighted_by_area():
+    sides = ((0.0, 1.0), (3.0, 2.0))
+    corners = [[[x, 0.0, 0.0], [x + s, 0.0, 0.0], [x + s, s, 0.0], [x, s, 0.0]] for x, s in sides]
+    spectra = np.repeat(np.stack([GREEN, BROWN]), 4, axis=0).astype(np.float32)
+    whole = analyse(SpectralMesh(quads(np.array(corners)), spectra, NM, np.ones(8, bool))).spectra[0]
+    np.testing.assert_allclose(whole.mean, (GREEN + 4.0 * BROWN) / 5.0, rtol=1e-5)
+    np.testing.assert_allclose(whole.sd, 0.4 * np.abs(GREEN - BROWN), atol=1e-6)
+    assert whole.area_m2 == pytest.approx(5.0)
+
+
 def test_weighted_mean_and_sd_against_repeated_values():
     values = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]])
     mean, sd = weighted_mean_and_sd(values, np.array([1.0, 2.0, 1.0]))

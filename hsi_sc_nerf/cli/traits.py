@@ -35,8 +35,9 @@ class TraitsCommand:
     unless --mesh.base-height-m does."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """How the mesh is made."""
-    resamples: int = 10
-    """How often the points are resampled for the uncertainty of area, volume and diameters; 0 leaves it out."""
+    splits: int = 6
+    """How often the cloud is split into random halves, which are meshed apart, for the uncertainty of the sizes; 0
+    leaves it out."""
     library: Path | None = None
     """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
     nm, then a column a spectrum). Spectra of one name are references of one class."""
@@ -80,9 +81,9 @@ class TraitsCommand:
         with console.status("closing the surface"):
             mesh = closed_mesh(cloud.points, cloud.normals, config)
         size, spread = size_of(mesh), None
-        if self.resamples:
-            with progress_bar("resampling", "meshes", self.resamples) as done:
-                spread = size_spread(cloud.points, cloud.normals, config, self.resamples, done=done)
+        if self.splits:
+            with progress_bar("uncertainty", "splits", self.splits) as done:
+                spread = size_spread(cloud.points, cloud.normals, config, self.splits, done=done)
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
@@ -93,8 +94,8 @@ class TraitsCommand:
 
     def _check(self) -> None:
         """Refuse now what would fail after minutes."""
-        if self.resamples < 0 or self.resamples == 1:
-            raise InputError(f"--resamples is {self.resamples}; give 0 for none, or at least 2.")
+        if self.splits < 0:
+            raise InputError(f"--splits is {self.splits}; give 0 for none, or more.")
         if not 4 <= self.mesh.octree_depth <= 12:
             raise InputError(f"--mesh.octree-depth is {self.mesh.octree_depth}; it must be from 4 to 12.")
         if not self.mesh.smoothing_radius_m > 0.0:
@@ -137,6 +138,6 @@ class TraitsCommand:
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         watertight = open_edges(surface.mesh) == 0
-        settings = {"cloud": self.cloud.name, **asdict(config), "resamples": self.resamples}
+        settings = {"cloud": self.cloud.name, **asdict(config), "splits": self.splits}
         report.write_traits_json(self.output_dir / "traits.json", size, spread, watertight, traits, settings)
         report.write_page(self.output_dir / "traits.md", self.cloud.name, size, spread, watertight, traits, drawn)

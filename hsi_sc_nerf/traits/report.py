@@ -44,7 +44,7 @@ def write_page(
         path: the file.
         title: what was measured.
         size: of the object.
-        spread: standard deviation of each size over resamples; None where none was asked for.
+        spread: standard deviation of each size; None where none was asked for.
         watertight: whether the mesh is closed; without it, the volume means nothing.
         traits: what the spectra tell.
         pictures: file names by caption.
@@ -53,7 +53,7 @@ def write_page(
     parts = [f"# Traits of {title}", "## Size", _size_table(size, spread)]
     state = "watertight" if watertight else "NOT watertight, so its volume cannot be trusted"
     uncertain = (
-        " ± is the standard deviation over resamples of the cloud's points: it does not hold errors that many points "
+        " ± is the standard deviation that random halves of the cloud tell: it does not hold errors that many points "
         "share, as those of scale, poses or training."
         if spread
         else ""
