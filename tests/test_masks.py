@@ -11,15 +11,18 @@ from capture_factory import (
     sphere_mask,
     true_pose,
 )
+from scipy import ndimage
 
 from hsi_sc_nerf.data.masks import (
     MaskConfig,
     above_lid,
     bin_width,
+    brightness,
     choose_threshold,
     foreground_mask,
     foreground_score,
     otsu_threshold,
+    shaded_parts,
 )
 from hsi_sc_nerf.data.packed import Container
 from hsi_sc_nerf.data.report import mask_picture
@@ -96,6 +99,42 @@ def test_mask_is_one_whole_region_with_its_stem():
     allowed[40:] = False
     assert not foreground_mask(score, 0.2, allowed=allowed)[40:].any()
     assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
+
+
+def shaded_ball(background: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bins of a red ball whose lower half gets ever less light, on a gray background; where it is and its light."""
+    y, x = np.mgrid[:60, :60]
+    ball = np.hypot(x - 30, y - 30) < 20
+    light = np.where(y > 30, np.clip(1.0 - (y - 30) / 22.0, 0.0, 1.0), 1.0)
+    spectrum = np.linspace(0.1, 0.7, 24)[:, None, None]
+    wall = np.full((24, 1, 1), background)
+    bins = np.where(ball, spectrum * light, wall * np.where(y > 50, 0.1, 1.0))
+    return bins.astype(np.float32), ball, light
+
+
+def test_shaded_parts_are_told_by_spread_relative_to_brightness():
+    bins, ball, light = shaded_ball(background=0.9)
+    score, bright = foreground_score(bins), brightness(bins)
+    body = foreground_mask(score, 0.1)
+    assert (ball & ~body).sum() > 60  # what the score alone misses
+    shaded = shaded_parts(body, score, bright)
+    rim = ball & ~ndimage.binary_erosion(ball)
+    assert not (ball & (light > 0.15) & ~body & ~shaded & ~rim).any()
+    assert (shaded & ~ball).sum() <= 4
+    assert not shaded_parts(body, score, bright, share=1.5).any()
+    upper = np.zeros_like(ball)
+    upper[:40] = True
+    assert not shaded_parts(body, score, bright, allowed=upper)[40:].any()
+
+
+def test_shaded_parts_are_not_looked_for_before_a_dark_background():
+    bins, _, _ = shaded_ball(background=0.1)
+    bins += np.random.default_rng(0).normal(0.0, 0.02, bins.shape).astype(np.float32)
+    score, bright = foreground_score(bins), brightness(bins)
+    body = foreground_mask(score, 0.1)
+    assert not shaded_parts(body, score, bright).any()
+    assert not shaded_parts(np.zeros_like(body), score, bright).any()
+    assert not shaded_parts(np.ones_like(body), score, bright).any()
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 77.0])

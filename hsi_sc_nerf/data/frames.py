@@ -18,7 +18,7 @@ from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration, pack_coun
 from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.cube_lines import CubeLines
 from hsi_sc_nerf.data.envi import Cube, open_cube
-from hsi_sc_nerf.data.masks import MaskConfig, bin_width, foreground_score
+from hsi_sc_nerf.data.masks import MaskConfig, bin_width, brightness, foreground_score
 from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
 from hsi_sc_nerf.data.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
@@ -54,12 +54,14 @@ class FrameNotes:
         fingerprint: of the files and settings that the frame was made from.
         gray: in which markers are looked for.
         score: foreground score (``masks.foreground_score``).
+        brightness: mean reflectance (``masks.brightness``).
         tally: how many values were clipped and flagged, by kept band.
     """
 
     fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
     score: Float[np.ndarray, "lines samples"]
+    brightness: Float[np.ndarray, "lines samples"]
     tally: Tally
 
 
@@ -68,7 +70,9 @@ def finished_notes(paths: FramePaths, fingerprint: str) -> FrameNotes | None:
     try:
         with np.load(paths.notes) as stored:
             tally = Tally(**{f.name: stored[f.name] for f in fields(Tally)})
-            notes = FrameNotes(str(stored["fingerprint"]), stored["gray"], stored["score"], tally)
+            notes = FrameNotes(
+                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], tally
+            )
         open_cube(paths.cube)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
         return None
@@ -114,11 +118,19 @@ def process_frame(
         fingerprint,
         upright(to_8_bit(frame.gray)),
         upright(foreground_score(frame.binned, masks.smoothing_px)),
+        upright(brightness(frame.binned, masks.smoothing_px)),
         frame.tally,
     )
     with atomic_write(paths.notes) as (temporary,):
         tally = {f.name: getattr(notes.tally, f.name) for f in fields(Tally)}
-        np.savez(temporary, fingerprint=notes.fingerprint, gray=notes.gray, score=notes.score, **tally)
+        np.savez(
+            temporary,
+            fingerprint=notes.fingerprint,
+            gray=notes.gray,
+            score=notes.score,
+            brightness=notes.brightness,
+            **tally,
+        )
     return notes
 
 

@@ -2,7 +2,8 @@
 
 Plant tissue changes its reflectance strongly between 400 and 1000 nm (pigments, red edge), while Teflon, plastic,
 paper and ink are nearly flat: the spread of a pixel's spectrum tells them apart. What prints and labels may still
-feign is removed by geometry: the object stands on the container's lid.
+feign is removed by geometry: the object stands on the container's lid. In shade the spread falls with the light, so
+the object's dark parts (its underside, next to the container) are told by spread relative to brightness.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
 
 _HISTOGRAM_BINS = 512
+# Shares of the object's median brightness: a background that lets shaded parts be told, and the least light to do it.
+_BRIGHT_BACKGROUND = 0.5
+_DARKEST = 0.1
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,9 @@ class MaskConfig:
     """Spread of reflectance over the bins from which a pixel is the object's. Found over all frames if not given."""
     weak_share: float = 0.5
     """Parts that stick out of the object (a stem) are added from this share of the threshold; 1 for none."""
+    shaded_share: float | None = 0.4
+    """Pixels darker than the object and next to it are added where their spread relative to their brightness is more
+    than this share of the object's; none for none. Not done before a dark background, where noise feigns spread."""
     min_contrast: float = 0.03
     """Least difference between the mean spreads of object and background that is believed."""
     morphology_fraction: float = 0.01
@@ -64,6 +71,13 @@ def foreground_score(
         cv2.accumulateSquare(difference, squares)
     total /= len(binned)
     return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
+
+
+def brightness(
+    binned: Float[np.ndarray, "bins lines samples"], smoothing_px: float = 0.5
+) -> Float[np.ndarray, "lines samples"]:
+    """Mean over spectral bins of the (slightly smoothed) reflectance."""
+    return _smoothed(binned.mean(axis=0), smoothing_px)
 
 
 def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tuple[float, float]:
@@ -153,6 +167,33 @@ def foreground_mask(
     rim = dilate(body, closing_px)
     sticking_out = touching(weak & ~rim, dilate(rim, 3), min_area_px=closing_px + 1)
     return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
+
+
+def shaded_parts(
+    body: Bool[np.ndarray, "lines samples"],
+    score: Float[np.ndarray, "lines samples"],
+    brightness: Float[np.ndarray, "lines samples"],
+    *,
+    allowed: Bool[np.ndarray, "lines samples"] | None = None,
+    share: float = 0.4,
+) -> Bool[np.ndarray, "lines samples"]:
+    """Pixels (inside ``allowed``) that belong to ``body`` but get less light than most of it.
+
+    Illumination scales spread and brightness alike, their ratio stays the material's. A pixel that is part white
+    background has less of it than its share of object: the default of 0.4 is reached by about 60 % object. There are
+    none where the background is less than half as bright as the body.
+    """
+    empty = np.zeros_like(body)
+    if not body.any() or body.all():
+        return empty
+    typical = float(np.median(brightness[body]))
+    if np.median(brightness[~body]) < _BRIGHT_BACKGROUND * typical:
+        return empty
+    relative = score / np.maximum(brightness, _DARKEST * typical)
+    shaded = (relative > share * np.median(relative[body])) & (brightness < typical) & ~body
+    if allowed is not None:
+        shaded &= allowed
+    return touching(shaded, dilate(body, 3), min_area_px=1)
 
 
 def _smoothed(image: Float[np.ndarray, "lines samples"], sigma_px: float) -> Float[np.ndarray, "lines samples"]:

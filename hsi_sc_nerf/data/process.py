@@ -26,7 +26,7 @@ from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.calibration.uncertainty import typical_uncertainty
 from hsi_sc_nerf.data.fingerprint import session_fingerprint
 from hsi_sc_nerf.data.frames import border_spectrum, object_spectrum
-from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask
+from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask, shaded_parts
 from hsi_sc_nerf.data.packed import (
     TRANSFORMS_NAME,
     Container,
@@ -45,6 +45,7 @@ from hsi_sc_nerf.data.posed_frames import (
     session_facts,
 )
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
+from hsi_sc_nerf.data.regions import fill_holes
 from hsi_sc_nerf.data.report import mask_picture
 from hsi_sc_nerf.data.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.data.session import open_session
@@ -149,8 +150,8 @@ def process_session(
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
-    scores = [note.score for note, used in zip(notes, poses.used, strict=True) if used]
-    masks = _make_masks(scores, camera_to_worlds, poses, container, config.masks)
+    used_notes = [note for note, posed in zip(notes, poses.used, strict=True) if posed]
+    masks = _make_masks(used_notes, camera_to_worlds, poses, container, config.masks)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
     mask_picture(
@@ -170,7 +171,6 @@ def process_session(
     )
     size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(bounds, axis=0)[0])
     console.print(f"Object: inside a box of {size_mm} mm.")
-    used = [note for note, posed in zip(notes, poses.used, strict=True) if posed]
     typical = None
     if calibration.uncertainty is not None:
         typical = typical_uncertainty(calibration.uncertainty, _mean_spectrum(frames, masks))
@@ -192,7 +192,7 @@ def process_session(
         background_reflectance=_background(frames, masks),
         container=container,
         frames=tuple(frames),
-        flagged_values=sum(int(note.tally.flagged.sum()) for note in used),
+        flagged_values=sum(int(note.tally.flagged.sum()) for note in used_notes),
         bad_bands_nm=np.delete(session.wavelengths_nm, calibration.bands),
         uncertainty=calibration.uncertainty,
         typical_uncertainty=typical,
@@ -221,26 +221,28 @@ def _clear_transforms(output_dir: Path) -> None:
 
 
 def _make_masks(
-    scores: Sequence[Float[np.ndarray, "h w"]],
+    notes: Sequence[FrameNotes],
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     poses: TurntablePoses,
     container: Container | None,
     config: MaskConfig,
 ) -> Bool[np.ndarray, "frames h w"]:
-    threshold = choose_threshold(scores, config)
+    threshold = choose_threshold([note.score for note in notes], config)
     distortion = np.array(poses.distortion, dtype=float)
     masks = []
-    for score, pose in zip(scores, camera_to_worlds, strict=True):
+    for note, pose in zip(notes, camera_to_worlds, strict=True):
         allowed = above_lid(poses.intrinsics, distortion, pose, container, config.overhang) if container else None
-        masks.append(
-            foreground_mask(
-                score,
-                threshold,
-                allowed=allowed,
-                weak_share=config.weak_share,
-                morphology_fraction=config.morphology_fraction,
-            )
+        body = foreground_mask(
+            note.score,
+            threshold,
+            allowed=allowed,
+            weak_share=config.weak_share,
+            morphology_fraction=config.morphology_fraction,
         )
+        if config.shaded_share is not None:
+            shaded = shaded_parts(body, note.score, note.brightness, allowed=allowed, share=config.shaded_share)
+            body = fill_holes(body | shaded)
+        masks.append(body)
     return np.stack(masks)
 
 
