@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from hsi_sc_nerf.evaluation.benchmark.report import markdown_table
+
 
 def write_table(
     page: Path, name: str, columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str | None = None
@@ -13,7 +15,7 @@ def write_table(
     starts, ends = f"<!-- {name} -->", f"<!-- end of {name} -->"
     before, rest = page.read_text(encoding="utf-8").split(starts)
     after = rest.split(ends)[1]
-    lines = [f"| {' | '.join(cells)} |" for cells in (columns, ["---"] * len(columns), *rows)]
+    lines = [markdown_table(columns, rows)]
     if caption is not None:
         lines += ["", caption]
     page.write_text("\n".join([before + starts, *lines, ends + after]), encoding="utf-8")

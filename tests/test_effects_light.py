@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.simulate.colours import Colour, colour_spectra
 from hsi_sc_nerf.simulate.diffusion import diffused
@@ -15,7 +16,7 @@ from hsi_sc_nerf.simulate.effects.stages import LightEffect
 from hsi_sc_nerf.simulate.effects.translucency import Translucency
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.lighting import Lighting, even_light
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder, quads, revolve
+from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, split_at_creases

@@ -8,8 +8,9 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder, snapped, subdivided, welded
+from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
 from hsi_sc_nerf.simulate.objects import OwnMesh
 from hsi_sc_nerf.simulate.scene import load_scene
 from hsi_sc_nerf.simulate.texture import padded_shares, sampled

@@ -1,3 +1,6 @@
+import shutil
+from pathlib import Path
+
 import ball_run
 import capture_factory as factory
 import numpy as np
@@ -196,10 +199,18 @@ def test_what_is_no_run_is_refused_in_a_sentence(tmp_path, run_config):
     other.write_text("a: 1\n")
     with pytest.raises(InputError, match=r"is no run of hsi-sc-nerf"):
         trained_run.open_run(other)
-    moved = tmp_path / "moved.yml"
-    moved.write_text(run_config.read_text().replace("experiment_name: ball", "experiment_name: gone"))
+    alone = tmp_path / "alone.yml"
+    alone.write_text(run_config.read_text())
     with pytest.raises(InputError, match="checkpoint"):
-        trained_run.open_run(moved)
+        trained_run.open_run(alone)
+
+
+def test_a_run_that_was_moved_is_opened_from_anywhere(tmp_path, run_config, run, monkeypatch):
+    moved = shutil.copytree(run_config.parent, tmp_path / "archive" / "apple 7")
+    monkeypatch.chdir(moved)
+    opened = trained_run.open_run(Path("config.yml"))
+    for name, value in run.model.state_dict().items():
+        torch.testing.assert_close(opened.model.state_dict()[name], value)
 
 
 def test_metres_and_scene_units_are_inverse(run):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.simulate import shapes
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder, quads, revolve
+from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 
 
 def sphere(radius_m: float, rings: int = 200, segments: int = 200) -> Mesh:

@@ -14,10 +14,11 @@ from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.data.specim_iq import read_metadata
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, turntable_camera_to_world
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
 from hsi_sc_nerf.simulate.materials import endmembers
-from hsi_sc_nerf.simulate.mesh import Mesh, revolve
+from hsi_sc_nerf.simulate.mesh import revolve
 from hsi_sc_nerf.simulate.objects import OwnMesh
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import load_scene, override

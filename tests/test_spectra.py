@@ -59,6 +59,7 @@ def test_a_black_spectrum_has_no_index(name):
     [
         ("pseudo-RGB", (598, 548, 449)),
         ("apple", (801, 708, 551)),
+        ("maize visible", (650, 540, 470)),
         ("maize", (850, 580, 490)),
         ("pear", (980, 710, 550)),
         ("CIR", (800, 670, 550)),

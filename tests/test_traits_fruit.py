@@ -9,8 +9,9 @@ from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.traits import TrueSurface, relative_rms
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder
+from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.simulate.objects import Fruit
 from hsi_sc_nerf.simulate.shapes import apple
 from hsi_sc_nerf.simulate.texture import FRUIT_MATERIALS, fruit_weights

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder
+from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.traits.base import SECTORS, find_base
 from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh, open_edges, solid_pieces
 from hsi_sc_nerf.traits.size import feret_diameters, size_of, size_spread

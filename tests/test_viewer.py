@@ -12,8 +12,8 @@ from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerControl, ViewerElement
 from viser.transforms import SO3
 
+from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.data.packed_cube import unpack
-from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
@@ -208,7 +208,7 @@ def test_controls_choose_band_composite_and_index(attached):
 
 def test_what_the_bands_do_not_reach_is_not_offered():
     visible = SpectralPanel(np.arange(400.0, 701.0, 5.0), 9)
-    assert visible.composite.options == ["pseudo-RGB"]
+    assert visible.composite.options == ["pseudo-RGB", "maize visible"]
     assert visible.index is None
     near_infrared = SpectralPanel(np.arange(750.0, 1001.0, 5.0), 9)
     assert near_infrared.composite is None

@@ -54,9 +54,10 @@ class RenderCommand:
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         from hsi_sc_nerf.data.atomic import atomic_write
+        from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
         from hsi_sc_nerf.export.progress import progress_bar
         from hsi_sc_nerf.export.render_cubes import render_view, write_view
-        from hsi_sc_nerf.export.render_pictures import eight_bit, find_look
+        from hsi_sc_nerf.export.render_pictures import find_look
         from hsi_sc_nerf.export.render_report import compare, write_report
         from hsi_sc_nerf.export.rendered_views import views_of_frames, views_of_orbit, views_of_path
         from hsi_sc_nerf.export.trained_run import open_run
@@ -85,7 +86,7 @@ class RenderCommand:
                     if views.measured is not None:
                         rows[-1] |= compare(self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands)
                     for look, add in zip(looks, videos, strict=True):
-                        add(eight_bit(look.paint(rendered)))
+                        add(to_8_bit(look.paint(rendered).numpy()))
                     done(i + 1)
         legends = {path.name: look.legend for path, look in zip(files, looks, strict=True)}
         write_report(self.output_dir / "render", rows, legends)

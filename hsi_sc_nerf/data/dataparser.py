@@ -11,13 +11,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.cameras import pinhole_cameras
 from hsi_sc_nerf.data.packed import PackedDataset, is_packed, open_packed
 from hsi_sc_nerf.data.process import ProcessConfig, process_session
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
@@ -77,23 +77,7 @@ class SpectralDataParser(DataParser):
             aabb = np.array([[-1.0] * 3, [1.0] * 3])
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
 
-        lens = dataset.intrinsics
-        k1, k2, p1, p2 = dataset.distortion
-        cameras = Cameras(
-            camera_to_worlds=torch.from_numpy(poses[chosen, :3]).float(),
-            fx=lens.fl_x,
-            fy=lens.fl_y,
-            cx=lens.cx,
-            cy=lens.cy,
-            width=lens.w,
-            height=lens.h,
-            distortion_params=torch.tensor([k1, k2, 0.0, 0.0, p1, p2]).float() if dataset.distortion.any() else None,
-            camera_type=CameraType.PERSPECTIVE,
-            metadata={
-                "frame_index": torch.from_numpy(chosen)[:, None].float(),
-                "camera_rotation": torch.from_numpy(poses[chosen, :3, :3].reshape(-1, 9)).float(),
-            },
-        )
+        cameras = pinhole_cameras(poses[chosen], dataset.intrinsics, dataset.distortion, chosen)
         transform = torch.eye(4)[:3]
         transform[:, 3] = -torch.from_numpy(centre)
         return DataparserOutputs(

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hsi_sc_nerf.mesh import ray_scene
 from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL
 from hsi_sc_nerf.simulate.truth import Truth
 
@@ -36,12 +37,7 @@ def seen_points(
         triangles: Of the object's mesh.
         track: Wrapped around the captures, for a progress bar.
     """
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor(np.asarray(vertices_m, np.float32)), open3d.core.Tensor(np.asarray(triangles, np.uint32))
-    )
+    scene = ray_scene(vertices_m, triangles)
     seen = np.zeros(len(points_m), bool)
     poses = dict(zip(truth.captures, truth.camera_to_world, strict=True))
     for capture in track(truth.captures):
@@ -52,7 +48,7 @@ def seen_points(
         sight = poses[capture][:3, 3] - points_m[candidates]
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         rays = np.concatenate([points_m[candidates], sight], axis=1, dtype=np.float32)
-        blocked = scene.test_occlusions(open3d.core.Tensor(rays), tnear=LIFT_M).numpy()
+        blocked = scene.test_occlusions(rays, tnear=LIFT_M).numpy()
         seen[candidates[~blocked]] = True
     return seen
 

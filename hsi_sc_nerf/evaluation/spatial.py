@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.mesh import ray_scene
 from hsi_sc_nerf.paper import F_SCORE_THRESHOLD_M
 
 
@@ -111,10 +112,4 @@ def distance_to_surface(
     points_m: Float[np.ndarray, "n 3"], vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
 ) -> Float[np.ndarray, "n"]:
     """Unsigned distance of each point to the nearest point of a triangle mesh, metres (Open3D, float32)."""
-    import open3d  # heavy, and the scores above do without it
-
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor(np.asarray(vertices_m, np.float32)), open3d.core.Tensor(np.asarray(triangles, np.uint32))
-    )
-    return scene.compute_distance(open3d.core.Tensor(np.asarray(points_m, np.float32))).numpy()
+    return ray_scene(vertices_m, triangles).compute_distance(np.asarray(points_m, np.float32)).numpy()

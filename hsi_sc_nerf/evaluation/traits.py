@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,9 +13,12 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra.composites import composite
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
 
 # A surface point is seen where a camera's ray ends at it, to within this.
 _OCCLUSION_M = 0.0001
@@ -55,10 +58,7 @@ class TrueSurface:
 
     def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the surface's nearest place to each point: unit normal, shares of materials, and distance (m)."""
-        import open3d as o3d
-
-        wanted = o3d.core.Tensor(np.asarray(points_m, np.float32))
-        found = self._scene().compute_closest_points(wanted)
+        found = self._scene().compute_closest_points(np.asarray(points_m, np.float32))
         triangle, uv = found["primitive_ids"].numpy().astype(np.int64), found["primitive_uvs"].numpy()
         share = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
         weights = np.einsum("nc,ncm->nm", share, self.weights[self.mesh.triangles[triangle]])
@@ -70,14 +70,12 @@ class TrueSurface:
         self, points_m: Float[np.ndarray, "n 3"], eyes_m: Float[np.ndarray, "cameras 3"]
     ) -> Bool[np.ndarray, "n"]:
         """Which points of the surface some camera sees, hidden by nothing but the object itself."""
-        import open3d as o3d
-
         scene, seen = self._scene(), np.zeros(len(points_m), bool)
         for eye in eyes_m:
             along = points_m - eye
             distance_m = np.linalg.norm(along, axis=1)
             rays = np.concatenate([np.broadcast_to(eye, along.shape), along / distance_m[:, None]], axis=1)
-            hit_m = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+            hit_m = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy()
             seen |= hit_m > distance_m - _OCCLUSION_M
         return seen
 
@@ -106,15 +104,8 @@ class TrueSurface:
             points.astype(np.float32), normals.astype(np.float32), colours, spectra, self.wavelengths_nm
         )
 
-    def _scene(self) -> Any:
-        import open3d as o3d
-
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor(self.mesh.vertices.astype(np.float32)),
-            o3d.core.Tensor(self.mesh.triangles.astype(np.uint32)),
-        )
-        return scene
+    def _scene(self) -> RaycastingScene:
+        return ray_scene(self.mesh.vertices, self.mesh.triangles)
 
 
 def relative_rms(measured: Float[np.ndarray, "bands"], true: Float[np.ndarray, "bands"]) -> float:

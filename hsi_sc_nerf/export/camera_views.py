@@ -11,12 +11,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.surface import opacity_crossing_depth
 from hsi_sc_nerf.export.visibility import DepthMaps
-from hsi_sc_nerf.models.pose_refinement import FRAME_INDEX
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 
@@ -33,6 +33,7 @@ DEPTH_RAYS = 300_000
 """Rays of all depth maps together; where frames have more pixels on the object, cells of several pixels share one."""
 CELLS_AROUND = 5
 """Depth maps reach this far beyond the masks."""
+_LEAST_OPACITY = 1e-3
 _DEPTH_TOLERANCE = 0.02
 """Scene units: about 2 mm."""
 
@@ -55,6 +56,20 @@ def camera_rays(
         camera_indices=torch.from_numpy(np.asarray(frames)[:, None]),
         coords=torch.from_numpy(np.asarray(places)[:, ::-1].copy()).float(),
     ).to(device)
+
+
+@torch.no_grad()
+def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tensor], Float[Tensor, "n bands"]]:
+    """The model's outputs for rays as measured, and the object's own reflectance: without the background's share.
+
+    A model without a background fills the rest of a ray with what the ray met last, which is the object's already.
+    """
+    behind = model.spectra_behind(rays)  # before the model corrects the rays
+    outputs = model(rays)
+    spectra, opacity = outputs["spectral"], outputs["accumulation"]
+    if model.background is not None:
+        spectra = (spectra - behind * (1.0 - opacity)) / opacity.clamp_min(_LEAST_OPACITY)
+    return outputs, spectra.clamp(0.0, 1.0)
 
 
 @torch.no_grad()

@@ -17,10 +17,8 @@ from torch import Tensor
 
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.models.metrics import spectral_angle_map, squared_error_map
-from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD
+from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN
 
-ERROR_DRAWN = (0.0, 0.1)
-"""Errors of reflectance at the two ends of the colours, the same for all views so that they can be compared."""
 _STYLE: Any = {"font.size": 9, "axes.titlesize": 9, "axes.linewidth": 0.0}
 
 

@@ -24,6 +24,7 @@ from hsi_sc_nerf.export.camera_views import (
     camera_rays,
     look_from_cameras,
     model_output,
+    render_object,
     surface_along,
 )
 from hsi_sc_nerf.export.even_points import even_points
@@ -35,7 +36,6 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 FARTHEST_MOVE = 0.02
 """Places are moved on to the surface by no more than this, scene units (about 2 mm)."""
-_LEAST_OPACITY = 1e-3
 
 
 @dataclass(eq=False)
@@ -193,12 +193,7 @@ def render_points(
         InputError: the model has no such output.
     """
     rays = camera_rays(cameras, cloud.frames, cloud.places, model.device)
-    background = model.spectra_behind(rays)  # before the model corrects the rays
-    outputs = model(rays)
-    opacity = outputs["accumulation"]
-    # What the ray collected beside the background's share is the object's own spectrum.
-    spectra = (outputs["spectral"] - background * (1.0 - opacity)) / opacity.clamp_min(_LEAST_OPACITY)
-    spectra = spectra.clamp(0.0, 1.0)
+    outputs, spectra = render_object(model, rays)
     if rgb_output_name == "rgb":
         colours = spectra[:, model.rgb_bands]
     else:
@@ -214,7 +209,7 @@ def render_points(
     if reorient_normals:
         away = (normals * rays.directions).sum(dim=-1, keepdim=True) > 0.0
         normals = torch.where(away, -normals, normals)
-    return RenderedPoints(spectra, opacity[:, 0], colours.clamp(0.0, 1.0), normals)
+    return RenderedPoints(spectra, outputs["accumulation"][:, 0], colours.clamp(0.0, 1.0), normals)
 
 
 def sample_surface_points(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
@@ -61,8 +61,3 @@ def find_look(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> Look:
 
     low, high = index.drawn_range
     return Look(found, f"{index.expression}, {low:g} to {high:g} in {INDEX_COLOURS}, grey where nothing is", paint)
-
-
-def eight_bit(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Colours in [0, 1] as bytes."""
-    return (picture * 255.0).round().byte().numpy()

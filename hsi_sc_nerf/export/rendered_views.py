@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_paths import get_path_from_json
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 
+from hsi_sc_nerf.data.cameras import pinhole_cameras
 from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.trained_run import TrainedRun
-from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, turntable_camera_to_world
+from hsi_sc_nerf.poses.geometry import turntable_camera_to_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +67,10 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
     poses = orbit_poses(run.refined_poses_m()[0], count)
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
     dataset = run.dataset
-    cameras = pinhole_cameras(poses, dataset.intrinsics, tuple(dataset.distortion.tolist()))
+    cameras = pinhole_cameras(poses, dataset.intrinsics, dataset.distortion)
     if size != 1.0:
         cameras.rescale_output_resolution(size)
     return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
-
-
-def pinhole_cameras(
-    poses: Float[np.ndarray, "n 4 4"], lens: PinholeIntrinsics, distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-) -> Cameras:
-    """Cameras at poses in scene units that are refined already: of them the model knows which way they look only.
-
-    Args:
-        poses: camera-to-world, OpenGL axes.
-        lens: of all of them.
-        distortion: k1, k2, p1, p2 (OpenCV).
-    """
-    k1, k2, p1, p2 = distortion
-    return Cameras(
-        camera_to_worlds=torch.from_numpy(poses[:, :3]).float(),
-        fx=lens.fl_x,
-        fy=lens.fl_y,
-        cx=lens.cx,
-        cy=lens.cy,
-        width=lens.w,
-        height=lens.h,
-        distortion_params=torch.tensor([k1, k2, 0.0, 0.0, p1, p2]).float() if any(distortion) else None,
-        camera_type=CameraType.PERSPECTIVE,
-        metadata={CAMERA_ROTATION: torch.from_numpy(poses[:, :3, :3].reshape(-1, 9)).float()},
-    )
 
 
 def views_of_path(path: Path) -> Views:

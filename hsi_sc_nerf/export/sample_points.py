@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from hsi_sc_nerf.export.camera_views import MIN_OPACITY, surface_along
+from hsi_sc_nerf.export.camera_views import MIN_OPACITY, render_object, surface_along
 from hsi_sc_nerf.export.trained_run import TrainedRun
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
@@ -183,10 +183,6 @@ def _rendered(
         camera_indices=torch.zeros_like(ones, dtype=torch.long),
         metadata={"directions_norm": ones},
     ).to(model.device)
-    behind = model.spectra_behind(rays)
-    outputs = model(rays)
-    spectra, opacity = outputs["spectral"], outputs["accumulation"]
+    outputs, spectra = render_object(model, rays)
     depth, _ = surface_along(model, rays.origins, rays.directions, outputs["depth"])
-    if model.background is not None:
-        spectra = (spectra - behind * (1.0 - opacity)) / opacity.clamp_min(1e-6)
-    return spectra.clamp(0.0, 1.0).cpu().numpy(), opacity[:, 0].cpu().numpy(), depth[:, 0].cpu().numpy()
+    return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy(), depth[:, 0].cpu().numpy()

@@ -83,6 +83,13 @@ def open_run(load_config: Path) -> TrainedRun:
         raise InputError(f"{load_config}: cannot be read; give the config.yml of a trained run.") from error
     if not (isinstance(config, TrainerConfig) and isinstance(config.pipeline.model, SpectralModelConfig)):
         raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
-    find_checkpoint(config.get_checkpoint_dir())
-    _, pipeline, _, _ = eval_setup(load_config)
+    find_checkpoint(_where_it_lies(config, load_config).get_checkpoint_dir())
+    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _where_it_lies(c, load_config))
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
+
+
+def _where_it_lies(config: TrainerConfig, load_config: Path) -> TrainerConfig:
+    """Settings that look for checkpoints beside their file, for a run may be moved, or given from another folder."""
+    config.output_dir = load_config.parent
+    config.experiment_name = config.method_name = config.timestamp = "."
+    return config

@@ -16,10 +16,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimize
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-FRAME_INDEX = "frame_index"
-"""Camera metadata: which frame of the session a ray belongs to."""
-CAMERA_ROTATION = "camera_rotation"
-"""Camera metadata: the nine elements of the camera-to-world rotation of a ray, row by row."""
+from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
 
 
 @dataclass

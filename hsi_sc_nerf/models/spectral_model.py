@@ -22,6 +22,7 @@ from nerfstudio.models.nerfacto import NerfactoModel
 from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 
+from hsi_sc_nerf.data.cameras import CAMERA_ROTATION
 from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
 from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
@@ -37,7 +38,7 @@ from hsi_sc_nerf.models.metrics import (
     spectral_rmse,
     squared_error_map,
 )
-from hsi_sc_nerf.models.pose_refinement import CAMERA_ROTATION, PoseRefinement
+from hsi_sc_nerf.models.pose_refinement import PoseRefinement
 from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.viewer.panel import SpectralPanel

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
+from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.report.blocks import CloudViewer, KeyFigure, Section
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.comparison_section import comparison_key_figure, comparison_section
@@ -137,9 +136,12 @@ def _rendered(run: TrainedRun, count: int) -> Sequence[HeldOutView]:
     """Held-out views, with a bar that tells the time left."""
     from hsi_sc_nerf.report.rendering import render_held_out
 
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(TextColumn("[bold]rendering held-out views"), *columns, console=Console(stderr=True)) as progress:
-        return list(progress.track(render_held_out(run, count), total=count))
+    views: list[HeldOutView] = []
+    with progress_bar("rendering", "held-out views", count) as done:
+        for view in render_held_out(run, count):
+            views.append(view)
+            done(len(views))
+    return views
 
 
 def _subtitle(dataset: PackedDataset) -> str:

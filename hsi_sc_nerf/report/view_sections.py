@@ -18,10 +18,9 @@ from hsi_sc_nerf.report.embed import embedded_array
 from hsi_sc_nerf.report.places import PlaceSpectra
 from hsi_sc_nerf.report.rendering import HeldOutView
 from hsi_sc_nerf.report.scores import ViewScores, object_angles, over_views, spread_of_views
-from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, coloured
+from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 
 PICTURED_VIEWS = 4
-_ERROR_DRAWN = (0.0, 0.1)
 _ERROR_COLOURS = "viridis"
 _MARGIN = 0.12
 _HISTOGRAM_BINS = 60
@@ -69,8 +68,8 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
         _metrics_table([view.scores for view in views]),
         Paragraph(
             f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
-            f"(light), the error, root mean square over bands, from {_ERROR_DRAWN[0]:g} (dark) to "
-            f"{_ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object."
+            f"(light), the error, root mean square over bands, from {ERROR_DRAWN[0]:g} (dark) to "
+            f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object."
         ),
     ]
     for index in spread_of_views(len(views), PICTURED_VIEWS):
@@ -79,7 +78,7 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
         inside = torch.from_numpy(view.scores.mask[crop])
         maps = (
             (view.scores.angle_rad, ANGLE_DRAWN_RAD, ANGLE_COLOURS, "Map of the spectral angle"),
-            (view.scores.error, _ERROR_DRAWN, _ERROR_COLOURS, "Map of the error"),
+            (view.scores.error, ERROR_DRAWN, _ERROR_COLOURS, "Map of the error"),
         )
         pictures = [
             embedded_array(view.measured_rgb[crop], f"{view.scores.name} as measured, pseudo-RGB"),

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at
 from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
 from hsi_sc_nerf.simulate.effects import of_stage
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
-from hsi_sc_nerf.simulate.mesh import Mesh
 from hsi_sc_nerf.simulate.objects import Cylinder, MaizeEar, Object, OwnMesh, Sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import Camera, Scene

@@ -1,8 +1,6 @@
-"""Triangle meshes as plain arrays: area, volume, and the few ways in which the simulator makes them."""
+"""The few ways in which the simulator makes meshes."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,38 +8,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-
-@dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh in metres; triangles run counter-clockwise seen from outside."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    triangles: Int[np.ndarray, "t 3"]
-
-    def moved(self, offset: Float[np.ndarray, "3"]) -> Mesh:
-        """The mesh shifted by ``offset`` (metres)."""
-        return Mesh(self.vertices + offset, self.triangles)
-
-    def area_m2(self) -> float:
-        """Surface area."""
-        return float(np.linalg.norm(self._doubled_normals(), axis=1).sum() / 2.0)
-
-    def volume_m3(self) -> float:
-        """Enclosed volume of a closed mesh (divergence theorem)."""
-        first = self.vertices[self.triangles[:, 0]]
-        return float(np.einsum("ij,ij->", first, self._doubled_normals()) / 6.0)
-
-    def is_watertight(self) -> bool:
-        """Whether each edge belongs to exactly two triangles that run along it in opposite directions."""
-        t = self.triangles.astype(np.int64)
-        start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
-        n = len(self.vertices)
-        forward, backward = np.sort(start * n + end), np.sort(end * n + start)
-        return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
-
-    def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
-        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
-        return np.cross(b - a, c - a)
+from hsi_sc_nerf.mesh import Mesh
 
 
 def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:

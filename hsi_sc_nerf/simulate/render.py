@@ -11,9 +11,10 @@ import open3d as o3d
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
+from hsi_sc_nerf.mesh import Mesh, ray_scene
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.simulate.effects.stages import LensEffect
-from hsi_sc_nerf.simulate.mesh import Mesh, subdivided
+from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19
 RAY_START_M = 2e-5
@@ -146,8 +147,7 @@ class Renderer:
         self.triangles = np.concatenate(triangles)
         self.weights = np.concatenate(weights)
         self.is_object = np.concatenate(is_object)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self.vertices.astype(np.float32), self.triangles.astype(np.uint32))
+        self._scene = ray_scene(self.vertices, self.triangles)
 
     @cached_property
     def facet_normals(self) -> Float[np.ndarray, "t 3"]:

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from hsi_sc_nerf.simulate.mesh import Mesh, revolve
+from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.simulate.mesh import revolve
 
 SEGMENTS = 336
 VERTEX_SPACING_M = 0.0005

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.mesh import Mesh, cylinder, quads
+from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.simulate.scene import Container, Markers, Turntable
 
 PLAQUE_STANDOFF_M = 0.0005

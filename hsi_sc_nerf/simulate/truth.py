@@ -15,10 +15,10 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 from hsi_sc_nerf.simulate.frames import Frame, Simulation
 from hsi_sc_nerf.simulate.light import Light
-from hsi_sc_nerf.simulate.mesh import Mesh
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
 

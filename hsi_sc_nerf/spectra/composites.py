@@ -29,6 +29,7 @@ COMPOSITES = {
         Composite("pseudo-RGB", paper.PSEUDO_RGB_NM, "the paper's picture for the eye"),
         # Paper, section "Example Applications" and its figures.
         Composite("apple", (801.0, 708.0, 551.0), "bruises"),
+        Composite("maize visible", (650.0, 540.0, 470.0), "kernels as the eye sees them"),
         Composite("maize", (850.0, 580.0, 490.0), "dryness and starch, carotenoids, pigments of kernels"),
         Composite("pear", (980.0, 710.0, 550.0), "water status, maturity, peel colour"),
         # The classical colour-infrared film: near infrared, red, green.

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
-from hsi_sc_nerf.simulate.mesh import Mesh
 from hsi_sc_nerf.traits.poisson import pieces
 
 UNCLASSIFIED = -1

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
 from hsi_sc_nerf.evaluation.pictures import _COLOURS, _STYLE, _figure, _save, _show
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.mesh import Mesh, ray_scene
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.traits.analysis import WHOLE, Classes, Traits
@@ -32,13 +32,8 @@ class SideViews:
     """Parallel projections of a mesh, seen from the sides; each pixel knows its triangle."""
 
     def __init__(self, mesh: Mesh, height_px: int = _HEIGHT_PX) -> None:
-        import open3d as o3d
-
         self._mesh = mesh
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.triangles.astype(np.uint32))
-        )
+        scene = ray_scene(mesh.vertices, mesh.triangles)
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         middle = (low + high) / 2.0
         reach_m = float(np.linalg.norm(mesh.vertices[:, :2] - middle[:2], axis=1).max())
@@ -52,7 +47,7 @@ class SideViews:
             right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
             start = middle + 2.0 * reach_m * towards + across[None, :, None] * right + up[:, None, None] * [0, 0, 1.0]
             rays = np.concatenate([start, np.broadcast_to(-towards, start.shape)], axis=-1).astype(np.float32)
-            hits = scene.cast_rays(o3d.core.Tensor(rays))
+            hits = scene.cast_rays(rays)
             u, v = np.moveaxis(hits["primitive_uvs"].numpy(), -1, 0)
             hit = np.isfinite(hits["t_hit"].numpy())
             triangle = np.where(hit, hits["primitive_ids"].numpy(), 0).astype(np.int64)

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.traits.base import find_base
 from hsi_sc_nerf.traits.smoothing import NEIGHBOURS, smoothed, thinned
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh
 
 SPREAD_DEPTH = 6

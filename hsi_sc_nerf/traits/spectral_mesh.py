@@ -16,7 +16,7 @@ from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
-from hsi_sc_nerf.simulate.mesh import Mesh
+from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.spectra.composites import composite
 from hsi_sc_nerf.traits.classes import vertex_areas_m2
 

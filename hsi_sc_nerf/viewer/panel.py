@@ -22,10 +22,10 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.models.metrics import spectral_angle_map
-from hsi_sc_nerf.models.pose_refinement import FRAME_INDEX
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
