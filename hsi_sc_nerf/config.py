@@ -91,6 +91,7 @@ hsi_sc_nerf_paper = MethodSpecification(
                 background="last-sample",
                 angular_loss="cosine",
                 angular_loss_mult=paper.ANGULAR_LOSS_WEIGHT,
+                distortion_loss_mult=paper.DISTORTION_LOSS_WEIGHT,
                 near_plane=paper.NEAR_FAR[0],
                 far_plane=paper.NEAR_FAR[1],
                 disable_scene_contraction=False,

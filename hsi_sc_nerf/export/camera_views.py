@@ -22,10 +22,10 @@ from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 
 MIN_OPACITY = 0.5
 """Rays that collect less than this hit no surface (released settings of the paper)."""
-SURFACE_OPACITY = 0.25
+SURFACE_OPACITY = 0.1
 """The surface is where a ray has collected this much. Other views keep the space outside the object empty, so the
 density begins at the true surface; how far into the object a ray reaches before it is half absorbed says how long the
-model was trained. On the demo's pear, half the opacity lies 1.5 mm below the true surface, a quarter 0.3 mm."""
+model was trained (benchmarks/surface_depth.py)."""
 SEARCH_DEPTH = 0.1
 """The surface is sought this far around a depth that is nearly right, scene units (about a centimetre)."""
 SEARCH_STEPS = 40

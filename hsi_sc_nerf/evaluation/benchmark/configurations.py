@@ -35,6 +35,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
     "ours-not-view-dependent": (OURS, "--pipeline.model.view-dependent False"),
     "ours-cosine-loss": (OURS, "--pipeline.model.angular-loss cosine --pipeline.model.angular-loss-mult 0.25"),
+    "ours-nerfacto-distortion": (OURS, "--pipeline.model.distortion-loss-mult 0.002"),
     "ours-predicted-normals": (OURS, "--pipeline.model.predict-normals True"),
     "ours-nerfacto-grid": (
         OURS,
