@@ -1,0 +1,100 @@
+"""How far below the true surface of a simulated session a trained model's rays have collected how much opacity.
+
+    uv run python benchmarks/surface_depth.py SESSION RUN/config.yml
+
+Rays of training frames through the object, which meet the true surface less than 60 degrees from the front, are
+followed from 6 mm before it to 8 mm behind it. `export.camera_views.SURFACE_OPACITY` is chosen by these figures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from open3d.core import Tensor as Open3DTensor
+from rich.console import Console
+from rich.table import Table
+
+from hsi_sc_nerf.export.camera_views import camera_rays
+from hsi_sc_nerf.export.surface import opacity_crossing_depth
+from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
+from hsi_sc_nerf.mesh import ray_scene
+from hsi_sc_nerf.simulate.truth import load_truth
+
+LEVELS = (0.05, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
+BEFORE_M, BEHIND_M, STEP_M = 0.006, 0.008, 0.0001
+MIN_COSINE = 0.5
+
+
+@dataclass(frozen=True)
+class SurfaceDepth:
+    """Measure where a trained model's opacity begins."""
+
+    session: tyro.conf.Positional[Path]
+    """The simulated session."""
+    load_config: tyro.conf.Positional[Path]
+    """The run's config.yml."""
+    rays: int = 4000
+    """Rays that are followed."""
+    seed: int = 0
+    """Of their choice."""
+
+    def main(self) -> None:
+        """Measure and print."""
+        run, mesh = open_run(self.load_config), load_truth(self.session).mesh()
+        origins_m, directions = self._rays(run)
+        scene = ray_scene(mesh.vertices, mesh.triangles)
+        met = scene.cast_rays(Open3DTensor(np.concatenate([origins_m, directions], axis=1).astype(np.float32)))
+        cosines = -(met["primitive_normals"].numpy() * directions).sum(axis=1)
+        depths_m = met["t_hit"].numpy()
+        frontal = np.isfinite(depths_m) & (cosines > MIN_COSINE)
+        below_m = depths_below_surface(
+            run, origins_m[frontal], directions[frontal], depths_m[frontal], cosines[frontal]
+        )
+        table = Table("opacity", "below the true surface, mm: mean", "standard deviation", "share of rays, %")
+        for level, below in zip(LEVELS, below_m, strict=True):
+            reached = np.isfinite(below)
+            figures = (1e3 * below[reached].mean(), 1e3 * below[reached].std(), 100.0 * reached.mean())
+            table.add_row(f"{level:g}", *(f"{figure:.2f}" for figure in figures))
+        Console().print(table)
+
+    def _rays(self, run: TrainedRun) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Refined rays through the centres of pixels of the object: origins in metres, and directions."""
+        dataset = run.manager.train_dataset
+        masks = np.stack([frame.mask() for frame in dataset.frames])
+        pixels = np.random.default_rng(self.seed).choice(np.argwhere(masks), self.rays, replace=False)
+        rays = camera_rays(dataset.cameras, pixels[:, 0], pixels[:, :0:-1] + 0.5, run.model.device)
+        with torch.no_grad():
+            run.model.camera_optimizer.apply_to_raybundle(rays)
+        return run.to_metres(rays.origins.cpu().numpy().astype(float)), rays.directions.cpu().numpy().astype(float)
+
+
+@torch.no_grad()
+def depths_below_surface(
+    run: TrainedRun,
+    origins_m: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    depths_m: Float[np.ndarray, "n"],
+    cosines: Float[np.ndarray, "n"],
+) -> list[Float[np.ndarray, "n"]]:
+    """For each of `LEVELS`, how far below the surface (m) rays reach it; NaN for those that do not."""
+    below = np.arange(-BEFORE_M, BEHIND_M, STEP_M)
+    along_m = depths_m[:, None] + below / cosines[:, None]
+    middles_m = (along_m[:, 1:] + along_m[:, :-1]) / 2.0
+    places = run.to_scene(origins_m[:, None] + directions[:, None] * middles_m[..., None])
+    densities = run.model.field.density_fn(torch.from_numpy(places).float().to(run.model.device))[..., 0].cpu()
+    edges = torch.from_numpy(along_m * run.scale).float()
+    results = []
+    for level in LEVELS:
+        reached_m = opacity_crossing_depth(edges, densities, level).numpy() / run.scale
+        missing = reached_m >= along_m[:, -1] - STEP_M / 2.0
+        results.append(np.where(missing, np.nan, (reached_m - depths_m) * cosines))
+    return results
+
+
+if __name__ == "__main__":
+    tyro.cli(SurfaceDepth).main()
