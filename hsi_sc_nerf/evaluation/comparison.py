@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.closest_points import robust_radius
 from hsi_sc_nerf.evaluation.registration import (
     Registration,
     align_by_features,
     refine,
-    robust_radius,
 )
 from hsi_sc_nerf.evaluation.similarity import Similarity
 from hsi_sc_nerf.evaluation.spatial import sample_surface

@@ -1,43 +1,40 @@
 """Bring a cloud into a reference's frame: features (FPFH, RANSAC), then iterative closest points.
 
-Features, normals and RANSAC are Open3D's. The closest-point rounds are not: Open3D estimates a scale from pairs of
-points only, which shrinks noisy clouds; here pairs are point and tangent plane with a scale as well as without.
+Features, normals and RANSAC are Open3D's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from hsi_sc_nerf.evaluation.closest_points import (
+    SEARCH_POINTS,
+    Target,
+    approached,
+    drawn,
+    refined,
+    robust_radius,
+    with_normals,
+)
 from hsi_sc_nerf.evaluation.similarity import Similarity
 
 if TYPE_CHECKING:
     import open3d
 
-ROUNDS = 50
-CONVERGED = 1e-5
-"""Share of the object's radius: a round that moves no point further is the last; ..."""
 NEARLY_CONVERGED = 1e-3
-"""... while a start is searched for."""
-NEIGHBOURS = 30
-"""Points to a tangent plane."""
+"""Share of the object's radius: while a start is searched for, a round that moves no point further is the last."""
 MOST_POINTS = 50_000
 """Points of the reference that take part."""
-MOVED_POINTS = 20_000
-"""Points of the cloud that take part in the last rounds."""
-SEARCH_POINTS = 1_000
-"""Points of the cloud that find the way in the first rounds, ..."""
 SEARCHED_POINTS = 10_000
-"""... and of the reference."""
+"""Points of the reference that take part while a start is searched for."""
 JUDGED_POINTS = 20_000
 """Points that tell good fits from bad ones."""
-FEWEST_PAIRS = 10
 RESTARTS = 3
 TURN_DEG = 30.0
 SIGNIFICANT = 4.0
@@ -68,36 +65,6 @@ class Registration:
     """What features found besides; None also where only closest points were sought."""
 
 
-@dataclass(frozen=True)
-class _Target:
-    """Points with what closest-point rounds need of them."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    tree: cKDTree
-
-    @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"]) -> _Target:
-        return cls(points, np.asarray(_with_normals(points).normals), cKDTree(points))
-
-    def thinned(self, count: int) -> _Target:
-        chosen = slice(None, None, max(1, len(self.points) // count))
-        return _Target(self.points[chosen], self.normals[chosen], cKDTree(self.points[chosen]))
-
-    def off_plane(self, points: Float[np.ndarray, "m 3"], cap_m: float) -> Float[np.ndarray, "m"]:
-        """Distance of each point to the tangent plane at its closest point, at most ``cap_m``."""
-        distance, nearest = self.tree.query(points, distance_upper_bound=cap_m)
-        off = np.full(len(points), cap_m)
-        near, there = np.isfinite(distance), nearest[np.isfinite(distance)]
-        off[near] = np.abs(np.einsum("ij,ij->i", points[near] - self.points[there], self.normals[there]))
-        return off
-
-
-def robust_radius(points: Float[np.ndarray, "n 3"]) -> float:
-    """Median distance of the points from their median: a sphere's radius, and hardly touched by outliers."""
-    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-
-
 def refine(
     cloud_m: Float[np.ndarray, "n 3"],
     reference_m: Float[np.ndarray, "m 3"],
@@ -107,9 +74,7 @@ def refine(
 ) -> Registration:
     """Iterative closest points from a start that is roughly right.
 
-    Point to tangent plane (Chen and Medioni 1992), with a scale if asked for. Pairs count that are closer than a
-    third of the object's radius in the first rounds, and closer than three robust standard deviations in the last, so
-    that outliers and what the reference lacks do not pull.
+    Point to tangent plane (Chen and Medioni 1992), with a scale if asked for.
 
     Args:
         cloud_m: What moves.
@@ -118,9 +83,8 @@ def refine(
         with_scale: Estimate a scale, too.
         seed: Of the points drawn, where there are more than take part.
     """
-    return _refined(
-        cloud_m, _Target.of(_drawn(reference_m, MOST_POINTS, seed)), start or Similarity(), with_scale, seed
-    )
+    target = Target.of(drawn(reference_m, MOST_POINTS, seed))
+    return Registration(*refined(cloud_m, target, start or Similarity(), with_scale, seed))
 
 
 def align_by_features(
@@ -146,15 +110,15 @@ def align_by_features(
     import open3d
 
     open3d.utility.random.seed(seed)
-    cloud, reference = (_Target.of(_drawn(points, MOST_POINTS, seed)) for points in (cloud_m, reference_m))
+    cloud, reference = (Target.of(drawn(points, MOST_POINTS, seed)) for points in (cloud_m, reference_m))
     radius = robust_radius(reference.points)
     sized = Similarity(radius / robust_radius(cloud.points) if with_scale else 1.0)
-    few = _drawn(cloud.points, SEARCH_POINTS, seed)
+    few = drawn(cloud.points, SEARCH_POINTS, seed)
     thinned = reference.thinned(SEARCHED_POINTS)
-    judged_cloud, judged_reference = (_drawn(target.points, JUDGED_POINTS, seed) for target in (cloud, reference))
+    judged_cloud, judged_reference = (drawn(target.points, JUDGED_POINTS, seed) for target in (cloud, reference))
 
     def found_from(start: Similarity) -> Similarity:
-        return _approached(few, thinned, start, with_scale, NEARLY_CONVERGED * radius)
+        return approached(few, thinned, start, with_scale, NEARLY_CONVERGED * radius)
 
     def judged(transform: Similarity) -> _Fit:
         # Both ways, so that a cloud shrunk into a corner does not fit.
@@ -164,7 +128,7 @@ def align_by_features(
 
     matched = _matched_features(sized(cloud.points), reference.points, radius, with_scale)
     start = min((judged(found_from(found.after(sized))) for found in matched), key=_Fit.misfit)
-    best = judged(_refined(cloud_m, reference, start.transform, with_scale, seed).transform)
+    best = judged(refined(cloud_m, reference, start.transform, with_scale, seed)[0])
     turned = [judged(found_from(best.transform.after(turn))) for turn in track(_turns(cloud.points))]
     best, *others = sorted([best, *turned], key=_Fit.misfit)
     rivals = ((other, other.transform.after(best.transform.inverse()).turn_deg()) for other in others)
@@ -176,7 +140,7 @@ def align_by_features(
         ),
         None,
     )
-    return replace(_refined(cloud_m, reference, best.transform, with_scale, seed), rival=rival)
+    return Registration(*refined(cloud_m, reference, best.transform, with_scale, seed), rival)
 
 
 @dataclass(frozen=True)
@@ -191,72 +155,6 @@ class _Fit:
     def is_worse_than(self, other: _Fit) -> bool:
         more = self.squares - other.squares
         return bool(more.mean() > SIGNIFICANT * more.std() / np.sqrt(len(more)))
-
-
-def _refined(cloud: np.ndarray, target: _Target, start: Similarity, with_scale: bool, seed: int) -> Registration:
-    radius = robust_radius(target.points)
-    few, many = (_drawn(cloud, count, seed) for count in (SEARCH_POINTS, MOVED_POINTS))
-    transform = _approached(few, target, start, with_scale, CONVERGED * radius)
-    off = target.off_plane(transform(many), radius / 10)
-    # The points' spacing bounds how close a closest point can be expected to be.
-    within = min(radius / 10, 3 * 1.4826 * float(np.median(off)) + 2 * _spacing(target))
-    return Registration(
-        _closest_point_rounds(many, target, transform, within, with_scale, CONVERGED * radius), within
-    )
-
-
-def _approached(
-    cloud: np.ndarray, target: _Target, start: Similarity, with_scale: bool, converged_m: float
-) -> Similarity:
-    radius = robust_radius(target.points)
-    transform = start
-    for within in (radius / 3, radius / 10):
-        transform = _closest_point_rounds(cloud, target, transform, within, with_scale, converged_m)
-    return transform
-
-
-def _closest_point_rounds(
-    cloud: np.ndarray, target: _Target, transform: Similarity, within: float, with_scale: bool, converged_m: float
-) -> Similarity:
-    for _ in range(ROUNDS):
-        moved = transform(cloud)
-        distance, nearest = target.tree.query(moved, distance_upper_bound=within)
-        paired = np.isfinite(distance)
-        if paired.sum() < FEWEST_PAIRS:
-            break
-        here, there = moved[paired], nearest[paired]
-        step = plane_step(here, target.points[there], target.normals[there], with_scale)
-        transform = step.after(transform)
-        if np.linalg.norm(step(here) - here, axis=1).max() < converged_m:
-            break
-    return transform
-
-
-def plane_step(
-    points: Float[np.ndarray, "n 3"],
-    on_plane: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    with_scale: bool = False,
-) -> Similarity:
-    """The small motion that brings points nearest to their planes in the least-squares sense.
-
-    Linearised in the rotation (and the scale) about the points' centre; what the planes do not determine stays as it
-    is. Low 2004, "Linear Least-Squares Optimization for Point-to-Plane ICP Surface Registration".
-    """
-    centre = points.mean(axis=0)
-    arms = points - centre
-    columns = [np.cross(arms, normals), normals]
-    if with_scale:
-        columns.append(np.einsum("ij,ij->i", arms, normals)[:, None])
-    size = float(np.sqrt(np.mean(arms**2))) or 1.0
-    # Turns and stretches in units of length, so that one bound tells which motions are undetermined.
-    units = np.array([size] * 3 + [1.0] * 3 + [size] * with_scale)
-    design = np.concatenate(columns, axis=1) / units
-    off = np.einsum("ij,ij->i", on_plane - points, normals)
-    motion = np.linalg.lstsq(design.T @ design, design.T @ off, rcond=1e-6)[0] / units
-    rotation = Rotation.from_rotvec(motion[:3]).as_matrix()
-    scale = float(np.exp(motion[6])) if with_scale else 1.0
-    return Similarity(scale, rotation, centre + motion[3:6] - scale * rotation @ centre)
 
 
 def _turns(cloud: np.ndarray) -> list[Similarity]:
@@ -307,33 +205,8 @@ def _features(
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
-    cloud = _with_normals(np.asarray(cloud.points))
+    cloud = with_normals(np.asarray(cloud.points))
     features = open3d.pipelines.registration.compute_fpfh_feature(
         cloud, open3d.geometry.KDTreeSearchParamRadius(5 * voxel)
     )
     return cloud, features
-
-
-def _with_normals(points: np.ndarray) -> open3d.geometry.PointCloud:
-    """A cloud with normals that point away from its centre."""
-    import open3d
-
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
-    normals = np.asarray(cloud.normals)
-    outwards = np.einsum("ij,ij->i", normals, points - np.median(points, axis=0))
-    cloud.normals = open3d.utility.Vector3dVector(np.where(outwards[:, None] < 0, -normals, normals))
-    return cloud
-
-
-def _spacing(target: _Target) -> float:
-    """Median distance to the next point."""
-    few = target.points[:: max(1, len(target.points) // SEARCH_POINTS)]
-    return float(np.median(target.tree.query(few, k=2)[0][:, 1]))
-
-
-def _drawn(points: np.ndarray, count: int, seed: int) -> np.ndarray:
-    points = np.asarray(points, float)
-    if len(points) <= count:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), count, replace=False)]
