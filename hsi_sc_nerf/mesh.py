@@ -25,7 +25,11 @@ class Mesh:
 
     def area_m2(self) -> float:
         """Surface area."""
-        return float(np.linalg.norm(self._doubled_normals(), axis=1).sum() / 2.0)
+        return float(self.triangle_areas_m2().sum())
+
+    def triangle_areas_m2(self) -> Float[np.ndarray, "t"]:
+        """Area of each triangle."""
+        return np.linalg.norm(self._doubled_normals(), axis=1) / 2.0
 
     def volume_m3(self) -> float:
         """Enclosed volume of a closed mesh (divergence theorem)."""

@@ -14,7 +14,6 @@ from hsi_sc_nerf.traits.classes import (
     classify,
     connected_regions,
     spectral_angles,
-    triangle_areas_m2,
     vertex_areas_m2,
 )
 from hsi_sc_nerf.traits.library import SpectralLibrary, read_library
@@ -43,7 +42,7 @@ def test_angles_and_classes_do_not_depend_on_brightness():
 
 def test_areas_of_vertices_add_up():
     mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
-    assert triangle_areas_m2(mesh).sum() == pytest.approx(mesh.area_m2())
+    assert mesh.triangle_areas_m2().sum() == pytest.approx(mesh.area_m2())
     assert vertex_areas_m2(mesh).sum() == pytest.approx(mesh.area_m2())
 
 

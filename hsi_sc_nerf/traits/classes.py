@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
@@ -56,21 +56,10 @@ def classify(
     return np.where(angles.min(axis=1) <= threshold_rad, nearest, UNCLASSIFIED)
 
 
-def triangle_areas_m2(mesh: Mesh) -> Float[np.ndarray, "t"]:
-    """Area of each triangle."""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0
-
-
 def vertex_areas_m2(mesh: Mesh) -> Float[np.ndarray, "v"]:
     """Each vertex's share of the surface: a third of each of its triangles. They add up to the mesh's area."""
-    thirds = np.repeat(triangle_areas_m2(mesh) / 3.0, 3)
+    thirds = np.repeat(mesh.triangle_areas_m2() / 3.0, 3)
     return np.bincount(mesh.triangles.ravel(), thirds, minlength=len(mesh.vertices))
-
-
-def class_area_m2(areas_m2: Float[np.ndarray, "v"], chosen: Bool[np.ndarray, "v"]) -> float:
-    """Area of the chosen vertices: a triangle counts by the share of its corners that are chosen."""
-    return float(areas_m2[chosen].sum())
 
 
 def connected_regions(
