@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_training, draw_views
+from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
 
 WAVELENGTHS = np.linspace(400.0, 1000.0, 7)
 RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (217, 217, 217)
@@ -99,14 +99,6 @@ def test_a_stray_point_does_not_shrink_the_object(tmp_path: Path) -> None:
 def test_an_empty_cloud_is_an_empty_picture(tmp_path: Path) -> None:
     draw_cloud(tmp_path / "cloud.png", np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert drawn(tmp_path / "cloud.png").size
-
-
-@pytest.mark.parametrize("panels", [1, 2, 4])
-def test_training_curves(tmp_path: Path, panels: int) -> None:
-    steps = np.arange(50)
-    curves = {f"loss {panel}": (steps, np.exp(-steps / 5.0 * panel)) for panel in range(panels)}
-    draw_training(tmp_path / "training.png", curves, {"full frame": 0, "masked": 25})
-    assert len(where(drawn(tmp_path / "training.png"), (0x00, 0x72, 0xB2), 30)) > 100 * panels
 
 
 def test_a_picture_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:

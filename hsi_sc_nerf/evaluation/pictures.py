@@ -6,7 +6,7 @@ Drawn without a display and without matplotlib's global state; written whole or 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,6 @@ _STYLE: Any = {
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _DASHED = (0.0, (3.0, 1.5))
 _CLOUD_POINTS = 200_000
-# Ratio of a curve's largest to its smallest value from which a logarithmic axis shows more than a linear one.
-_LOGARITHMIC_ABOVE = 10
 
 
 def _figure(width_in: float, height_in: float) -> Figure:
@@ -220,43 +218,4 @@ def draw_cloud(
         )
     if outside:
         figure.supxlabel(f"{outside / len(points):.2%} of the points lie outside the frame", fontsize=8, color="0.4")
-    _save(figure, path)
-
-
-@rc_context(_STYLE)
-def draw_training(
-    path: Path,
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    stage_starts: Mapping[str, float] | None = None,
-) -> None:
-    """Training curves, a panel each, on a logarithmic axis where the values are positive and span a decade.
-
-    Args:
-        path: The PNG file.
-        curves: (steps, values) by title.
-        stage_starts: The step at which each named stage begins, drawn as a dashed line.
-    """
-    rows = math.ceil(len(curves) / 3)
-    columns = math.ceil(len(curves) / rows)
-    figure = _figure(3.2 * columns, 2.3 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (title, (steps, values)) in zip(panels, curves.items(), strict=False):
-        axes.plot(steps, values, color=_COLOURS[0], linewidth=1.2)
-        if len(values) and min(values) > 0 and max(values) > _LOGARITHMIC_ABOVE * min(values):
-            axes.set_yscale("log")
-        for name, step in (stage_starts or {}).items():
-            axes.axvline(step, color="0.5", linestyle="--", linewidth=0.8)
-            axes.annotate(
-                name,
-                (step, 1),
-                (3, -2),
-                xycoords=("data", "axes fraction"),
-                textcoords="offset points",
-                va="top",
-                fontsize=7,
-                color="0.4",
-            )
-        axes.set(title=title, xlabel="step")
-    for axes in panels[len(curves) :]:
-        axes.set_visible(False)
     _save(figure, path)

@@ -18,6 +18,7 @@ from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.surface import opacity_crossing_depth
 from hsi_sc_nerf.export.visibility import DepthMaps
 from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.numerics import safe_ratio
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
 
 MIN_OPACITY = 0.5
@@ -68,7 +69,7 @@ def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tens
     outputs = model(rays)
     spectra, opacity = outputs["spectral"], outputs["accumulation"]
     if model.background is not None:
-        spectra = (spectra - behind * (1.0 - opacity)) / opacity.clamp_min(_LEAST_OPACITY)
+        spectra = safe_ratio(spectra - behind * (1.0 - opacity), opacity, minimum=_LEAST_OPACITY)
     return outputs, spectra.clamp(0.0, 1.0)
 
 
