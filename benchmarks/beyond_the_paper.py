@@ -35,10 +35,12 @@ from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_word
 from hsi_sc_nerf.evaluation.benchmark.run import HeldOutViews
 from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
+from hsi_sc_nerf.evaluation.processing import score_processing
 from hsi_sc_nerf.evaluation.threshold_curves import score_at
 from hsi_sc_nerf.models.metrics import spectral_metrics
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")
 SHADING = ("chamber_shading",)
@@ -124,10 +126,17 @@ class BeyondThePaper:
         return json.loads(kept.read_text(encoding="utf-8"))
 
     def _caption(self) -> str:
+        masks = ", ".join(f"{name} {worst_mask(self.output_dir / name):.3f}" for name in self.objects)
         return (
             f"{self.frames} frames of {self.size} x {self.size} x {paper.BANDS}, {self.train_seconds:g} s of "
-            f"training ({self.clock}) each, {self.common}; {describe_in_words(describe_machine())}."
+            f"training ({self.clock}) each, {self.common}; masks, smallest intersection over union of a frame: "
+            f"{masks}; {describe_in_words(describe_machine())}."
         )
+
+
+def worst_mask(folder: Path) -> float:
+    """Smallest intersection over union of a frame's mask with what the object covers."""
+    return score_processing(open_packed(folder / "session-data"), load_truth(folder / "session")).mask_iou
 
 
 def noise_free_metrics(config: Path, noise_free: Path, held_out_views: int | None) -> dict[str, float]:
