@@ -6,7 +6,7 @@ import pytest
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder
-from hsi_sc_nerf.traits.base import SECTORS, find_base
+from hsi_sc_nerf.traits.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.traits.poisson import MeshConfig, closed_mesh, open_edges, solid_pieces
 from hsi_sc_nerf.traits.size import feret_diameters, size_of, size_spread
 from hsi_sc_nerf.traits.smoothing import smoothed, thinned
@@ -75,9 +75,27 @@ def test_base_of_a_cone_goes_straight_on_to_where_it_stands():
 
 def test_base_without_a_height_is_where_the_cloud_ends():
     points, normals = sphere_points(20000, above=-0.6)
-    base = find_base(points, normals)
-    assert base.height_m == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=5e-4)
-    assert base.foot_radius_m.shape == (SECTORS,)
+    assert lowest_edge_m(points) == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=5e-4)
+    mesh = closed_mesh(points, normals, MeshConfig(octree_depth=6))
+    assert mesh.vertices[:, 2].min() == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=1e-3)
+
+
+def test_a_rim_that_hangs_down_does_not_widen_the_base():
+    points, normals = sphere_points(40000, above=-0.8)
+    edge_m = STAND_M + 0.2 * RADIUS_M
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
+    out = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=-1)
+    hanging = 0.6 * RADIUS_M * out
+    hanging[:, 2] = edge_m - np.random.default_rng(1).uniform(0.0, 0.001, len(hanging))
+    config = MeshConfig(octree_depth=6, base_height_m=STAND_M)
+    clean = closed_mesh(points, normals, config)
+    with_rim = closed_mesh(np.concatenate([points, hanging]), np.concatenate([normals, out]), config)
+    rim = lower_rim(np.concatenate([points, hanging]), 0.001)
+    assert rim[len(points) :].mean() > 0.98
+    assert rim[: len(points)].mean() < 0.02
+    assert with_rim.area_m2() == pytest.approx(clean.area_m2(), rel=0.005)
+    foot_m = find_base(points[~rim[: len(points)]], normals[~rim[: len(points)]], STAND_M).foot_radius_m
+    assert foot_m.max() < 0.55 * RADIUS_M
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0003])

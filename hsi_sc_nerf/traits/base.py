@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 
 SECTORS = 72
@@ -70,37 +70,67 @@ class Base:
         return np.interp(azimuth, middles, values, period=2.0 * np.pi)
 
 
-def find_base(
-    points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], height_m: float | None = None
-) -> Base:
+def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], height_m: float) -> Base:
     """Where an object that stands upright (z up) closes: its surface goes straight on, down to the base's plane.
 
     Args:
         points_m: the seen surface.
         normals: unit normals, outwards.
-        height_m: z of the plane that the object stands on; without it, where the seen surface ends at its lowest.
+        height_m: z of the plane that the object stands on.
     """
-    z = points_m[:, 2]
-    low = points_m[z < np.quantile(z, _STRAYS) + _STRIP_M, :2]
-    centre = (low.min(axis=0) + low.max(axis=0)) / 2.0
+    z, centre = points_m[:, 2], _centre(points_m)
     offset = points_m[:, :2] - centre
-    radius = np.hypot(*offset.T)
-    sector = (np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi) * (SECTORS / (2.0 * np.pi))).astype(
-        int
-    ) % SECTORS
+    radius, sector = np.hypot(*offset.T), _sectors(offset)
     outwards = (normals[:, :2] * offset).sum(axis=1) / np.maximum(radius, 1e-12)
 
     edge_z, edge_r, slope = (np.full(SECTORS, np.nan) for _ in range(3))
     for index in np.unique(sector):
         here = np.flatnonzero(sector == index)
-        edge_z[index] = np.quantile(z[here], _STRAYS)
+        edge_z[index] = _edge(z[here])
         strip = here[z[here] <= edge_z[index] + _STRIP_M]
         edge_r[index] = np.median(radius[strip][z[strip] <= np.median(z[strip])])
         slope[index] = np.clip(-normals[strip, 2].mean() / max(outwards[strip].mean(), 1e-6), 0.0, _FLATTEST)
     edge_z, edge_r, slope = (_smooth_around(values) for values in (edge_z, edge_r, slope))
-    base_z = float(edge_z.min()) if height_m is None else height_m
-    foot_r = np.maximum(edge_r - slope * np.maximum(edge_z - base_z, 0.0), 0.0)
-    return Base(centre, base_z, edge_z, edge_r, foot_r)
+    foot_r = np.maximum(edge_r - slope * np.maximum(edge_z - height_m, 0.0), 0.0)
+    return Base(centre, height_m, edge_z, edge_r, foot_r)
+
+
+def lower_rim(points_m: Float[np.ndarray, "n 3"], width_m: float) -> Bool[np.ndarray, "n"]:
+    """Points less than ``width_m`` above where the surface of an object that stands upright ends.
+
+    There, rays graze it and masks end: reconstructed, the last millimetres often hang down straight.
+    """
+    z, sector = points_m[:, 2], _sectors(points_m[:, :2] - _centre(points_m))
+    rim = np.zeros(len(points_m), bool)
+    for index in np.unique(sector):
+        here = sector == index
+        rim[here] = z[here] < _edge(z[here]) + width_m
+    return rim
+
+
+def lowest_edge_m(points_m: Float[np.ndarray, "n 3"]) -> float:
+    """z at which the surface of an object that stands upright ends at its lowest."""
+    sector = _sectors(points_m[:, :2] - _centre(points_m))
+    edges = np.full(SECTORS, np.nan)
+    for index in np.unique(sector):
+        edges[index] = _edge(points_m[sector == index, 2])
+    return float(_smooth_around(edges).min())
+
+
+def _centre(points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2"]:
+    """Middle of the lowest strip, x and y."""
+    low = points_m[points_m[:, 2] < _edge(points_m[:, 2]) + _STRIP_M, :2]
+    return (low.min(axis=0) + low.max(axis=0)) / 2.0
+
+
+def _sectors(offset_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+    azimuth = np.arctan2(offset_m[:, 1], offset_m[:, 0]) % (2.0 * np.pi)
+    return (azimuth * (SECTORS / (2.0 * np.pi))).astype(int) % SECTORS
+
+
+def _edge(z_m: Float[np.ndarray, "n"]) -> float:
+    """Height at which points end, strays below it left out."""
+    return float(np.quantile(z_m, _STRAYS))
 
 
 def _smooth_around(values: Float[np.ndarray, "sectors"]) -> Float[np.ndarray, "sectors"]:

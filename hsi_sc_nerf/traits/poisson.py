@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.mesh import Mesh
-from hsi_sc_nerf.traits.base import find_base
+from hsi_sc_nerf.traits.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.traits.smoothing import NEIGHBOURS, smoothed, thinned
 
 # Points that a quadric is fitted to lie a third of its radius apart: about thirty weigh in.
@@ -37,8 +37,9 @@ class MeshConfig:
 def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], config: MeshConfig) -> Mesh:
     """The closed surface of an object that stands upright, its base flat.
 
-    The points are thinned and smoothed, the base that no camera saw is closed (`find_base`), and the whole goes
-    through screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D), of which specks are left out.
+    The points are thinned, half a smoothing radius of the surface's lower rim is left out, the others are smoothed,
+    the base that no camera saw is closed (`find_base`), and the whole goes through screened Poisson reconstruction
+    (Kazhdan and Hoppe 2013; Open3D), of which specks are left out.
 
     Args:
         points_m: the seen surface, z up.
@@ -52,15 +53,19 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
         raise InputError(
             f"the cloud has {len(points_m)} points that do not surround a solid; export more points of the object."
         )
+    points, facing = np.asarray(points_m, float), np.asarray(normals, float)
+    base_height_m = lowest_edge_m(points) if config.base_height_m is None else config.base_height_m
     spacing_m = config.smoothing_radius_m / _THINNING
-    points, facing = thinned(np.asarray(points_m, float), np.asarray(normals, float), spacing_m)
+    points, facing = thinned(points, facing, spacing_m)
+    inner = ~lower_rim(points, config.smoothing_radius_m / 2.0)
+    points, facing = points[inner], facing[inner]
     if len(points) < NEIGHBOURS:
         raise InputError(
             f"the cloud is too small for a smoothing radius of {config.smoothing_radius_m} m, which leaves "
             f"{len(points)} points; check that it is in metres, or lower the radius."
         )
     points, outward = smoothed(points, facing, config.smoothing_radius_m)
-    base_points, base_normals = find_base(points, outward, config.base_height_m).points(spacing_m)
+    base_points, base_normals = find_base(points, outward, base_height_m).points(spacing_m)
     return solid_pieces(
         _poisson(np.concatenate([points, base_points]), np.concatenate([outward, base_normals]), config.octree_depth)
     )
