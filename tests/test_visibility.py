@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from hsi_sc_nerf.export.silhouettes import within_silhouettes
 from hsi_sc_nerf.export.visibility import MIN_COSINE, DepthMaps, most_frontal
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
 
@@ -108,3 +109,16 @@ def test_the_most_frontal_frame_is_chosen(device: str) -> None:
         mine = expected == frame
         projected, _ = project(points.cpu().numpy()[mine].astype(float), pose, LENS)
         np.testing.assert_allclose(places.cpu().numpy()[mine], projected, atol=1e-2)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_some_frames_show_beside_the_object_is_not_the_objects(device: str) -> None:
+    maps = ball_maps(device, [(np.zeros(3), 1.0)])
+    maps.masks[:] = torch.isfinite(maps.depths)
+    assert maps.masks.any() and not maps.masks.all()
+    points = on_unit_ball(500, device)
+    assert within_silhouettes(maps, points).all()
+    assert within_silhouettes(maps, 0.3 * points).all()
+    # Before and behind the ball in the first and the last frame, beside it in the one between them.
+    beside = torch.tensor(SECOND_BALL, device=device).float() + 0.05 * points
+    assert not within_silhouettes(maps, beside).any()

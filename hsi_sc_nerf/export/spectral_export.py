@@ -24,6 +24,7 @@ from hsi_sc_nerf.export.point_cloud import Region, SurfacePoints, everywhere, re
 from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.regions import chosen_bands, in_box, in_cylinder
 from hsi_sc_nerf.export.roi_masks import in_roi_masks, read_roi_masks
+from hsi_sc_nerf.export.silhouettes import within_silhouettes
 from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.export.view_spread import COLUMNS, MeasuredFrames, spread_over_views
 
@@ -84,6 +85,11 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Pa
 def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region:
     """Which points the options keep."""
     tests: list[Region] = []
+    device = run.model.device
+    if not options.keep_turntable:
+        tests.append(
+            lambda points, _: within_silhouettes(seen.maps, torch.from_numpy(points).float().to(device)).cpu().numpy()
+        )
     if options.obb_center is not None and options.obb_rotation is not None and options.obb_scale is not None:
         crop = OrientedBox.from_params(options.obb_center, options.obb_rotation, options.obb_scale)
         tests.append(lambda points, _: crop.within(torch.from_numpy(points).float()).numpy())
@@ -94,7 +100,7 @@ def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region
         x, y, radius_m, *z_m = options.roi_cylinder
         tests.append(lambda points, _: in_cylinder(run.to_metres(points), (x, y), radius_m, (z_m[0], z_m[1])))
     if options.roi_masks is not None:
-        device, (lines, samples) = run.model.device, seen.maps.masks.shape[1:]
+        lines, samples = seen.maps.masks.shape[1:]
         painted = read_roi_masks(options.roi_masks, run.manager.train_dataset.frames, (lines, samples))
         masks = {frame: torch.from_numpy(mask).to(device) for frame, mask in painted.items()}
 

@@ -63,6 +63,11 @@ class DepthMaps:
         _, distance, _, inside, pixels = self._projected(frame, points)
         return distance, torch.where(inside, self._depths_at(frame, pixels), torch.nan)
 
+    def pixels_of(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Int[Tensor, "n 2"]]:
+        """Which points lie in a frame's picture, hidden or not, and their pixels (sample, line); else (0, 0)."""
+        *_, inside, pixels = self._projected(frame, points)
+        return inside, pixels
+
     def _projected(self, frame: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Vectors from the camera, their lengths, places in the picture, which lie in it, their pixels."""
         pose, lens = self.camera_to_world[frame], self.intrinsics
