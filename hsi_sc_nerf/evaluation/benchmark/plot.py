@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun
 from hsi_sc_nerf.evaluation.benchmark.timing import Clock
@@ -40,9 +40,9 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[TrainedRun], clock: Clock 
             _draw_run(axes, run, metric, _SECONDS[clock], colour, line)
         if metric in _LOGARITHMIC:
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(ScalarFormatter())
-            axes.yaxis.set_minor_formatter(ScalarFormatter())
-            axes.tick_params(axis="y", which="both", labelsize=8)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_title(f"{title}, {'lower' if metric in _LOGARITHMIC else 'higher'} is better")
     for axes in panels[1]:
         axes.set_xlabel(f"training ({'wall' if clock == 'wall' else 'processor'} seconds)")
