@@ -57,6 +57,10 @@ def test_the_direct_head_has_a_reflectance_a_band():
     assert ((spectra > 0) & (spectra < 1)).all()
 
 
+def test_no_ray_has_no_density():
+    assert field().density_fn(torch.zeros(0, 4, 3)).shape == (0, 4, 1)
+
+
 def test_coefficients_start_at_the_mean_and_are_not_bounded():
     start = torch.tensor([1.4, -0.8, 0.0])
     made = field(coefficient_start=start)

@@ -130,7 +130,8 @@ class SpectralField(NerfactoField):
         # nerfacto takes grid positions here, and its normals are skewed where the grid is.
         self._sample_locations = positions  # type: ignore[assignment]
         in_grid, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
-        hidden = self.mlp_base(in_grid.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
+        hidden = self.mlp_base(in_grid.view(-1, 3))
+        hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
         self._density_before_activation = self._log_density(hidden)  # type: ignore[assignment]
         return hidden, inside
 
