@@ -53,6 +53,8 @@ class BallModel:
         density_gradient=lambda p: -p,
     )
 
+    background: object | None = object()
+
     def spectra_behind(self, rays):
         """A chamber of one grey."""
         return torch.full((len(rays), len(WAVELENGTHS_NM)), 0.1)

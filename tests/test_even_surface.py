@@ -6,10 +6,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from known_ball import FRAMES, LENS, POSES, RADIUS, WAVELENGTHS_NM, BallModel, known_run, true_spectra
+from known_ball import FRAMES, LENS, POSES, RADIUS, SIZE_PX, WAVELENGTHS_NM, BallModel, known_run, true_spectra
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.camera_views import SEARCH_DEPTH, SEARCH_STEPS, look_from_cameras, refined_poses
+from hsi_sc_nerf.export.camera_views import (
+    SEARCH_DEPTH,
+    SEARCH_STEPS,
+    camera_rays,
+    look_from_cameras,
+    refined_poses,
+    render_object,
+)
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.point_cloud import sample_surface_points
@@ -66,6 +73,19 @@ def test_points_lie_on_the_surface_and_each_frame_sees_them_where_it_says(run):
         mine = found.frames == frame
         places, _ = project(found.points[mine], POSES[frame], LENS)
         np.testing.assert_allclose(found.places[mine], places, atol=0.1)
+
+
+def test_without_a_background_the_rest_of_a_ray_is_the_objects_too(run, monkeypatch):
+    cameras = run.manager.train_dataset.cameras
+
+    def centre_ray():
+        return camera_rays(cameras, np.array([0]), np.full((1, 2), SIZE_PX / 2.0), "cpu")
+
+    outputs, spectra = render_object(run.model, centre_ray())
+    torch.testing.assert_close(outputs["spectral"], 0.9 * spectra + 0.1 * 0.1)
+    monkeypatch.setattr(run.model, "background", None)
+    outputs, spectra = render_object(run.model, centre_ray())
+    torch.testing.assert_close(spectra, outputs["spectral"])
 
 
 def test_points_are_spread_evenly_over_what_is_seen(cloud, run):
