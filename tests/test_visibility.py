@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hsi_sc_nerf.export.silhouettes import within_silhouettes
+from hsi_sc_nerf.export.silhouettes import silhouettes, within_silhouettes
 from hsi_sc_nerf.export.visibility import MIN_COSINE, DepthMaps, most_frontal
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
 
@@ -115,9 +115,10 @@ def test_the_most_frontal_frame_is_chosen(device: str) -> None:
 def test_what_some_frames_show_beside_the_object_is_not_the_objects(device: str) -> None:
     maps = ball_maps(device, [(np.zeros(3), 1.0)])
     maps.masks[:] = torch.isfinite(maps.depths)
+    outlines = silhouettes(maps.masks)
     points = on_unit_ball(500, device)
-    assert within_silhouettes(maps, points).all()
-    assert within_silhouettes(maps, 0.3 * points).all()
+    assert within_silhouettes(maps, outlines, points).all()
+    assert within_silhouettes(maps, outlines, 0.3 * points).all()
     # Before and behind the ball in the first and the last frame, beside it in the one between them.
     beside = torch.tensor([1.35, 0.0, 0.0], device=device) + 0.05 * points
-    assert not within_silhouettes(maps, beside).any()
+    assert not within_silhouettes(maps, outlines, beside).any()

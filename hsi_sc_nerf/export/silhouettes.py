@@ -19,17 +19,25 @@ SLACK_PX = 2
 """Masks reach this much further here than they do: rims are uncertain by a pixel or two."""
 
 
-def within_silhouettes(maps: DepthMaps, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+def silhouettes(masks: Bool[Tensor, "frames lines samples"]) -> Bool[Tensor, "frames lines samples"]:
+    """The object's masks, wider by `SLACK_PX`."""
+    size = 2 * SLACK_PX + 1
+    return torch.cat([functional.max_pool2d(mask[None].float(), size, 1, SLACK_PX) > 0.0 for mask in masks])
+
+
+def within_silhouettes(
+    maps: DepthMaps, outlines: Bool[Tensor, "frames lines samples"], points: Float[Tensor, "n 3"]
+) -> Bool[Tensor, "n"]:
     """Points that fall on the object in nearly all frames.
 
     Args:
-        maps: whose masks are the object's silhouettes.
+        maps: of all frames.
+        outlines: `silhouettes` of the object in them.
         points: in the unit of the depth maps.
     """
     pictures, on_object = (torch.zeros(len(points), device=points.device) for _ in range(2))
-    for frame, mask in enumerate(maps.masks):
+    for frame, outline in enumerate(outlines):
         inside, pixels = maps.pixels_of(frame, points)
-        wider = functional.max_pool2d(mask[None].float(), 2 * SLACK_PX + 1, stride=1, padding=SLACK_PX)[0] > 0.0
         pictures += inside
-        on_object += inside & wider[pixels[:, 1], pixels[:, 0]]
+        on_object += inside & outline[pixels[:, 1], pixels[:, 0]]
     return on_object >= MIN_SHARE * pictures

@@ -24,7 +24,7 @@ from hsi_sc_nerf.export.point_cloud import Region, SurfacePoints, everywhere, re
 from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.regions import chosen_bands, in_box, in_cylinder
 from hsi_sc_nerf.export.roi_masks import in_roi_masks, read_roi_masks
-from hsi_sc_nerf.export.silhouettes import within_silhouettes
+from hsi_sc_nerf.export.silhouettes import silhouettes, within_silhouettes
 from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.export.view_spread import COLUMNS, MeasuredFrames, spread_over_views
 
@@ -87,9 +87,13 @@ def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region
     tests: list[Region] = []
     device = run.model.device
     if not options.keep_turntable:
-        tests.append(
-            lambda points, _: within_silhouettes(seen.maps, torch.from_numpy(points).float().to(device)).cpu().numpy()
-        )
+        outlines = silhouettes(seen.maps.masks)
+
+        def on_object(points: np.ndarray, _: np.ndarray) -> np.ndarray:
+            where = torch.from_numpy(points).float().to(device)
+            return within_silhouettes(seen.maps, outlines, where).cpu().numpy()
+
+        tests.append(on_object)
     if options.obb_center is not None and options.obb_rotation is not None and options.obb_scale is not None:
         crop = OrientedBox.from_params(options.obb_center, options.obb_rotation, options.obb_scale)
         tests.append(lambda points, _: crop.within(torch.from_numpy(points).float()).numpy())

@@ -83,10 +83,10 @@ def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
     radius, sector = np.hypot(*offset.T), _sectors(offset)
     outwards = (normals[:, :2] * offset).sum(axis=1) / np.maximum(radius, 1e-12)
 
-    edge_z, edge_r, slope = (np.full(SECTORS, np.nan) for _ in range(3))
+    edge_z = _edges(z, sector)
+    edge_r, slope = (np.full(SECTORS, np.nan) for _ in range(2))
     for index in np.unique(sector):
         here = np.flatnonzero(sector == index)
-        edge_z[index] = _edge(z[here])
         strip = here[z[here] <= edge_z[index] + _STRIP_M]
         edge_r[index] = np.median(radius[strip][z[strip] <= np.median(z[strip])])
         slope[index] = np.clip(-normals[strip, 2].mean() / max(outwards[strip].mean(), 1e-6), 0.0, _FLATTEST)
@@ -101,20 +101,13 @@ def lower_rim(points_m: Float[np.ndarray, "n 3"], width_m: float) -> Bool[np.nda
     There, rays graze it and masks end: reconstructed, the last millimetres often hang down straight.
     """
     z, sector = points_m[:, 2], _sectors(points_m[:, :2] - _centre(points_m))
-    rim = np.zeros(len(points_m), bool)
-    for index in np.unique(sector):
-        here = sector == index
-        rim[here] = z[here] < _edge(z[here]) + width_m
-    return rim
+    return z < _edges(z, sector)[sector] + width_m
 
 
 def lowest_edge_m(points_m: Float[np.ndarray, "n 3"]) -> float:
     """z at which the surface of an object that stands upright ends at its lowest."""
     sector = _sectors(points_m[:, :2] - _centre(points_m))
-    edges = np.full(SECTORS, np.nan)
-    for index in np.unique(sector):
-        edges[index] = _edge(points_m[sector == index, 2])
-    return float(_smooth_around(edges).min())
+    return float(_smooth_around(_edges(points_m[:, 2], sector)).min())
 
 
 def _centre(points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2"]:
@@ -131,6 +124,14 @@ def _sectors(offset_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
 def _edge(z_m: Float[np.ndarray, "n"]) -> float:
     """Height at which points end, strays below it left out."""
     return float(np.quantile(z_m, _STRAYS))
+
+
+def _edges(z_m: Float[np.ndarray, "n"], sector: Int[np.ndarray, "n"]) -> Float[np.ndarray, "sectors"]:
+    """`_edge` of each sector; NaN where it has no points."""
+    edges = np.full(SECTORS, np.nan)
+    for index in np.unique(sector):
+        edges[index] = _edge(z_m[sector == index])
+    return edges
 
 
 def _smooth_around(values: Float[np.ndarray, "sectors"]) -> Float[np.ndarray, "sectors"]:
