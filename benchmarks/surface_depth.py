@@ -3,7 +3,8 @@
     uv run python benchmarks/surface_depth.py SESSION RUN/config.yml
 
 Rays of training frames through the object, which meet the true surface less than 60 degrees from the front, are
-followed from 6 mm before it to 8 mm behind it. `export.camera_views.SURFACE_OPACITY` is chosen by these figures.
+followed from 6 mm before it to 8 mm behind it. Opacity is what a ray from the front would have collected on the way.
+`export.camera_views.SURFACE_OPACITY` is chosen by these figures.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.mesh import ray_scene
 from hsi_sc_nerf.simulate.truth import load_truth
 
-LEVELS = (0.05, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
+LEVELS = (0.05, 0.07, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
 BEFORE_M, BEHIND_M, STEP_M = 0.006, 0.008, 0.0001
 MIN_COSINE = 0.5
 
@@ -87,6 +88,7 @@ def depths_below_surface(
     middles_m = (along_m[:, 1:] + along_m[:, :-1]) / 2.0
     places = run.to_scene(origins_m[:, None] + directions[:, None] * middles_m[..., None])
     densities = run.model.field.density_fn(torch.from_numpy(places).float().to(run.model.device))[..., 0].cpu()
+    densities = densities * torch.from_numpy(cosines[:, None]).float()
     edges = torch.from_numpy(along_m * run.scale).float()
     results = []
     for level in LEVELS:

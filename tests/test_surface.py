@@ -1,8 +1,10 @@
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from hsi_sc_nerf.export.camera_views import SURFACE_OPACITY, surface_along
 from hsi_sc_nerf.export.surface import opacity_crossing_depth
 
 
@@ -24,3 +26,18 @@ def test_a_hard_surface_is_found_at_its_front():
 def test_an_empty_ray_ends_at_its_last_edge():
     edges = torch.linspace(0.0, 1.0, 11)[None].expand(3, -1)
     assert opacity_crossing_depth(edges, torch.zeros(3, 10), 0.25).tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 60.0, 75.0])
+def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg):
+    rise = 4000.0  # of the density with the depth below z = 0: a quarter of a unit is opaque
+    soft_ground = SimpleNamespace(field=SimpleNamespace(density_fn=lambda p: -rise * p[..., 2:].clamp_max(0.0)))
+    angle = math.radians(angle_deg)
+    directions = torch.tensor([[math.sin(angle), 0.0, -math.cos(angle)]])
+    origins, cosines = -2.0 * directions, -directions[:, 2:]
+    depth, opacity = surface_along(soft_ground, origins, directions, torch.full((1, 1), 2.02), cosines)
+    below = -(origins + depth * directions)[0, 2].item()
+    # The optical depth of a frontal ray is rise * z^2 / 2; steps of the search are 5e-3 units of a ray.
+    expected = math.sqrt(-2.0 * math.log1p(-SURFACE_OPACITY) / rise)
+    assert below == pytest.approx(expected, abs=1e-3)
+    assert opacity.item() > 0.99

@@ -102,9 +102,11 @@ def test_nothing_is_seen_outside_the_mask(device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_most_frontal_frame_is_chosen(device: str) -> None:
     points = on_unit_ball(1000, device)
-    frames, places = most_frontal(ball_maps(device, [(np.zeros(3), 1.0)]), points, points)
+    frames, places, how_frontal = most_frontal(ball_maps(device, [(np.zeros(3), 1.0)]), points, points)
     expected = np.where(cosines(points).max(axis=0) > MIN_COSINE, cosines(points).argmax(axis=0), -1)
     np.testing.assert_array_equal(frames.cpu().numpy(), expected)
+    largest = cosines(points).max(axis=0).clip(MIN_COSINE)
+    np.testing.assert_allclose(how_frontal.cpu().numpy(), largest, atol=1e-5)
     for frame, pose in enumerate(POSES):
         mine = expected == frame
         projected, _ = project(points.cpu().numpy()[mine].astype(float), pose, LENS)

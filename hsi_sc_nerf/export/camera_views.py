@@ -79,14 +79,25 @@ def surface_along(
     origins: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
     near_depth: Float[Tensor, "n 1"],
+    cosines: Float[Tensor, "n 1"] | None = None,
 ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
-    """Depth of the surface, sought in fine steps around a depth, and the opacity collected on the way."""
+    """Depth of the surface, sought in fine steps around a depth, and the opacity collected on the way.
+
+    Args:
+        model: trained model, in evaluation mode.
+        origins: of the rays, scene units.
+        directions: unit vectors.
+        near_depth: a depth that is nearly right.
+        cosines: of the angles between the rays and the surface's inward normal, where it is known. An oblique ray's
+            way through the same density is longer: what counts is what a ray from the front would collect.
+    """
     offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=near_depth.device)
     edges = (near_depth + offsets).clamp_min(0.0)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
     densities = model.field.density_fn(origins[:, None] + directions[:, None] * middles[..., None])[..., 0]
     opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
-    return opacity_crossing_depth(edges, densities, SURFACE_OPACITY)[:, None], opacity
+    facing_densities = densities if cosines is None else densities * cosines
+    return opacity_crossing_depth(edges, facing_densities, SURFACE_OPACITY)[:, None], opacity
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from hsi_sc_nerf.export.visibility import DepthMaps, most_frontal
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 FARTHEST_MOVE = 0.02
-"""Places are moved on to the surface by no more than this, scene units (about 2 mm)."""
+"""Places are moved on to the surface by no more than this along their normal, scene units (about 2 mm)."""
 
 
 @dataclass(eq=False)
@@ -134,16 +134,16 @@ def _moved_to_surface(
     """Places near the surface, moved on to it along the rays that see them from the front; the others left out."""
     points = torch.from_numpy(places).float().to(model.device)
     facing = mesh.normals_at(places)
-    frames, pixels = most_frontal(maps, points, torch.from_numpy(facing).to(points))
+    frames, pixels, cosines = most_frontal(maps, points, torch.from_numpy(facing).to(points))
     chosen = frames >= 0
-    points, frames, pixels = points[chosen], frames[chosen], pixels[chosen]
+    points, frames, pixels, cosines = points[chosen], frames[chosen], pixels[chosen], cosines[chosen, None]
     origins = maps.camera_to_world[frames, :3, 3]
     away = points - origins
     distances = away.norm(dim=-1, keepdim=True)
     directions = away / distances
-    depth, opacity = surface_along(model, origins, directions, distances)
+    depth, opacity = surface_along(model, origins, directions, distances, cosines)
     # What lies farther away is another part of the surface, which has its own places.
-    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() < FARTHEST_MOVE)[:, 0]
+    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() * cosines < FARTHEST_MOVE)[:, 0]
     found = (origins + directions * depth)[met]
     return SurfacePoints(
         found.cpu().numpy(),

@@ -152,7 +152,7 @@ def spectra_of_points(
     chunk = model.config.eval_num_rays_per_chunk
     for start in range(0, len(point), chunk):
         p, c = point[start : start + chunk], camera[start : start + chunk]
-        spectra, opacity, depth = _rendered(model, poses[c, :3, 3], directions[p, c])
+        spectra, opacity, depth = _rendered(model, poses[c, :3, 3], directions[p, c], cosines[p, c])
         missed = np.abs(depth - distances[p, c]) * cosines[p, c]
         hit = (opacity > MIN_OPACITY) & (missed <= reach)
         kept.append(spectra[hit])
@@ -172,7 +172,10 @@ def _in_frame(
 
 
 def _rendered(
-    model: SpectralModel, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
+    model: SpectralModel,
+    origins: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    cosines: Float[np.ndarray, "rays"],
 ) -> tuple[Float[np.ndarray, "rays bands"], Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
     """Spectrum of what rays of unit length meet, without the background's share; opacity; depth of the surface."""
     ones = torch.ones(len(origins), 1)
@@ -184,5 +187,6 @@ def _rendered(
         metadata={"directions_norm": ones},
     ).to(model.device)
     outputs, spectra = render_object(model, rays)
-    depth, _ = surface_along(model, rays.origins, rays.directions, outputs["depth"])
+    facing = torch.from_numpy(cosines[:, None]).to(rays.origins)
+    depth, _ = surface_along(model, rays.origins, rays.directions, outputs["depth"], facing)
     return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy(), depth[:, 0].cpu().numpy()

@@ -102,8 +102,11 @@ class FrameView:
 
 def most_frontal(
     maps: DepthMaps, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
-    """The frame that sees each point most from the front (-1 if none does), and its place (x, y) there."""
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+    """The frame that sees each point most from the front (-1 if none does), its place (x, y) there, and how much.
+
+    The last is the cosine of the angle between normal and view, at least ``MIN_COSINE``.
+    """
     best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
     frames = torch.full((len(points),), -1, device=points.device)
     places = points.new_zeros(len(points), 2)
@@ -112,4 +115,4 @@ def most_frontal(
         best = torch.where(better, view.cosines, best)
         frames = torch.where(better, index, frames)
         places = torch.where(better[:, None], view.places, places)
-    return frames, places
+    return frames, places, best
