@@ -10,13 +10,14 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
+from torch.nn import functional
 
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.progress import progress_bar
 from hsi_sc_nerf.export.surface import opacity_crossing_depth
-from hsi_sc_nerf.export.visibility import DepthMaps
+from hsi_sc_nerf.export.visibility import MIN_COSINE, DepthMaps
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.numerics import safe_ratio
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
@@ -27,6 +28,8 @@ SURFACE_OPACITY = 0.07
 """The surface is where a ray has collected this much. Other views keep the space outside the object empty, so the
 density begins at the true surface; how far into the object a ray reaches before it is half absorbed says how long the
 model was trained (benchmarks/surface_depth.py)."""
+WELL_WITHIN = 0.25
+"""Where a ray has collected this much, the density rises towards the object; further out its gradient is noise."""
 SEARCH_DEPTH = 0.1
 """The surface is sought this far around a depth that is nearly right, scene units (about a centimetre)."""
 SEARCH_STEPS = 40
@@ -88,16 +91,20 @@ def surface_along(
         origins: of the rays, scene units.
         directions: unit vectors.
         near_depth: a depth that is nearly right.
-        cosines: of the angles between the rays and the surface's inward normal, where it is known. An oblique ray's
-            way through the same density is longer: what counts is what a ray from the front would collect.
+        cosines: of the angles between the rays and the surface's inward normal; without it, the density's gradient
+            where a ray is well within the surface says which way that faces. An oblique ray's way through the same
+            density is longer: what counts is what a ray from the front would collect.
     """
     offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=near_depth.device)
     edges = (near_depth + offsets).clamp_min(0.0)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
     densities = model.field.density_fn(origins[:, None] + directions[:, None] * middles[..., None])[..., 0]
     opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
-    facing_densities = densities if cosines is None else densities * cosines
-    return opacity_crossing_depth(edges, facing_densities, SURFACE_OPACITY)[:, None], opacity
+    if cosines is None:
+        within = origins + directions * opacity_crossing_depth(edges, densities, WELL_WITHIN)[:, None]
+        inwards = functional.normalize(model.field.density_gradient(within), dim=-1)
+        cosines = (inwards * directions).sum(dim=-1, keepdim=True).clamp_min(MIN_COSINE)
+    return opacity_crossing_depth(edges, densities * cosines, SURFACE_OPACITY)[:, None], opacity
 
 
 @dataclass(frozen=True, eq=False)
