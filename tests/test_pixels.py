@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from hsi_sc_nerf.data.envi import open_cube
 from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.data.pixels import RIM_PX, PixelReader, PixelSampler, spread_over
 from hsi_sc_nerf.errors import InputError
 
 SHAPE = (5, 7, 4)
@@ -118,6 +119,24 @@ def test_foreground_share_is_kept(sampler, masks):
     frame, line, sample = batch["indices"].T
     np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
     assert batch["mask"].sum() == 150
+
+
+def test_a_share_of_the_rest_lies_on_the_rim(tmp_path):
+    masks = np.zeros((2, 20, 30), bool)
+    masks[0, 8:12, 10:15] = masks[1, 0, 0] = True
+    counts = np.zeros((*masks.shape, 4), np.uint16)
+    pixels = PixelSampler(reader_of(tmp_path, counts), masks, 4000, 0, has_flagged=False)
+    from_object = np.stack([distance_transform_edt(~mask) for mask in masks])
+    frame, line, sample = pixels.sample(0, foreground_share=0.5, rim_share=0.75)["indices"].T
+    distances = from_object[frame, line, sample]
+    assert (distances == 0).sum() == 2000
+    rim, rest = distances[2500:], distances[2000:2500]
+    assert rim.min() >= 1.0
+    assert rim.max() < RIM_PX + 1.0
+    assert rest.max() > 10.0
+    # Every pixel within the rim's width.
+    drawn = np.unique(np.stack([frame, line, sample])[:, 2500:], axis=1).shape[1]
+    assert drawn >= ((from_object > 0) & (from_object <= RIM_PX)).sum()
 
 
 @pytest.mark.parametrize("share", [None, 0.0, 0.5, 1.0])

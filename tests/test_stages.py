@@ -101,6 +101,7 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
     ("fields", "sentence"),
     [
         ({"foreground_share": 1.2}, "foreground-share 1.2"),
+        ({"rim_share": -0.1}, "rim-share -0.1"),
         ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
         ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
         ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt16
 
 from hsi_sc_nerf.data.packed_cube import unpack, unpack_unflagged
+from hsi_sc_nerf.data.regions import dilate
 from hsi_sc_nerf.errors import InputError
+
+RIM_PX = 3
+"""The rim of the foreground is so wide: the pixels just beside it, which decide where the object ends."""
 
 
 class PixelReader:
@@ -100,13 +105,16 @@ class PixelSampler:
         self._rest_before = self._foreground - np.arange(len(self._foreground))
         self._values = _measured_values if has_flagged else _values
 
-    def sample(self, step: int, foreground_share: float | None = None) -> dict[str, np.ndarray]:
+    def sample(
+        self, step: int, foreground_share: float | None = None, rim_share: float = 0.0
+    ) -> dict[str, np.ndarray]:
         """One batch.
 
         Args:
             step: training step.
             foreground_share: share of the pixels drawn from the foreground, in [0, 1], the others from the rest of
                 the frames; ``None`` draws evenly from whole frames.
+            rim_share: share of those others that is drawn from the foreground's rim.
 
         Returns:
             What `at` returns.
@@ -125,13 +133,15 @@ class PixelSampler:
                     "the masks of all training frames are empty, so that there is no object to train on; look at "
                     "report/ in the dataset and process again."
                 )
+            in_rim = round((count - in_foreground) * rim_share) if rim_share > 0.0 and len(self._rim) > 0 else 0
             num_rest = self.masks.size - len(self._foreground)
-            flat = np.concatenate(
-                [
-                    self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
-                    self._rest(rng.integers(0, num_rest, count - in_foreground)),
-                ]
-            )
+            drawn = [
+                self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
+                self._rest(rng.integers(0, num_rest, count - in_foreground - in_rim)),
+            ]
+            if in_rim > 0:
+                drawn.append(self._rim[rng.integers(0, len(self._rim), in_rim)])
+            flat = np.concatenate(drawn)
         return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
@@ -148,6 +158,11 @@ class PixelSampler:
             "mask": self.masks[frame, line, sample, None],
             **self._values(self.reader.read(indices)),
         }
+
+    @cached_property
+    def _rim(self) -> Int[np.ndarray, "count"]:
+        """The pixels outside the foreground that are at most ``RIM_PX`` from it."""
+        return np.flatnonzero(np.stack([dilate(mask, 2 * RIM_PX + 1) & ~mask for mask in self.masks]))
 
     def _rest(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
         """The pixels with these places among all that are not foreground.

@@ -29,6 +29,9 @@ class StageConfig:
     foreground_share: float | None = None
     """Share of the rays that hit the foreground masks; the others keep empty space empty. 1: the object's pixels
     alone, as in the paper. None: whole frames."""
+    rim_share: float = 0.0
+    """Share of the other rays, where there is a foreground share, that pass just beside the masks: these say most
+    sharply where the object ends."""
     angular_loss_mult: float | None = None
     """Weight of the spectral angle's loss in this stage. None: the model's."""
     hsi_loss_mult: float | None = None
@@ -62,8 +65,10 @@ class StageConfig:
         Raises:
             ValueError: one sentence that names the stage and its field.
         """
-        if self.foreground_share is not None and not 0.0 <= self.foreground_share <= 1.0:
-            raise ValueError(f"{self.name}: foreground-share {self.foreground_share} is not between 0 and 1")
+        shares = {"foreground-share": self.foreground_share, "rim-share": self.rim_share}
+        for option, share in shares.items():
+            if share is not None and not 0.0 <= share <= 1.0:
+                raise ValueError(f"{self.name}: {option} {share} is not between 0 and 1")
         factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
         factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
         for option, factor in factors.items():
@@ -85,6 +90,7 @@ def masked_stage() -> StageConfig:
         name="masked",
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
+        rim_share=0.8,
         frozen_groups=("camera_opt", "background"),
         lr_start=0.5,
         lr_end=0.02,
