@@ -20,6 +20,8 @@ from torch.nn import functional
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.camera_views import (
     MIN_OPACITY,
+    SEARCH_DEPTH,
+    SEARCH_STEPS,
     SeenSurface,
     camera_rays,
     look_from_cameras,
@@ -142,8 +144,11 @@ def _moved_to_surface(
     distances = away.norm(dim=-1, keepdim=True)
     directions = away / distances
     depth, opacity = surface_along(model, origins, directions, distances, cosines)
-    # What lies farther away is another part of the surface, which has its own places.
-    met = (opacity > MIN_OPACITY)[:, 0] & ((depth - distances).abs() * cosines < FARTHEST_MOVE)[:, 0]
+    # What lies farther away is another part of the surface, which has its own places; and what is dense from the
+    # search's start on has its surface before it.
+    moved = (depth - distances).abs()
+    near = (moved * cosines < FARTHEST_MOVE) & (moved < SEARCH_DEPTH * (1.0 - 2.0 / SEARCH_STEPS))
+    met = ((opacity > MIN_OPACITY) & near)[:, 0]
     found = (origins + directions * depth)[met]
     return SurfacePoints(
         found.cpu().numpy(),
