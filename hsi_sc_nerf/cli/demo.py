@@ -17,6 +17,8 @@ DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
     "pipeline.model.proposal-warmup": "200",
     "pipeline.model.proposal-weights-anneal-max-num-iters": "100",
+    # Pressing the surface together as hard as in a run of thousands of steps costs one of some hundred a decibel.
+    "pipeline.model.distortion-loss-mult": "0.007",
     "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
     "steps-per-eval-image": "1000000",
