@@ -6,6 +6,7 @@ import capture_factory as factory
 import numpy as np
 import pytest
 import torch
+import yaml
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.cli.sample import SampleCommand
@@ -211,6 +212,16 @@ def test_a_run_that_was_moved_is_opened_from_anywhere(tmp_path, run_config, run,
     opened = trained_run.open_run(Path("config.yml"))
     for name, value in run.model.state_dict().items():
         torch.testing.assert_close(opened.model.state_dict()[name], value)
+
+
+def test_a_dataset_given_relative_to_another_folder_is_found_above_the_run(tmp_path, run_config, monkeypatch):
+    home = run_config.parents[4]
+    config = yaml.load(run_config.read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path("data")
+    relative = run_config.with_name("relative.yml")
+    relative.write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    assert trained_run.open_run(relative).dataset.root.resolve() == (home / "data").resolve()
 
 
 def test_metres_and_scene_units_are_inverse(run):

@@ -89,7 +89,14 @@ def open_run(load_config: Path) -> TrainedRun:
 
 
 def _where_it_lies(config: TrainerConfig, load_config: Path) -> TrainerConfig:
-    """Settings that look for checkpoints beside their file, for a run may be moved, or given from another folder."""
+    """Settings that look for checkpoints beside their file, for a run may be moved, or given from another folder.
+
+    A dataset that was given relative to the folder of training is sought from the run's own folder upwards.
+    """
     config.output_dir = load_config.parent
     config.experiment_name = config.method_name = config.timestamp = "."
+    manager = config.pipeline.datamanager
+    if manager.data is not None and not manager.data.exists():
+        above = (folder / manager.data for folder in load_config.resolve().parents)
+        manager.data = next((data for data in above if data.exists()), manager.data)
     return config
