@@ -26,8 +26,8 @@ MIN_OPACITY = 0.5
 """Rays that collect less than this hit no surface (released settings of the paper)."""
 SURFACE_OPACITY = 0.07
 """The surface is where a ray from the front has collected this much. Other views keep the space outside the object
-empty, so the density begins at the true surface; how far into the object a ray reaches before it is half absorbed says
-how long the model was trained (benchmarks/surface_depth.py)."""
+empty, so the density begins at the true surface; how far into the object a ray reaches before it is half absorbed
+says how long the model was trained (benchmarks/surface_depth.py)."""
 WELL_WITHIN = 0.25
 """Where a ray has collected this much, the density rises towards the object; further out its gradient is noise."""
 SEARCH_DEPTH = 0.1
