@@ -105,10 +105,14 @@ def test_the_cloud_has_the_true_spectra_and_columns(cloud, run):
     np.testing.assert_allclose(cloud.spectra, true_spectra(points), atol=2e-3)
     np.testing.assert_allclose(cloud.extra["opacity"], 0.9, atol=1e-6)
     np.testing.assert_allclose(cloud.colours, true_spectra(points)[:, [3, 1, 0]] * 255, atol=1.5)
-    assert list(cloud.extra) == ["opacity", "views", "spectral_std", "saturated"]
+    assert list(cloud.extra) == ["opacity", "incidence_deg", "views", "spectral_std", "saturated"]
     to_cameras = POSES[:, None, :3, 3] - points
     outward = points / np.linalg.norm(points, axis=1, keepdims=True)
     cosines = (to_cameras * outward).sum(axis=-1) / np.linalg.norm(to_cameras, axis=-1)
+    # Where several frames see a point, it is that which sees it most from the front.
+    expected_deg = np.rad2deg(np.arccos(cosines.max(axis=0)))
+    assert np.abs(cloud.extra["incidence_deg"] - expected_deg).max() < 15.0
+    assert np.abs(cloud.extra["incidence_deg"] - expected_deg).mean() < 3.0
     # The mesh's normals and the masks' edges are as coarse as the pixels.
     clear = (np.abs(cosines - MIN_COSINE) > 0.2).all(axis=0)
     differs = cloud.extra["views"][clear] != (cosines > MIN_COSINE).sum(axis=0)[clear]

@@ -5,7 +5,7 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.traits import TrueSurface, relative_rms
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.traits.analysis import WHOLE, analyse, classified
@@ -136,6 +136,22 @@ def test_vertices_take_the_spectra_of_points_near_them():
     assert not found.seen[surface.mesh.vertices[:, 2] < 0.003].any()
     inside = chosen & (np.abs(surface.mesh.vertices[:, 1]) > 0.005) & (surface.mesh.vertices[:, 2] < 0.039)
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
+
+
+def test_points_seen_too_obliquely_give_no_spectra():
+    surface = two_halves()
+    points = surface.mesh.vertices
+    left = points[:, 1] < 0.0
+    spectra = np.where(left[:, None], 9.0, surface.spectra).astype(np.float32)
+    colours = np.zeros((len(points), 3), np.uint8)
+    cloud = SpectralCloud(points, points, colours, spectra, NM, {INCIDENCE: np.where(left, 71.0, 69.0)})
+    found = with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=70.0)
+    assert found.spectra.max() <= 1.0
+    assert not found.seen[points[:, 1] < -0.002].any()
+    assert found.seen[~left].all()
+    assert with_spectra(surface.mesh, cloud, 0.001).seen.all()
+    with pytest.raises(InputError, match="no point of the cloud is seen at 60 degrees or less"):
+        with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=60.0)
 
 
 def test_mesh_is_a_cloud_with_triangles(tmp_path):

@@ -15,9 +15,9 @@ from hsi_sc_nerf.export.options import CloudOptions
 class ExportCommand:
     """Write the point cloud of a trained run: a spectrum a point, in metres, evenly spread over the object.
 
-    Each point also says how opaque the model is there (opacity), how many training frames see it (views), how much
-    their measurements of it differ (spectral_std) and in which share of them it is saturated or not measured
-    (saturated). `ns-export pointcloud` writes the same with the options that it has.
+    Each point also says how opaque the model is there (opacity), how obliquely it is seen (incidence_deg), how many
+    training frames see it (views), how much their measurements of it differ (spectral_std) and in which share of them
+    it is saturated or not measured (saturated). `ns-export pointcloud` writes the same with the options that it has.
     """
 
     load_config: Path

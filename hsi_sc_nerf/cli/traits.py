@@ -11,6 +11,7 @@ from rich.console import Console
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.traits.poisson import MeshConfig
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ class TraitsCommand:
     splits: int = 6
     """How often the cloud is split into random halves, which are meshed apart, for the uncertainty of the sizes; 0
     leaves it out."""
+    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    """Spectra come from points that a camera sees at no more than this many degrees from the front: pixels that meet
+    the surface obliquely smear it, and at its rim show what lies beside it. Sizes come from all points."""
     library: Path | None = None
     """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
     nm, then a column a spectrum). Spectra of one name are references of one class."""
@@ -85,7 +89,7 @@ class TraitsCommand:
             with progress_bar("uncertainty", "splits", self.splits) as done:
                 spread = size_spread(cloud.points, cloud.normals, config, self.splits, done=done)
         with console.status("spectra on the surface"):
-            surface = with_spectra(mesh, cloud, config.smoothing_radius_m)
+            surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
             traits = analyse(surface, picked, found)
         with console.status("tables and pictures"):
@@ -138,6 +142,7 @@ class TraitsCommand:
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         watertight = open_edges(surface.mesh) == 0
-        settings = {"cloud": self.cloud.name, **asdict(config), "splits": self.splits}
+        options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
+        settings = {"cloud": self.cloud.name, **asdict(config), **options}
         report.write_traits_json(self.output_dir / "traits.json", size, spread, watertight, traits, settings)
         report.write_page(self.output_dir / "traits.md", self.cloud.name, size, spread, watertight, traits, drawn)

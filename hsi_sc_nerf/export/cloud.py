@@ -10,6 +10,10 @@ from jaxtyping import Float, UInt8
 
 # Points in a piece: 27 MB at 204 bands.
 CHUNK_POINTS = 1 << 15
+INCIDENCE = "incidence_deg"
+"""Column: the angle between a point's normal and the ray that its spectrum is of."""
+MAX_INCIDENCE_DEG = 70.0
+"""Cameras that look at a face more obliquely than this see it smeared over their pixels."""
 
 
 @dataclass(frozen=True)

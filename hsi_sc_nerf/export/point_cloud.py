@@ -49,12 +49,14 @@ class SurfacePoints:
         facing: unit normals of the mesh that the points were spread on, outwards.
         frames: the training frame that sees each most from the front.
         places: where it is in that frame's picture, (x, y) in pixels from its corner.
+        incidence_deg: angle between its normal and the way to that frame's camera.
     """
 
     points: Float[np.ndarray, "n 3"]
     facing: Float[np.ndarray, "n 3"]
     frames: Int[np.ndarray, "n"]
     places: Float[np.ndarray, "n 2"]
+    incidence_deg: Float[np.ndarray, "n"]
 
     def __len__(self) -> int:
         return len(self.points)
@@ -155,6 +157,7 @@ def _moved_to_surface(
         facing[chosen.cpu().numpy()][met.cpu().numpy()],
         frames[met].cpu().numpy(),
         pixels[met].cpu().numpy(),
+        torch.rad2deg(cosines[met, 0].clamp_max(1.0).arccos()).cpu().numpy(),
     )
 
 

@@ -19,12 +19,11 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from hsi_sc_nerf.export.camera_views import MIN_OPACITY, render_object, surface_along
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.export.trained_run import TrainedRun
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
 
-MAX_INCIDENCE_DEG = 70.0
-"""Cameras that look at a face more obliquely than this see it smeared over their pixels."""
 POINTS_AT_A_TIME = 1 << 12
 
 

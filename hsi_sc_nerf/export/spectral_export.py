@@ -17,7 +17,7 @@ from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.camera_views import SeenSurface, look_from_cameras
 from hsi_sc_nerf.export.clean import estimate_normals, statistical_inliers
-from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, INCIDENCE, CloudStream, SpectralCloud
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.point_cloud import Region, SurfacePoints, everywhere, render_points, spread_points
@@ -49,7 +49,8 @@ def export_spectral_point_cloud(options: ExportPointCloud) -> None:
 def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Path:
     """Write the cloud of a run to ``OUTPUT_DIR/point_cloud.*`` (metres, object frame) and return its path.
 
-    Columns beside spectra, normals and colours: ``opacity`` of the point's ray, and `view_spread.COLUMNS`.
+    Columns beside spectra, normals and colours: ``opacity`` of the point's ray, ``incidence_deg`` at which that meets
+    the surface, and `view_spread.COLUMNS`.
 
     Raises:
         InputError: the model holds no object, an option cannot be met, or the file cannot be written.
@@ -76,7 +77,7 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Pa
         flags = np.stack([frame.flags() for frame in run.manager.train_dataset.frames])
     pieces = _Pieces(run, seen, MeasuredFrames(sampler.reader, flags), surface, normals, bands, options, batch)
     wavelengths_nm = run.model.wavelengths_nm[bands]
-    cloud = CloudStream(len(surface), wavelengths_nm, ("opacity", *COLUMNS), pieces)
+    cloud = CloudStream(len(surface), wavelengths_nm, ("opacity", INCIDENCE, *COLUMNS), pieces)
     path = write_cloud(Path(output_dir) / NAME, cloud, options.format)
     CONSOLE.print(f"[bold green]{cloud.count:,} points with {len(bands)} bands, in metres: {path}", soft_wrap=True)
     return path
@@ -149,7 +150,7 @@ class _Pieces:
             np.empty((len(piece), 3), np.uint8),
             np.empty((len(piece), len(self.bands)), np.float32),
             model.wavelengths_nm[self.bands],
-            {"opacity": np.empty(len(piece), np.float32)},
+            {"opacity": np.empty(len(piece), np.float32), INCIDENCE: piece.incidence_deg.astype(np.float32)},
         )
         bands = torch.from_numpy(self.bands).to(model.device)
         for start in range(0, len(piece), self.batch):

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
 from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.spectra.composites import composite
@@ -32,7 +33,7 @@ class SpectralMesh:
         mesh: metres, object frame.
         spectra: reflectance; at vertices that were not seen, of the nearest points that were.
         wavelengths_nm: band centres.
-        seen: which vertices have points of the cloud near them; the closed base has none.
+        seen: which vertices have points near them whose spectra were used; the closed base has none.
     """
 
     mesh: Mesh
@@ -46,24 +47,37 @@ class SpectralMesh:
         return vertex_areas_m2(self.mesh)
 
 
-def with_spectra(mesh: Mesh, cloud: SpectralCloud, seen_within_m: float) -> SpectralMesh:
+def with_spectra(
+    mesh: Mesh, cloud: SpectralCloud, seen_within_m: float, max_incidence_deg: float = np.inf
+) -> SpectralMesh:
     """Give each vertex the mean spectrum of the `NEIGHBOURS` nearest points, near ones weighing more.
 
     Args:
         mesh: in the frame of the cloud.
         cloud: the points it was made from.
         seen_within_m: a vertex with no point as near as this was not seen.
+        max_incidence_deg: points whose column `INCIDENCE` is larger are left out: their pixels smear the surface, and
+            at its rim show what lies beside it.
+
+    Raises:
+        InputError: that leaves no point.
     """
-    tree = cKDTree(cloud.points)
+    used = np.flatnonzero(cloud.extra.get(INCIDENCE, np.zeros(len(cloud))) <= max_incidence_deg)
+    if len(used) == 0:
+        raise InputError(
+            f"no point of the cloud is seen at {max_incidence_deg:g} degrees or less from the front; raise "
+            "--max-incidence-deg."
+        )
+    tree = cKDTree(cloud.points[used])
     spectra = np.empty((len(mesh.vertices), cloud.spectra.shape[1]), np.float32)
     seen = np.empty(len(mesh.vertices), bool)
-    count = min(NEIGHBOURS, len(cloud.points))
+    count = min(NEIGHBOURS, len(used))
     for start in range(0, len(spectra), _CHUNK_VERTICES):
         chunk = slice(start, start + _CHUNK_VERTICES)
         distance_m, neighbour = tree.query(mesh.vertices[chunk], np.arange(1, count + 1), workers=-1)
         weight = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
         weight /= weight.sum(axis=1, keepdims=True)
-        spectra[chunk] = np.einsum("vk,vkb->vb", weight, cloud.spectra[neighbour])
+        spectra[chunk] = np.einsum("vk,vkb->vb", weight, cloud.spectra[used[neighbour]])
         seen[chunk] = distance_m[:, 0] <= seen_within_m
     return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen)
 
@@ -80,7 +94,7 @@ def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
 def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
     """Write the mesh as a spectral PLY whose points are the vertices, followed by the triangles.
 
-    Columns beside the bands: ``seen`` (1 where the cloud has points, 0 on what was closed) and those in ``extra``.
+    Columns beside the bands: ``seen`` (1 where there are spectra, 0 on what was closed) and those in ``extra``.
 
     Raises:
         InputError: the file cannot be written.
