@@ -95,6 +95,7 @@ def test_any_group_can_be_frozen():
 def test_a_stage_sets_the_loss_weights_that_it_names():
     assert StageConfig("a", 1.0).loss_weights() == {}
     assert StageConfig("a", 1.0, angular_loss_mult=0.0).loss_weights() == {"angular_loss_mult": 0.0}
+    assert StageConfig("a", 1.0, photon_floor=0.1).loss_weights() == {"photon_floor": 0.1}
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
 from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid, training_subspace
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss, photon_weights
 from hsi_sc_nerf.models.metrics import (
     spectral_angle_map,
     spectral_angle_mapper,
@@ -221,7 +221,11 @@ class SpectralModel(NerfactoModel):
         losses = {}
         if config.hsi_loss_mult > 0:
             errors = hsi_loss if config.hsi_loss == "squared" else charbonnier_loss
-            value = errors(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
+            floor = config.photon_floor
+            pixels = None if floor is None else photon_weights(target, floor, valid)
+            value = errors(
+                outputs["spectral"], target, valid=valid, band_weights=self.band_weights, pixel_weights=pixels
+            )
             losses["hsi_loss"] = config.hsi_loss_mult * value
         if config.angular_loss_mult > 0:
             angles = angular_loss if config.angular_loss == "cosine" else angle_loss

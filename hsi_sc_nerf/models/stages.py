@@ -36,6 +36,8 @@ class StageConfig:
     """Weight of the spectral angle's loss in this stage. None: the model's."""
     hsi_loss_mult: float | None = None
     """Weight of the squared error in this stage. None: the model's."""
+    photon_floor: float | None = None
+    """How dark pixels count in this stage. None: as the model's photon-floor says."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change: what they learned so far stays in force (camera_opt: unless
     the pose refinement's mode says otherwise)."""
@@ -53,7 +55,8 @@ class StageConfig:
 
     def loss_weights(self) -> dict[str, float]:
         """Loss weights of the model that this stage sets, by their names in the model's configuration."""
-        weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
+        names = ("angular_loss_mult", "hsi_loss_mult", "photon_floor")
+        weights = {name: getattr(self, name) for name in names}
         return {name: weight for name, weight in weights.items() if weight is not None}
 
     def check(self, groups: Collection[str]) -> None:
@@ -91,6 +94,7 @@ def masked_stage() -> StageConfig:
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
         rim_share=0.8,
+        photon_floor=0.05,
         frozen_groups=("camera_opt", "background"),
         lr_start=0.5,
         lr_end=0.02,
