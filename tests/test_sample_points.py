@@ -39,7 +39,7 @@ def test_mean_and_spread_are_numpys():
     for i in (1, 2, 4):
         own = spectra[point == i]
         np.testing.assert_allclose(found.spectra[i], own.mean(axis=0), rtol=1e-6)
-        np.testing.assert_allclose(found.spectral_std[i], np.sqrt(own.var(axis=0, ddof=1).mean()), rtol=1e-6)
+        np.testing.assert_allclose(found.spectral_std[i], own.std(axis=0, ddof=1).mean(), rtol=1e-6)
     np.testing.assert_allclose(found.spectra[3], spectra[0], rtol=1e-6)
     assert np.isnan(found.spectra[0]).all()
     assert np.isnan(found.spectral_std[[0, 3]]).all()

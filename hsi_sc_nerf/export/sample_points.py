@@ -33,7 +33,7 @@ class PointSpectra:
 
     Attributes:
         spectra: mean reflectance over the views; NaN without any.
-        spectral_std: standard deviation over the views, root mean square over the bands; NaN with fewer than two.
+        spectral_std: standard deviation over the views, mean over the bands; NaN with fewer than two.
         views: how many views were averaged.
     """
 
@@ -79,12 +79,12 @@ def mean_and_spread(
     """Mean and spread of the spectra that belong to the same point."""
     bands = spectra.shape[1]
     views = np.bincount(point, minlength=num_points)
-    total = np.zeros((num_points, bands))
+    total, squares = np.zeros((2, num_points, bands))
     np.add.at(total, point, spectra)
     with np.errstate(invalid="ignore"):
         mean = np.where(views[:, None] > 0, total / views[:, None], np.nan)
-        squares = np.bincount(point, np.square(spectra - mean[point]).mean(axis=1), minlength=num_points)
-        spread = np.where(views > 1, np.sqrt(squares / (views - 1.0)), np.nan)
+        np.add.at(squares, point, np.square(spectra - mean[point]))
+        spread = np.where(views > 1, np.sqrt(squares / (views[:, None] - 1.0)).mean(axis=1), np.nan)
     return PointSpectra(mean.astype(np.float32), spread.astype(np.float32), views)
 
 
