@@ -42,10 +42,6 @@ class SpectralModelConfig(NerfactoModelConfig):
     angles themselves, in radians, which want a weight some ten times smaller."""
     weigh_bands: bool = False
     """Let bands count by how well they were measured."""
-    photon_floor: float | None = None
-    """Let dark pixels count for more in the errors of reflectance, in proportion to 1 / (reflectance + this): the
-    light's own noise grows with it. This is the reflectance whose light is as noisy as the sensor in the dark. None:
-    all pixels count alike, as in the paper."""
     angular_loss_mult: float = 0.03
     """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT

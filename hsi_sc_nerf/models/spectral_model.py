@@ -49,6 +49,9 @@ class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
     Outputs of a ray: ``spectral`` (bands) beside nerfacto's own, with ``rgb`` a pseudo-RGB of three bands.
+
+    Attributes:
+        photon_floor: how dark pixels count (`losses.photon_weights`); None: all alike. The trainer sets it by step.
     """
 
     config: SpectralModelConfig
@@ -58,6 +61,7 @@ class SpectralModel(NerfactoModel):
     decoder: nn.Module
     renderer_rgb: nn.Module  # type: ignore[assignment]
     band_weights: Tensor | None
+    photon_floor: float | None = None
 
     def populate_modules(self) -> None:
         """Build the modules.
@@ -221,8 +225,7 @@ class SpectralModel(NerfactoModel):
         losses = {}
         if config.hsi_loss_mult > 0:
             errors = hsi_loss if config.hsi_loss == "squared" else charbonnier_loss
-            floor = config.photon_floor
-            pixels = None if floor is None else photon_weights(target, floor, valid)
+            pixels = None if self.photon_floor is None else photon_weights(target, self.photon_floor, valid)
             value = errors(
                 outputs["spectral"], target, valid=valid, band_weights=self.band_weights, pixel_weights=pixels
             )

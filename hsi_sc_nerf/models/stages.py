@@ -15,6 +15,9 @@ import numpy as np
 
 from hsi_sc_nerf import paper
 
+PHOTON_FLOOR = 0.05
+"""Default of `StageConfig.photon_floor`."""
+
 
 @dataclass
 class StageConfig:
@@ -37,7 +40,11 @@ class StageConfig:
     hsi_loss_mult: float | None = None
     """Weight of the squared error in this stage. None: the model's."""
     photon_floor: float | None = None
-    """How dark pixels count in this stage. None: as the model's photon-floor says."""
+    """Let dark pixels count for more in the errors of reflectance, in proportion to 1 / (reflectance + this): the
+    light's own noise grows with it. This is the reflectance whose light is as noisy as the sensor in the dark. None:
+    all pixels count alike, as in the paper."""
+    photon_share: float = 1.0
+    """Share of the stage's steps, from its start, in which they do; after it all pixels count alike."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change: what they learned so far stays in force (camera_opt: unless
     the pose refinement's mode says otherwise)."""
@@ -55,8 +62,7 @@ class StageConfig:
 
     def loss_weights(self) -> dict[str, float]:
         """Loss weights of the model that this stage sets, by their names in the model's configuration."""
-        names = ("angular_loss_mult", "hsi_loss_mult", "photon_floor")
-        weights = {name: getattr(self, name) for name in names}
+        weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
         return {name: weight for name, weight in weights.items() if weight is not None}
 
     def check(self, groups: Collection[str]) -> None:
@@ -68,10 +74,16 @@ class StageConfig:
         Raises:
             ValueError: one sentence that names the stage and its field.
         """
-        shares = {"foreground-share": self.foreground_share, "rim-share": self.rim_share}
+        shares = {
+            "foreground-share": self.foreground_share,
+            "rim-share": self.rim_share,
+            "photon-share": self.photon_share,
+        }
         for option, share in shares.items():
             if share is not None and not 0.0 <= share <= 1.0:
                 raise ValueError(f"{self.name}: {option} {share} is not between 0 and 1")
+        if self.photon_floor is not None and not self.photon_floor > 0.0:
+            raise ValueError(f"{self.name}: photon-floor {self.photon_floor} is not above 0; None leaves it out")
         factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
         factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
         for option, factor in factors.items():
@@ -83,8 +95,17 @@ class StageConfig:
 
 
 def full_frame_stage() -> StageConfig:
-    """The paper's first stage: every pixel, poses refined."""
-    return StageConfig(name="full-frame", share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS))
+    """The paper's first stage: every pixel, poses refined. Its first half counts dark pixels for more.
+
+    Then the object's surface comes into being, also where it meets its stand in the shade; the second half brings the
+    bright chamber right.
+    """
+    return StageConfig(
+        name="full-frame",
+        share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
+        photon_floor=PHOTON_FLOOR,
+        photon_share=0.5,
+    )
 
 
 def masked_stage() -> StageConfig:
@@ -94,7 +115,7 @@ def masked_stage() -> StageConfig:
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
         rim_share=0.8,
-        photon_floor=0.05,
+        photon_floor=PHOTON_FLOOR,
         frozen_groups=("camera_opt", "background"),
         lr_start=0.5,
         lr_end=0.02,
@@ -127,6 +148,11 @@ class Stage:
         """Whether the parameters of ``group`` change at ``step``."""
         waiting = int(self.config.learn_after.get(group, 0.0) * (self.end - self.start))
         return group not in self.config.frozen_groups and step >= self.start + waiting
+
+    def photon_floor(self, step: int) -> float | None:
+        """The floor under the pixels' brightness in their weights at ``step``; None: all count alike."""
+        weighted = step < self.start + self.config.photon_share * (self.end - self.start)
+        return self.config.photon_floor if weighted else None
 
     def lr_factor(self, step: int, group: str) -> float:
         """Factor on the learning rate of ``group`` at ``step``: exponential between its two, after a warm-up."""
