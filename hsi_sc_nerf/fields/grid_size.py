@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-CELLS_PER_PIXEL = 4.0
-"""Cells along what one pixel covers at the object. Views from all round tell more than one pixel does: on the pear of
-docs/accuracy_and_time.md half as many make the surface rougher, whole frames lose 0.7 dB."""
+CELLS_PER_PIXEL = 2.0
+"""Cells along what one pixel covers at the object. Four resolve more, but a step costs a fifth more time, in which
+two come as far (docs/accuracy_and_time.md)."""
 COARSEST_GRID = 16
 """Cells along the scene box in the first level, nerfacto's."""
 LEVEL_GROWTH = 1.38

@@ -15,9 +15,6 @@ import numpy as np
 
 from hsi_sc_nerf import paper
 
-PHOTON_FLOOR = 0.05
-"""Default of `StageConfig.photon_floor`."""
-
 
 @dataclass
 class StageConfig:
@@ -97,13 +94,13 @@ class StageConfig:
 def full_frame_stage() -> StageConfig:
     """The paper's first stage: every pixel, poses refined. Its first half counts dark pixels for more.
 
-    Then the object's surface comes into being, also where it meets its stand in the shade; the second half brings the
-    bright chamber right.
+    In that half the object's surface comes into being, also where it meets its stand in the shade; the second half
+    brings the bright chamber right.
     """
     return StageConfig(
         name="full-frame",
         share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
-        photon_floor=PHOTON_FLOOR,
+        photon_floor=0.05,
         photon_share=0.5,
     )
 
@@ -115,7 +112,6 @@ def masked_stage() -> StageConfig:
         share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_share=0.75,
         rim_share=0.8,
-        photon_floor=PHOTON_FLOOR,
         frozen_groups=("camera_opt", "background"),
         lr_start=0.5,
         lr_end=0.02,
