@@ -13,14 +13,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.evaluation.benchmark.report import markdown_table
 from hsi_sc_nerf.evaluation.traits import TrueSurface, relative_rms
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.traits.analysis import classified
 from hsi_sc_nerf.traits.library import SpectralLibrary
@@ -32,6 +34,7 @@ from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh, with_spectra
 EVERY_KTH_CAMERA = 5
 ROI_RADIUS_M = 0.005
 ROIS = 12
+INCIDENCES_DEG = ((0, 50), (50, 70), (70, 90))
 BLUSH_SHARES = (0.25, 0.5, 0.75)
 LEFT_OUT = ("stem",)
 """Its spectrum lies between those of bruise and skin: the rim of a bruise would be stem."""
@@ -64,7 +67,7 @@ class TraitsAccuracy:
         started = time.perf_counter()
         config = replace(self.mesh, base_height_m=stands_at_m)
         mesh = closed_mesh(cloud.points, cloud.normals, config)
-        surface = with_spectra(mesh, cloud, config.smoothing_radius_m)
+        surface = with_spectra(mesh, cloud, config.smoothing_radius_m, MAX_INCIDENCE_DEG)
         seconds = time.perf_counter() - started
 
         vertices = true.mesh.vertices
@@ -73,6 +76,7 @@ class TraitsAccuracy:
             true.mesh, true.reflectance(everything), true.wavelengths_nm, true.seen(vertices, eyes_m)
         )
         rows = [*_size_rows(surface, ideal, cloud), *_roi_rows(surface, ideal), *_class_rows(surface, true, ideal)]
+        rows += _incidence_rows(cloud, true)
         page = markdown_table(["trait", "measured", "true", "error"], rows)
         page += f"\n\nopen edges: {open_edges(mesh)}; {len(cloud.points)} points; {seconds:.0f} s"
         print(page)
@@ -117,6 +121,22 @@ def _roi_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
     worst = f"worst {100.0 * max(errors):.2f} % at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
     spots = f"spectra of {ROIS} spots of {2000.0 * ROI_RADIUS_M:g} mm, relative RMS"
     return [[spots, "", "", f"median {100.0 * np.median(errors):.2f} %, {worst}"]]
+
+
+def _incidence_rows(cloud: SpectralCloud, true: TrueSurface) -> list[list[str]]:
+    """Spectral angles between points and the true surface beneath them, by how obliquely the points are seen."""
+    if INCIDENCE not in cloud.extra:
+        return []
+    _, weights, _ = true.nearest(cloud.points)
+    truth = torch.from_numpy(weights @ true.endmembers)
+    angles = spectral_angle(torch.from_numpy(cloud.spectra).to(truth), truth).numpy()
+    rows = []
+    for low, high in INCIDENCES_DEG:
+        of = angles[(cloud.extra[INCIDENCE] >= low) & (cloud.extra[INCIDENCE] < high)]
+        if len(of) > 0:
+            told = f"median {np.median(of):.3f}, 90th percentile {np.quantile(of, 0.9):.3f}"
+            rows.append([f"angle of {len(of)} points seen at {low} to {high} degrees, rad", "", "", told])
+    return rows
 
 
 def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -> list[list[str]]:

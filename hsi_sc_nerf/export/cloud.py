@@ -13,7 +13,8 @@ CHUNK_POINTS = 1 << 15
 INCIDENCE = "incidence_deg"
 """Column: the angle between a point's normal and the ray that its spectrum is of."""
 MAX_INCIDENCE_DEG = 70.0
-"""Cameras that look at a face more obliquely than this see it smeared over their pixels."""
+"""Cameras that look at a face more obliquely than this see it smeared over their pixels, together with what lies
+beside it (docs/traits.md)."""
 
 
 @dataclass(frozen=True)

@@ -92,16 +92,13 @@ class StageConfig:
 
 
 def full_frame_stage() -> StageConfig:
-    """The paper's first stage: every pixel, poses refined. Its first half counts dark pixels for more.
+    """The paper's first stage: every pixel, poses refined.
 
-    In that half the object's surface comes into being, also where it meets its stand in the shade; the second half
-    brings the bright chamber right.
+    Where dark pixels are to count for more, they do in its first half: in that the object's surface comes into being,
+    also where it meets its stand in the shade; the second half brings the bright chamber right.
     """
     return StageConfig(
-        name="full-frame",
-        share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
-        photon_floor=0.05,
-        photon_share=0.5,
+        name="full-frame", share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS), photon_share=0.5
     )
 
 
