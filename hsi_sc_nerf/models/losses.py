@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.models.validity import cleared, has_angle
+from hsi_sc_nerf.models.validity import cleared, count_bands, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, select_pixels, spectral_angle, widen
 
 # Root mean square reflectance below which a spectrum has no usable direction. A count of the packed cubes is 2e-5.
@@ -44,8 +44,8 @@ def photon_weights(
     if valid is None:
         brightness = widen(target).mean(dim=-1, keepdim=True)
     else:
-        total, count = widen(cleared(target, valid)).sum(dim=-1, keepdim=True), valid.sum(dim=-1, keepdim=True)
-        brightness = total / count.clamp_min(1)
+        total = widen(cleared(target, valid)).sum(dim=-1, keepdim=True)
+        brightness = total / count_bands(valid)[..., None].clamp_min(1)
     weights = 1.0 / (brightness.clamp_min(0.0) + floor)
     return weights / weights.mean()
 
