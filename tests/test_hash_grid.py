@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
@@ -85,3 +87,13 @@ def test_threads_do_not_change_gradients():
         torch.set_num_threads(before)
     assert torch.equal(gradients[0][0], gradients[1][0])
     assert torch.equal(gradients[0][1], gradients[1][1])
+
+
+def test_the_viewer_may_interpolate_while_training_does():
+    """Launches from several threads at once, as a viewer's beside the trainer's, do not disturb each other."""
+    torch.manual_seed(0)
+    points, table, scalings = torch.rand(20_000, 3), torch.rand(2 * 64, 2), torch.tensor([4.0, 8.0])
+    alone = interpolate_hash_grid(points, table, scalings, 64)
+    with ThreadPoolExecutor(3) as threads:
+        found = threads.map(lambda _: interpolate_hash_grid(points, table, scalings, 64), range(60))
+        assert all(torch.equal(beside, alone) for beside in found)

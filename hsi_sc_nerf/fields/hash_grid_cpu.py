@@ -8,9 +8,8 @@ many there are.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
+from threading import Lock
+from typing import Any
 
 import numba
 import numpy as np
@@ -22,6 +21,13 @@ _SHARED_FROM = 4096
 """Points from which on threads are worth waking."""
 
 _compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+_shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
+
+# On Linux these are the threads of torch: others would have to wait for its own, which go on spinning on their cores
+# for milliseconds after every operation.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+# The last of these does not bear a second launch beside the first, as from the viewer's thread.
+_one_at_a_time = Lock()
 
 
 @_compiled
@@ -53,9 +59,13 @@ def _weights(x, y, z):
     return a * near_z, a * z, b * near_z, b * z, c * near_z, c * z, d * near_z, d * z
 
 
+# The three below do one part of ``parts``.
+
+
 @_compiled
-def _interpolate(positions, table, scalings, mask, features, first, last):
+def _interpolate(positions, table, scalings, mask, features, part, parts):
     channels = table.shape[1]
+    first, last = len(positions) * part // parts, len(positions) * (part + 1) // parts
     for level in range(len(scalings)):
         for i in range(first, last):
             x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
@@ -69,10 +79,10 @@ def _interpolate(positions, table, scalings, mask, features, first, last):
 
 
 @_compiled
-def _add_to_table(positions, scalings, mask, gradient, grad_table, first, last):
-    """Gradient with respect to the table's levels from ``first`` to ``last``."""
+def _add_to_table(positions, scalings, mask, gradient, grad_table, part, parts):
+    """Gradient with respect to the table. Every part gets coarse and fine levels: the coarse ones are done sooner."""
     channels = grad_table.shape[1]
-    for level in range(first, last):
+    for level in range(part, len(scalings), parts):
         for i in range(len(positions)):
             x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
             rows, x, y, z = _corners(x, y, z, scalings[level], mask, level * (mask + 1))
@@ -84,8 +94,9 @@ def _add_to_table(positions, scalings, mask, gradient, grad_table, first, last):
 
 
 @_compiled
-def _position_gradients(positions, table, scalings, mask, gradient, grad_positions, first, last):
+def _position_gradients(positions, table, scalings, mask, gradient, grad_positions, part, parts):
     channels = table.shape[1]
+    first, last = len(positions) * part // parts, len(positions) * (part + 1) // parts
     one = np.float32(1.0)
     for i in range(first, last):
         for level in range(len(scalings)):
@@ -108,23 +119,33 @@ def _position_gradients(positions, table, scalings, mask, gradient, grad_positio
             grad_positions[i, 2] += scalings[level] * along_z
 
 
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="hash-grid")
+@_shared
+def _interpolate_at_once(positions, table, scalings, mask, features, parts):
+    for part in numba.prange(parts):
+        _interpolate(positions, table, scalings, mask, features, part, parts)
 
 
-def _share(work: Callable[[int, int], None], count: int, threads: int) -> None:
-    """Do ``work(first, last)`` for all of ``count``, in equal parts at once."""
-    if threads == 1:
-        work(0, count)
+@_shared
+def _add_to_table_at_once(positions, scalings, mask, gradient, grad_table, parts):
+    for part in numba.prange(parts):
+        _add_to_table(positions, scalings, mask, gradient, grad_table, part, parts)
+
+
+@_shared
+def _position_gradients_at_once(positions, table, scalings, mask, gradient, grad_positions, parts):
+    for part in numba.prange(parts):
+        _position_gradients(positions, table, scalings, mask, gradient, grad_positions, part, parts)
+
+
+def _run(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
+    """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it."""
+    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    if threads == 1 or points < _SHARED_FROM:
+        alone(*arguments, 0, 1)
         return
-    edges = [count * part // threads for part in range(threads + 1)]
-    for done in [_pool(threads).submit(work, *edge) for edge in pairwise(edges)]:
-        done.result()
-
-
-def _threads_for(points: int) -> int:
-    return torch.get_num_threads() if points >= _SHARED_FROM else 1
+    with _one_at_a_time:
+        numba.set_num_threads(threads)
+        at_once(*arguments, threads)
 
 
 def interpolate(
@@ -135,11 +156,8 @@ def interpolate(
 ) -> Float32[np.ndarray, "n levels_x_channels"]:
     """Trilinear interpolation of a stack of hashed grids, as `hash_grid.interpolate_hash_grid` describes it."""
     features = np.empty((len(positions), len(scalings) * table.shape[1]), np.float32)
-
-    def work(first: int, last: int) -> None:
-        _interpolate(positions, table, scalings, table_size - 1, features, first, last)
-
-    _share(work, len(positions), _threads_for(len(positions)))
+    arguments = positions, table, scalings, table_size - 1, features
+    _run(_interpolate, _interpolate_at_once, len(positions), *arguments)
     return features
 
 
@@ -152,11 +170,8 @@ def table_gradient(
 ) -> Float32[np.ndarray, "rows channels"]:
     """Gradient with respect to the table; threads share the levels, whose rows are apart."""
     grad_table = np.zeros_like(table)
-
-    def work(first: int, last: int) -> None:
-        _add_to_table(positions, scalings, table_size - 1, gradient, grad_table, first, last)
-
-    _share(work, len(scalings), min(len(scalings), _threads_for(len(positions))))
+    arguments = positions, scalings, table_size - 1, gradient, grad_table
+    _run(_add_to_table, _add_to_table_at_once, len(positions), *arguments)
     return grad_table
 
 
@@ -169,9 +184,6 @@ def position_gradient(
 ) -> Float32[np.ndarray, "n 3"]:
     """Gradient with respect to the positions."""
     grad_positions = np.zeros_like(positions)
-
-    def work(first: int, last: int) -> None:
-        _position_gradients(positions, table, scalings, table_size - 1, gradient, grad_positions, first, last)
-
-    _share(work, len(positions), _threads_for(len(positions)))
+    arguments = positions, table, scalings, table_size - 1, gradient, grad_positions
+    _run(_position_gradients, _position_gradients_at_once, len(positions), *arguments)
     return grad_positions
