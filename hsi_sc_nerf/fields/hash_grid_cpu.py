@@ -25,7 +25,7 @@ _shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 
 # On Linux these are the threads of torch: others would have to wait for its own, which go on spinning on their cores
 # for milliseconds after every operation.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 # The last of these does not bear a second launch beside the first, as from the viewer's thread.
 _one_at_a_time = Lock()
 
@@ -139,7 +139,7 @@ def _position_gradients_at_once(positions, table, scalings, mask, gradient, grad
 
 def _run(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
     """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it."""
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     if threads == 1 or points < _SHARED_FROM:
         alone(*arguments, 0, 1)
         return
