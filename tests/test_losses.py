@@ -13,7 +13,6 @@ from hsi_sc_nerf.models.losses import (
     angular_loss,
     charbonnier_loss,
     hsi_loss,
-    photon_weights,
 )
 
 LOSSES = [hsi_loss, angular_loss, charbonnier_loss, angle_loss]
@@ -246,33 +245,3 @@ def test_band_weights_count_a_band_as_often_as_they_say(loss) -> None:
     repeated = (values.repeat_interleave(weights, dim=-1) for values in (predicted, target))
     weighted = loss(predicted, target, half_mask(), None, weights / weights.float().mean())
     assert weighted.item() == pytest.approx(loss(*repeated, half_mask()).item(), rel=1e-5)
-
-
-def test_photon_weights_are_inverse_variances_of_mean_one() -> None:
-    target = torch.tensor([[0.1, 0.3], [0.5, 0.5], [-0.2, 0.1]])
-    weights = photon_weights(target, 0.05)
-    assert weights.shape == (3, 1)
-    assert weights.mean().item() == pytest.approx(1.0)
-    # Brightness 0.2, 0.5 and, where noise has made it negative, 0.
-    expected = np.array([1 / 0.25, 1 / 0.55, 1 / 0.05])
-    np.testing.assert_allclose(weights[:, 0], expected / expected.mean(), rtol=1e-6)
-
-
-def test_photon_weights_know_the_measured_bands_only() -> None:
-    target = torch.tensor([[0.2, 7.0], [0.4, 0.4], [9.0, 9.0]])
-    valid = torch.tensor([[True, False], [True, True], [False, False]])
-    weights = photon_weights(target, 0.1, valid)[:, 0]
-    assert (weights[0] / weights[1]).item() == pytest.approx(0.5 / 0.3)
-    assert torch.isfinite(weights).all()
-
-
-@pytest.mark.parametrize("loss", [hsi_loss, charbonnier_loss])
-def test_pixel_weights_weigh_pixels(loss) -> None:
-    predicted, target = pair()
-    weights = torch.rand(5, 6, 1, generator=torch.Generator().manual_seed(1))
-    weights /= weights.mean()
-    each = torch.stack([loss(predicted[i, j], target[i, j]) for i in range(5) for j in range(6)])
-    expected = (weights.flatten() * each).mean().item()
-    assert loss(predicted, target, pixel_weights=weights).item() == pytest.approx(expected, rel=1e-5)
-    masked = (weights.flatten() * each)[half_mask().flatten()].mean().item()
-    assert loss(predicted, target, half_mask(), pixel_weights=weights).item() == pytest.approx(masked, rel=1e-5)

@@ -97,21 +97,11 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
     assert StageConfig("a", 1.0, angular_loss_mult=0.0).loss_weights() == {"angular_loss_mult": 0.0}
 
 
-def test_dark_pixels_count_for_more_in_the_first_steps_of_a_stage():
-    stage = Stage(StageConfig("a", 1.0, photon_floor=0.1, photon_share=0.5), start=10, end=30)
-    assert [step for step in range(10, 30) if stage.photon_floor(step) == 0.1] == list(range(10, 20))
-    assert stage.photon_floor(20) is None
-    assert Stage(StageConfig("a", 1.0, photon_floor=0.1), 10, 30).photon_floor(29) == 0.1
-    assert Stage(StageConfig("a", 1.0), 10, 30).photon_floor(10) is None
-
-
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
         ({"foreground_share": 1.2}, "foreground-share 1.2"),
         ({"rim_share": -0.1}, "rim-share -0.1"),
-        ({"photon_share": 2.0}, "photon-share 2.0"),
-        ({"photon_floor": 0.0}, "photon-floor 0.0 is not above 0"),
         ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
         ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
         ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),

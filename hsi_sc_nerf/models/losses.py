@@ -4,8 +4,8 @@ All are means over the pixels of the mask, float32, and 0 with gradient 0 where 
 are finite for any finite spectra, in float16 too (``hsi_sc_nerf.numerics``).
 
 ``valid`` tells which values of the target are measurements. The others count nowhere, whatever number stands there,
-and no gradient comes from them. ``band_weights`` and ``pixel_weights`` (of mean 1) tell how much each band and each
-pixel counts; without them all count alike.
+and no gradient comes from them. ``band_weights`` (of mean 1) tell how much each band counts; without them all count
+alike.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.models.validity import cleared, count_bands, has_angle
+from hsi_sc_nerf.models.validity import cleared, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, select_pixels, spectral_angle, widen
 
 # Root mean square reflectance below which a spectrum has no usable direction. A count of the packed cubes is 2e-5.
@@ -27,36 +27,12 @@ CHARBONNIER_SCALE = 0.02
 """Error in reflectance from which on the Charbonnier loss grows like the error, not like its square."""
 
 
-def photon_weights(
-    target: Float[Tensor, "*pixels bands"], floor: float, valid: Bool[Tensor, "*pixels bands"] | None = None
-) -> Float[Tensor, "*pixels 1"]:
-    """Weights of mean 1 in proportion to ``1 / (mean reflectance + floor)``, those of least squares.
-
-    The variance of a reading is the sensor's own and that of the light, which grows with it: where little light
-    falls, readings are better, and what tells two things there apart is smaller. (Mildenhall et al., "NeRF in the
-    Dark", CVPR 2022, weigh with the square of this, for eyes; this is for the sensor's noise.)
-
-    Args:
-        target: Measured reflectance; below 0 counts as 0.
-        floor: Reflectance whose light is as noisy as the sensor in the dark, greater than 0.
-        valid: Values of the target that are measurements; all without it.
-    """
-    if valid is None:
-        brightness = widen(target).mean(dim=-1, keepdim=True)
-    else:
-        total = widen(cleared(target, valid)).sum(dim=-1, keepdim=True)
-        brightness = total / count_bands(valid)[..., None].clamp_min(1)
-    weights = 1.0 / (brightness.clamp_min(0.0) + floor)
-    return weights / weights.mean()
-
-
 def hsi_loss(
     predicted: Float[Tensor, "*pixels bands"],
     target: Float[Tensor, "*pixels bands"],
     mask: Bool[Tensor, "*pixels"] | None = None,
     valid: Bool[Tensor, "*pixels bands"] | None = None,
     band_weights: Float[Tensor, "bands"] | None = None,
-    pixel_weights: Float[Tensor, "*pixels 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared error over pixels **and bands** (paper, L_hsi).
 
@@ -70,13 +46,12 @@ def hsi_loss(
         mask: Pixels that count; all without one.
         valid: Values of the target that are measurements, each of which counts alike; all without it.
         band_weights: How much each band counts.
-        pixel_weights: How much each pixel counts.
 
     Raises:
         ValueError: the mask is not boolean, or its shape is not that of the pixels; likewise ``valid``.
     """
     difference, valid = _difference(predicted, target, mask, valid)
-    costs = _weighted(difference.square(), band_weights, pixel_weights, mask)
+    costs = _weighted(difference.square(), band_weights)
     return narrow(masked_mean(costs, valid), predicted, target)
 
 
@@ -86,7 +61,6 @@ def charbonnier_loss(
     mask: Bool[Tensor, "*pixels"] | None = None,
     valid: Bool[Tensor, "*pixels bands"] | None = None,
     band_weights: Float[Tensor, "bands"] | None = None,
-    pixel_weights: Float[Tensor, "*pixels 1"] | None = None,
     scale: float = CHARBONNIER_SCALE,
 ) -> Float[Tensor, ""]:
     """Mean of ``2 s^2 (sqrt(1 + (d / s)^2) - 1)`` over pixels and bands, d the error and s the scale.
@@ -98,7 +72,7 @@ def charbonnier_loss(
     difference, valid = _difference(predicted, target, mask, valid)
     square = (difference / scale).square()
     # sqrt(1 + q) - 1 would lose small q to rounding.
-    costs = _weighted(2.0 * scale**2 * square / ((1.0 + square).sqrt() + 1.0), band_weights, pixel_weights, mask)
+    costs = _weighted(2.0 * scale**2 * square / ((1.0 + square).sqrt() + 1.0), band_weights)
     return narrow(masked_mean(costs, valid), predicted, target)
 
 
@@ -149,12 +123,8 @@ def angle_loss(
     return narrow(masked_mean(spectral_angle(p, t), counted), predicted, target)
 
 
-def _weighted(
-    costs: Tensor, band_weights: Tensor | None, pixel_weights: Tensor | None, mask: Tensor | None
-) -> Float[Tensor, "n bands"]:
-    if band_weights is not None:
-        costs = costs * band_weights.to(costs)
-    return costs if pixel_weights is None else costs * select_pixels(pixel_weights, mask).to(costs)
+def _weighted(costs: Tensor, band_weights: Tensor | None) -> Tensor:
+    return costs if band_weights is None else costs * band_weights.to(costs)
 
 
 def _difference(

@@ -30,7 +30,7 @@ from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
 from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid, training_subspace
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss, photon_weights
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.metrics import (
     spectral_angle_map,
     spectral_angle_mapper,
@@ -49,9 +49,6 @@ class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
     Outputs of a ray: ``spectral`` (bands) beside nerfacto's own, with ``rgb`` a pseudo-RGB of three bands.
-
-    Attributes:
-        photon_floor: how dark pixels count (`losses.photon_weights`); None: all alike. The trainer sets it by step.
     """
 
     config: SpectralModelConfig
@@ -61,7 +58,6 @@ class SpectralModel(NerfactoModel):
     decoder: nn.Module
     renderer_rgb: nn.Module  # type: ignore[assignment]
     band_weights: Tensor | None
-    photon_floor: float | None = None
 
     def populate_modules(self) -> None:
         """Build the modules.
@@ -225,10 +221,7 @@ class SpectralModel(NerfactoModel):
         losses = {}
         if config.hsi_loss_mult > 0:
             errors = hsi_loss if config.hsi_loss == "squared" else charbonnier_loss
-            pixels = None if self.photon_floor is None else photon_weights(target, self.photon_floor, valid)
-            value = errors(
-                outputs["spectral"], target, valid=valid, band_weights=self.band_weights, pixel_weights=pixels
-            )
+            value = errors(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
             losses["hsi_loss"] = config.hsi_loss_mult * value
         if config.angular_loss_mult > 0:
             angles = angular_loss if config.angular_loss == "cosine" else angle_loss

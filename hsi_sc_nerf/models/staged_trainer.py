@@ -137,7 +137,6 @@ class StagedTrainer(Trainer):
         stage = self.plan.at(step)
         if stage is not self._stage:
             self._enter(stage)
-        self._model.photon_floor = stage.photon_floor(step)
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
         rates = self._set_learning_rates(stage, step)
         torch.manual_seed(step_seed(self.config.machine.seed, step))

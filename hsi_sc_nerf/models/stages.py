@@ -27,8 +27,8 @@ class StageConfig:
     num_iterations: int | None = None
     """Length of this stage on its own; where it is given it goes before the share."""
     foreground_share: float | None = None
-    """Share of the rays that hit the foreground masks; the others keep empty space empty. 1: the object's pixels
-    alone, as in the paper. None: whole frames."""
+    """Share of the rays that hit the foreground masks; the others, anywhere else in the frames, keep empty space
+    empty. 1: the object's pixels alone, as in the paper. None: anywhere in whole frames."""
     rim_share: float = 0.0
     """Share of the other rays, where there is a foreground share, that pass just beside the masks: these say most
     sharply where the object ends."""
@@ -36,12 +36,6 @@ class StageConfig:
     """Weight of the spectral angle's loss in this stage. None: the model's."""
     hsi_loss_mult: float | None = None
     """Weight of the squared error in this stage. None: the model's."""
-    photon_floor: float | None = None
-    """Let dark pixels count for more in the errors of reflectance, in proportion to 1 / (reflectance + this): the
-    light's own noise grows with it. This is the reflectance whose light is as noisy as the sensor in the dark. None:
-    all pixels count alike, as in the paper."""
-    photon_share: float = 1.0
-    """Share of the stage's steps, from its start, in which they do; after it all pixels count alike."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change: what they learned so far stays in force (camera_opt: unless
     the pose refinement's mode says otherwise)."""
@@ -71,16 +65,10 @@ class StageConfig:
         Raises:
             ValueError: one sentence that names the stage and its field.
         """
-        shares = {
-            "foreground-share": self.foreground_share,
-            "rim-share": self.rim_share,
-            "photon-share": self.photon_share,
-        }
+        shares = {"foreground-share": self.foreground_share, "rim-share": self.rim_share}
         for option, share in shares.items():
             if share is not None and not 0.0 <= share <= 1.0:
                 raise ValueError(f"{self.name}: {option} {share} is not between 0 and 1")
-        if self.photon_floor is not None and not self.photon_floor > 0.0:
-            raise ValueError(f"{self.name}: photon-floor {self.photon_floor} is not above 0; None leaves it out")
         factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
         factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
         for option, factor in factors.items():
@@ -92,13 +80,16 @@ class StageConfig:
 
 
 def full_frame_stage() -> StageConfig:
-    """The paper's first stage: every pixel, poses refined.
+    """The paper's first stage: whole frames, poses refined.
 
-    Where dark pixels are to count for more, they do in its first half: in that the object's surface comes into being,
-    also where it meets its stand in the shade; the second half brings the bright chamber right.
+    A share of the rays is sure to hit the object, and one to pass just beside it: its surface comes into being here,
+    and on a turntable it is seen in less than a tenth of the pixels.
     """
     return StageConfig(
-        name="full-frame", share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS), photon_share=0.5
+        name="full-frame",
+        share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
+        foreground_share=0.2,
+        rim_share=0.2,
     )
 
 
@@ -141,11 +132,6 @@ class Stage:
         """Whether the parameters of ``group`` change at ``step``."""
         waiting = int(self.config.learn_after.get(group, 0.0) * (self.end - self.start))
         return group not in self.config.frozen_groups and step >= self.start + waiting
-
-    def photon_floor(self, step: int) -> float | None:
-        """The floor under the pixels' brightness in their weights at ``step``; None: all count alike."""
-        weighted = step < self.start + self.config.photon_share * (self.end - self.start)
-        return self.config.photon_floor if weighted else None
 
     def lr_factor(self, step: int, group: str) -> float:
         """Factor on the learning rate of ``group`` at ``step``: exponential between its two, after a warm-up."""

@@ -43,7 +43,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     ),
     "ours-foreground-only": (OURS, "--masked.foreground-share 1.0"),
     "ours-no-rim": (OURS, "--masked.rim-share 0.0"),
-    "ours-dark-pixels": (OURS, "--full-frame.photon-floor 0.05"),
+    "ours-whole-frames": (OURS, "--full-frame.foreground-share None"),
     "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
     "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
     "ours-measured-poses": (OURS, "--pipeline.model.camera-optimizer.mode off"),
