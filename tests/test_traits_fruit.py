@@ -92,6 +92,14 @@ def test_bruise_area_is_within_ten_percent_of_the_true_surface_classified_alike(
     assert [region.label for region in measured.regions].count(1) >= 1
 
 
+def test_bruise_area_by_mixture_is_within_three_percent_of_where_it_has_most(ideal_apple, measured_apple, true_apple):
+    spectra = SpectralLibrary(true_apple.materials, NM, true_apple.endmembers)
+    measured = classified(measured_apple, spectra, 0.1, 1e-5)
+    bruise = true_apple.materials.index("bruise")
+    most = ideal_apple.seen & (true_apple.weights[:, bruise] > 0.5)
+    assert measured.mixture_areas_m2[bruise] == pytest.approx(ideal_apple.areas_m2[most].sum(), rel=0.03)
+
+
 def small_cloud(path):
     """A green and brown cylinder as the command's input."""
     mesh: Mesh = cylinder(0.04, 0.05, segments=96, step_m=0.001).moved(np.array([0.0, 0.0, STAND_M]))
@@ -126,7 +134,8 @@ def test_command_writes_all_results(tmp_path):
     assert content["size"]["volume_l"] == pytest.approx(1000.0 * true.mesh.volume_m3(), rel=0.03)
     assert content["size_sd"]["volume_l"] > 0.0
     side_m2 = (content["seen_area_m2"]) / 2.0
-    assert content["classes"]["areas_m2"] == pytest.approx({"skin": side_m2, "bruise": side_m2}, rel=0.1)
+    for area in ("areas_m2", "mixture_areas_m2"):
+        assert content["classes"][area] == pytest.approx({"skin": side_m2, "bruise": side_m2}, rel=0.1)
     assert content["regions"]["spot"]["area_m2"] == pytest.approx(np.pi * 0.006**2, rel=0.15)
     table = np.loadtxt(tmp_path / "out" / "spectra.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(table[:, 0], NM, rtol=1e-5)

@@ -138,7 +138,10 @@ class TraitsCommand:
             if any(table.values()):
                 draw(self.output_dir / name, surface, views, traits)
                 drawn[caption] = name
-        extra = {} if traits.classes is None else {"class": traits.classes.labels.astype("float32")}
+        found, extra = traits.classes, {}
+        if found is not None:
+            by = {"class": found.labels, "class_by_mixture": found.mixture_labels}
+            extra = {name: labels.astype("float32") for name, labels in by.items()}
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         watertight = open_edges(surface.mesh) == 0

@@ -17,6 +17,7 @@ from hsi_sc_nerf.traits.classes import UNCLASSIFIED, Region, classify, connected
 from hsi_sc_nerf.traits.library import SpectralLibrary
 from hsi_sc_nerf.traits.regions import PickedRegion, RegionSpectrum, region_spectrum, weighted_mean_and_sd
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.traits.unmixing import unmix
 
 WHOLE = "whole surface"
 
@@ -31,6 +32,9 @@ class Classes:
         threshold_rad: largest spectral angle of a class's spectra to its reference.
         areas_m2: of each class.
         unclassified_m2: seen, but in no class.
+        mixture_labels: number of the class that makes up more than half of each vertex, its spectrum taken for a
+            mixture of the library's; -1 where none does, where it is no such mixture, or was not seen.
+        mixture_areas_m2: of each class by these.
         regions: connected regions, the largest first.
     """
 
@@ -39,6 +43,8 @@ class Classes:
     threshold_rad: float
     areas_m2: Float[np.ndarray, "classes"]
     unclassified_m2: float
+    mixture_labels: Int[np.ndarray, "v"]
+    mixture_areas_m2: Float[np.ndarray, "classes"]
     regions: list[Region]
 
 
@@ -74,7 +80,8 @@ def classified(
 ) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 
-    A class is what the library has under one name; a place belongs to the class of its nearest reference.
+    A class is what the library has under one name. By angle, a place belongs to the class of its nearest reference;
+    by mixture, to the class that holds most of it: a blurred edge stays where it was, because half is half.
 
     Raises:
         InputError: the library does not cover the bands, or the threshold is no angle.
@@ -85,15 +92,25 @@ def classified(
     names = tuple(dict.fromkeys(library.names))
     # The last entry is what the index -1 finds.
     class_of = np.array([*(names.index(name) for name in library.names), UNCLASSIFIED])
-    labels = np.full(len(surface.seen), UNCLASSIFIED)
-    labels[surface.seen] = class_of[classify(surface.spectra[surface.seen], references, threshold_rad)]
-    areas = np.array([surface.areas_m2[labels == index].sum() for index in range(len(names))])
+    spectra = surface.spectra[surface.seen]
+    labels, mixture_labels = (np.full(len(surface.seen), UNCLASSIFIED) for _ in range(2))
+    labels[surface.seen] = class_of[classify(spectra, references, threshold_rad)]
+    shares, angles = unmix(spectra, references)
+    by_class = shares @ np.eye(len(names))[class_of[:-1]]
+    most = (by_class.max(axis=1) > 0.5) & (angles <= threshold_rad)
+    mixture_labels[surface.seen] = np.where(most, by_class.argmax(axis=1), UNCLASSIFIED)
+
+    def areas_m2(of: Int[np.ndarray, "v"]) -> Float[np.ndarray, "classes"]:
+        return np.array([surface.areas_m2[of == index].sum() for index in range(len(names))])
+
     return Classes(
         names=names,
         labels=labels,
         threshold_rad=threshold_rad,
-        areas_m2=areas,
+        areas_m2=areas_m2(labels),
         unclassified_m2=float(surface.areas_m2[surface.seen & (labels == UNCLASSIFIED)].sum()),
+        mixture_labels=mixture_labels,
+        mixture_areas_m2=areas_m2(mixture_labels),
         regions=connected_regions(surface.mesh, labels, surface.areas_m2, smallest_region_m2),
     )
 

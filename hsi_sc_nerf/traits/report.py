@@ -101,6 +101,7 @@ def write_traits_json(
             "threshold_rad": classes.threshold_rad,
             "areas_m2": dict(zip(classes.names, classes.areas_m2.tolist(), strict=True)),
             "unclassified_m2": classes.unclassified_m2,
+            "mixture_areas_m2": dict(zip(classes.names, classes.mixture_areas_m2.tolist(), strict=True)),
             "regions": [{**asdict(region), "label": classes.names[region.label]} for region in classes.regions],
         },
         "regions": {region.name: {"area_m2": region.area_m2} for region in traits.spectra},
@@ -136,13 +137,20 @@ def _size_table(size: Size, spread: Size | None) -> str:
 def _class_tables(traits: Traits) -> list[str]:
     classes = traits.classes
     assert classes is not None
+    known = zip(classes.names, classes.areas_m2, classes.mixture_areas_m2, strict=True)
+    areas = [*known, ("in no class", classes.unclassified_m2, traits.seen_m2 - classes.mixture_areas_m2.sum())]
+    counts = [sum(region.label == index for region in classes.regions) for index in range(len(classes.names))]
     rows = [
-        [name, f"{area * _CM2_PER_M2:.2f}", f"{area / traits.seen_m2:.1%}", str(count)]
-        for index, (name, area) in enumerate(zip(classes.names, classes.areas_m2, strict=True))
-        for count in [sum(region.label == index for region in classes.regions)]
+        [
+            name,
+            f"{area * _CM2_PER_M2:.2f}",
+            f"{area / traits.seen_m2:.1%}",
+            str(count),
+            f"{mixture * _CM2_PER_M2:.2f}",
+            f"{mixture / traits.seen_m2:.1%}",
+        ]
+        for (name, area, mixture), count in zip(areas, [*counts, ""], strict=True)
     ]
-    unknown = classes.unclassified_m2
-    rows.append(["in no class", f"{unknown * _CM2_PER_M2:.2f}", f"{unknown / traits.seen_m2:.1%}", ""])
     listed = [
         [classes.names[region.label], f"{region.area_m2 * _CM2_PER_M2:.2f}"]
         + [f"{1000.0 * x:.1f}" for x in region.centre_m]
@@ -150,8 +158,13 @@ def _class_tables(traits: Traits) -> list[str]:
     ]
     return [
         "## Classes",
-        f"By the smallest spectral angle to the library's spectra, at most {classes.threshold_rad:g} rad.",
-        markdown_table(["class", "area, cm²", "of what was seen", "regions"], rows),
+        "By angle: all places whose spectral angle to the class is the smallest, and at most "
+        f"{classes.threshold_rad:g} rad. By mixture: all places of which the class makes up more than half, their "
+        "spectra taken for mixtures of the library's; where the library has all that the surface is made of, these "
+        "tell spots with soft edges better.",
+        markdown_table(
+            ["class", "by angle, cm²", "of what was seen", "regions", "by mixture, cm²", "of what was seen"], rows
+        ),
         f"The largest {len(listed)} of {len(classes.regions)} connected regions, with their middles:",
         markdown_table(["class", "area, cm²", "x, mm", "y, mm", "z, mm"], listed),
     ]
