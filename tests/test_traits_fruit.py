@@ -126,7 +126,7 @@ def test_command_writes_all_results(tmp_path):
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert written == {
         *("traits.md", "traits.json", "spectra.csv", "mesh.ply"),
-        *("composites.png", "indices.png", "classes.png", "region_spectra.png"),
+        *("composites.png", "indices.png", "classes.png", "classes_by_mixture.png", "region_spectra.png"),
     }
     content = json.loads((tmp_path / "out" / "traits.json").read_text())
     assert content["watertight"]

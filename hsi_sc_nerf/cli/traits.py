@@ -127,8 +127,11 @@ class TraitsCommand:
         views = pictures.SideViews(surface.mesh)
         drawn = {}
         if traits.classes is not None:
-            drawn["Classes"] = "classes.png"
-            pictures.draw_classes(self.output_dir / "classes.png", traits.classes, surface, views)
+            names, labels = traits.classes.names, traits.classes.labels
+            drawn["Classes by angle"], drawn["Classes by mixture"] = "classes.png", "classes_by_mixture.png"
+            pictures.draw_classes(self.output_dir / "classes.png", names, labels, surface, views)
+            labels = traits.classes.mixture_labels
+            pictures.draw_classes(self.output_dir / "classes_by_mixture.png", names, labels, surface, views)
         drawn["Spectra of regions"] = "region_spectra.png"
         pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
         for caption, name, draw, table in (

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib import colormaps, rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
@@ -16,7 +16,7 @@ from hsi_sc_nerf.evaluation.pictures import _COLOURS, _STYLE, _figure, _save, _s
 from hsi_sc_nerf.mesh import Mesh, ray_scene
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
-from hsi_sc_nerf.traits.analysis import WHOLE, Classes, Traits
+from hsi_sc_nerf.traits.analysis import WHOLE, Traits
 from hsi_sc_nerf.traits.classes import UNCLASSIFIED
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
 
@@ -125,23 +125,28 @@ def _draw_rows(
 
 
 @rc_context(_STYLE)
-def draw_classes(path: Path, classes: Classes, surface: SpectralMesh, views: SideViews) -> None:
+def draw_classes(
+    path: Path, names: Sequence[str], labels: Int[np.ndarray, "v"], surface: SpectralMesh, views: SideViews
+) -> None:
     """The classes on the surface, with their areas; white is in no class, grey was not seen."""
-    colours = np.array([to_rgb(_COLOURS[index % len(_COLOURS)]) for index in range(len(classes.names))])
-    painted = np.where(classes.labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[classes.labels])
+    colours = np.array([to_rgb(_COLOURS[index % len(_COLOURS)]) for index in range(len(names))])
+    painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = _GREY
     pictures = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(painted)]
     height, width = pictures[0].shape[:2]
-    figure = _figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(classes.names) // 3 + 2))
+    figure = _figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
         _show(axes, picture)
         axes.set_title(title)
+    areas_cm2 = [
+        1e4 * surface.areas_m2[surface.seen & (labels == index)].sum() for index in (*range(len(names)), UNCLASSIFIED)
+    ]
     patches = [
-        Patch(color=colours[i], label=f"{name}: {area * 1e4:.2f} cm²")
-        for i, (name, area) in enumerate(zip(classes.names, classes.areas_m2, strict=True))
+        Patch(color=colours[index], label=f"{name}: {area:.2f} cm²")
+        for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
         if area > 0
     ]
-    rest = f"in no class: {classes.unclassified_m2 * 1e4:.2f} cm²"
+    rest = f"in no class: {areas_cm2[-1]:.2f} cm²"
     patches += [
         Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest),
         Patch(color=str(_GREY), label="not seen"),
