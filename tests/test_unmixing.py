@@ -88,6 +88,15 @@ def test_references_of_one_name_are_one_class_of_a_mixture():
     assert found.mixture_areas_m2 == pytest.approx([mesh.area_m2(), 0.0])
 
 
+def test_a_place_of_which_no_class_has_half_is_of_none():
+    mesh = cylinder(0.04, 0.04, segments=32, step_m=0.005)
+    spectra = np.tile(np.float32([0.45, 0.3, 0.25]) @ ENDMEMBERS, (len(mesh.vertices), 1)).astype(np.float32)
+    surface = SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
+    found = classified(surface, SpectralLibrary(("green", "brown", "red"), NM, ENDMEMBERS), np.pi, 1e-6)
+    assert (found.mixture_labels == -1).all()
+    assert (found.labels >= 0).all()
+
+
 def test_what_is_no_mixture_of_the_library_is_of_no_class():
     mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
     left = mesh.vertices[:, 1:2] > 0.0
