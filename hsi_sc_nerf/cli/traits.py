@@ -126,12 +126,15 @@ class TraitsCommand:
 
         views = pictures.SideViews(surface.mesh)
         drawn = {}
-        if traits.classes is not None:
-            names, labels = traits.classes.names, traits.classes.labels
-            drawn["Classes by angle"], drawn["Classes by mixture"] = "classes.png", "classes_by_mixture.png"
-            pictures.draw_classes(self.output_dir / "classes.png", names, labels, surface, views)
-            labels = traits.classes.mixture_labels
-            pictures.draw_classes(self.output_dir / "classes_by_mixture.png", names, labels, surface, views)
+        extra = {}
+        if (found := traits.classes) is not None:
+            for caption, picture, column, labels in (
+                ("Classes by angle", "classes.png", "class", found.labels),
+                ("Classes by mixture", "classes_by_mixture.png", "class_by_mixture", found.mixture_labels),
+            ):
+                pictures.draw_classes(self.output_dir / picture, found.names, labels, surface, views)
+                drawn[caption] = picture
+                extra[column] = labels.astype("float32")
         drawn["Spectra of regions"] = "region_spectra.png"
         pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
         for caption, name, draw, table in (
@@ -141,10 +144,6 @@ class TraitsCommand:
             if any(table.values()):
                 draw(self.output_dir / name, surface, views, traits)
                 drawn[caption] = name
-        found, extra = traits.classes, {}
-        if found is not None:
-            by = {"class": found.labels, "class_by_mixture": found.mixture_labels}
-            extra = {name: labels.astype("float32") for name, labels in by.items()}
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         watertight = open_edges(surface.mesh) == 0

@@ -13,7 +13,7 @@ from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, Composite
 from hsi_sc_nerf.spectra.composites import composite as composite_of
 from hsi_sc_nerf.spectra.indices import INDICES, SpectralIndex, index_values
-from hsi_sc_nerf.traits.classes import UNCLASSIFIED, Region, classify, connected_regions
+from hsi_sc_nerf.traits.classes import UNCLASSIFIED, Region, class_areas_m2, classify, connected_regions
 from hsi_sc_nerf.traits.library import SpectralLibrary
 from hsi_sc_nerf.traits.regions import PickedRegion, RegionSpectrum, region_spectrum, weighted_mean_and_sd
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
@@ -35,6 +35,7 @@ class Classes:
         mixture_labels: number of the class that makes up more than half of each vertex, its spectrum taken for a
             mixture of the library's; -1 where none does, where it is no such mixture, or was not seen.
         mixture_areas_m2: of each class by these.
+        mixture_unclassified_m2: seen, but in no class by these.
         regions: connected regions, the largest first.
     """
 
@@ -45,6 +46,7 @@ class Classes:
     unclassified_m2: float
     mixture_labels: Int[np.ndarray, "v"]
     mixture_areas_m2: Float[np.ndarray, "classes"]
+    mixture_unclassified_m2: float
     regions: list[Region]
 
 
@@ -100,17 +102,18 @@ def classified(
     most = (by_class.max(axis=1) > 0.5) & (angles <= threshold_rad)
     mixture_labels[surface.seen] = np.where(most, by_class.argmax(axis=1), UNCLASSIFIED)
 
-    def areas_m2(of: Int[np.ndarray, "v"]) -> Float[np.ndarray, "classes"]:
-        return np.array([surface.areas_m2[of == index].sum() for index in range(len(names))])
-
+    areas_m2, mixture_areas_m2 = (
+        class_areas_m2(of, surface.areas_m2, surface.seen, len(names)) for of in (labels, mixture_labels)
+    )
     return Classes(
         names=names,
         labels=labels,
         threshold_rad=threshold_rad,
-        areas_m2=areas_m2(labels),
-        unclassified_m2=float(surface.areas_m2[surface.seen & (labels == UNCLASSIFIED)].sum()),
+        areas_m2=areas_m2[:-1],
+        unclassified_m2=float(areas_m2[-1]),
         mixture_labels=mixture_labels,
-        mixture_areas_m2=areas_m2(mixture_labels),
+        mixture_areas_m2=mixture_areas_m2[:-1],
+        mixture_unclassified_m2=float(mixture_areas_m2[-1]),
         regions=connected_regions(surface.mesh, labels, surface.areas_m2, smallest_region_m2),
     )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
@@ -60,6 +60,14 @@ def vertex_areas_m2(mesh: Mesh) -> Float[np.ndarray, "v"]:
     """Each vertex's share of the surface: a third of each of its triangles. They add up to the mesh's area."""
     thirds = np.repeat(mesh.triangle_areas_m2() / 3.0, 3)
     return np.bincount(mesh.triangles.ravel(), thirds, minlength=len(mesh.vertices))
+
+
+def class_areas_m2(
+    labels: Int[np.ndarray, "v"], areas_m2: Float[np.ndarray, "v"], seen: Bool[np.ndarray, "v"], classes: int
+) -> Float[np.ndarray, "classes_and_none"]:
+    """Area of each class, and as the last entry of what was seen but is in none."""
+    places = np.where(labels == UNCLASSIFIED, classes, labels)
+    return np.bincount(places[seen], areas_m2[seen], minlength=classes + 1)
 
 
 def connected_regions(

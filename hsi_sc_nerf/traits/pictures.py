@@ -17,7 +17,7 @@ from hsi_sc_nerf.mesh import Mesh, ray_scene
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.traits.analysis import WHOLE, Traits
-from hsi_sc_nerf.traits.classes import UNCLASSIFIED
+from hsi_sc_nerf.traits.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
 
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
@@ -138,9 +138,7 @@ def draw_classes(
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
         _show(axes, picture)
         axes.set_title(title)
-    areas_cm2 = [
-        1e4 * surface.areas_m2[surface.seen & (labels == index)].sum() for index in (*range(len(names)), UNCLASSIFIED)
-    ]
+    areas_cm2 = 1e4 * class_areas_m2(labels, surface.areas_m2, surface.seen, len(names))
     patches = [
         Patch(color=colours[index], label=f"{name}: {area:.2f} cm²")
         for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))

@@ -138,7 +138,7 @@ def _class_tables(traits: Traits) -> list[str]:
     classes = traits.classes
     assert classes is not None
     known = zip(classes.names, classes.areas_m2, classes.mixture_areas_m2, strict=True)
-    areas = [*known, ("in no class", classes.unclassified_m2, traits.seen_m2 - classes.mixture_areas_m2.sum())]
+    areas = [*known, ("in no class", classes.unclassified_m2, classes.mixture_unclassified_m2)]
     counts = [sum(region.label == index for region in classes.regions) for index in range(len(classes.names))]
     rows = [
         [
