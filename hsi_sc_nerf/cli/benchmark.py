@@ -56,7 +56,7 @@ class BenchmarkCommand:
     """Folder for the runs and for benchmark.csv, .md, .json and .png."""
     configurations: tuple[str, ...] = tuple(CONFIGURATIONS)
     """Which of the known configurations to train: paper is the published recipe, ours is this package's, and
-    the others are ours with one departure from the paper taken away."""
+    the others are ours with one departure from the paper taken away, or one option that ours does without."""
     sets: tuple[str, ...] = ()
     """Configurations of your own, each "NAME=BASE WORDS": the words change BASE (ours where it is left out) as they
     would behind `ns-train METHOD`, for example "fine=paper --pipeline.model.max-res 1024"."""

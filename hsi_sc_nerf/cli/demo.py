@@ -30,13 +30,13 @@ DEMO_TRAINING = {
 class DemoCommand:
     """Make a capture of a virtual fruit, reconstruct it, and compare the result with the known truth.
 
-    Takes about five minutes on two cores.
+    Takes four to five minutes on two cores.
     """
 
     output_dir: Path = Path("hsi-sc-nerf-demo")
     """Folder for everything the demo makes; an earlier demo there is replaced."""
     scene: str = "pear"
-    """What stands on the turntable: pear, apple, maize, or a scene file of your own."""
+    """What stands on the turntable: pear, apple, maize, pepper, sphere, cylinder, or a scene file of your own."""
     iterations: int = 500
     """Training steps, both stages together."""
     points: int = 60_000

@@ -16,7 +16,8 @@ class SimulateCommand:
     """Make a turntable capture of a virtual fruit, as the camera would leave it on disk, with its truth beside it."""
 
     scene: tyro.conf.Positional[str]
-    """pear, apple or maize, or a scene file of your own (YAML; start from a copy of a shipped one)."""
+    """pear, apple, maize, pepper, sphere, cylinder, or a scene file of your own (YAML; start from a copy of a shipped
+    one)."""
     session: tyro.conf.Positional[Path]
     """Folder to write; new, empty, or an earlier simulated session, which is replaced."""
     frames: int | None = None

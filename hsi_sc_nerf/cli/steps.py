@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -59,6 +58,8 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
 
 def own_cost(name: str, started: float) -> StepCost:
     """Cost of a step that ran in this process since ``started`` (`time.perf_counter`)."""
+    import resource  # not on Windows, where the other commands run
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _RSS_UNIT_BYTES / 2**20
     return StepCost(name, time.perf_counter() - started, peak)
 

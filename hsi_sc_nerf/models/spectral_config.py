@@ -59,7 +59,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Let a point's spectrum depend on the direction from which it is seen: it holds gloss, and the shading of lamps
     that stand still while the object turns."""
     predict_normals: bool = False
-    """Predict normals, as the paper does. It roughly doubles the time of a step, and the cloud's normals are those of
+    """Predict normals, as the paper does. A step takes half again as long, and the cloud's normals are those of
     the density in any case."""
     near_plane: float = 0.01
     """Rays start no nearer to the camera than this (scene units)."""

@@ -22,13 +22,6 @@ _PSNR = {
     "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
     "Eval Images Metrics/psnr": "one held-out view",
 }
-_CORRECTIONS = {
-    "Train Metrics Dict/camera_opt_rotation_deg": "rotation of the camera",
-    "Train Metrics Dict/camera_opt_angle_max_deg": "largest of the table's angles",
-}
-# Terms of the loss that never reach this share of its largest value say nothing.
-_LEAST_SHARE = 1e-5
-_HELD_OUT_PSNR = ("Eval Images Metrics Dict (all images)/psnr", "Eval Images Metrics/psnr")
 
 
 def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section:

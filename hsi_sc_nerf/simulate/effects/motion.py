@@ -73,7 +73,7 @@ class AxisTilt(MotionEffect):
 
 @dataclass(frozen=True)
 class Wobble(MotionEffect):
-    """The turntable's axis nutates: it leans by a constant small angle to a side that goes round as the disc turns.
+    """The turntable's axis sways: it leans by a constant small angle to a side that goes round as the disc turns.
 
     The axis leans about the point where it meets the disc, in the first frame towards the camera.
     """
