@@ -62,11 +62,13 @@ def _method(
     )
 
 
+_BASIS_AND_BACKGROUND = {"basis": 1e-3, "background": 1e-2}
+
 hsi_sc_nerf = MethodSpecification(
     config=_method(
         "hsi-sc-nerf",
         SpectralPipelineConfig(datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()),
-        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4, "basis": 1e-3, "background": 1e-2},
+        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4} | _BASIS_AND_BACKGROUND,
         full_frame=full_frame_stage(),
         masked=masked_stage(),
     ),
@@ -112,7 +114,9 @@ hsi_sc_nerf_paper = MethodSpecification(
                 camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
             ),
         ),
-        {"fields": paper.LEARNING_RATE, "proposal_networks": paper.LEARNING_RATE, "camera_opt": 1e-3},
+        # The preset itself has neither basis nor picture of the chamber: they wait for those who ask for them.
+        {"fields": paper.LEARNING_RATE, "proposal_networks": paper.LEARNING_RATE, "camera_opt": 1e-3}
+        | _BASIS_AND_BACKGROUND,
         full_frame=StageConfig(
             name="full-frame",
             share=0.5,

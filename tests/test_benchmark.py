@@ -171,7 +171,7 @@ def made_up(monkeypatch):
     def run_step(name, argv, log):
         ran.names.append(name)
         if name in ran.fails:
-            raise InputError(f"the step '{name}' failed with status 1; {log} tells why.")
+            raise InputError(f"the step '{name}' failed with status 1; what it said is above and in {log}.")
         if name.startswith("rehearsal"):
             found = {"iterations": 30, "iteration_seconds": 0.1}
             Path(json.loads(Path(argv[-2]).read_text())["output_dir"]).mkdir()

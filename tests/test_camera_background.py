@@ -170,10 +170,10 @@ def test_freezing_and_resuming():
     directions, rotations = rays_of_frame(0.0, pixel_centres())
     torch.nn.init.constant_(module.correction, 0.3)
     before = module(directions, rotations)
-    module.freeze(True)
+    module.requires_grad_(False)
     assert not module(directions, rotations).requires_grad
     torch.testing.assert_close(module(directions, rotations), before)
-    module.freeze(False)
+    module.requires_grad_(True)
     assert module(directions, rotations).requires_grad
     resumed = background(torch.zeros(40, 60, 3), learnable=True)
     resumed.load_state_dict(module.state_dict())

@@ -125,6 +125,8 @@ def test_a_mesh_against_itself_in_millimetres_is_exact(mesh: Path, tmp_path: Pat
     assert max(found.to_reference_m.max(), found.to_cloud_m.max()) < 1e-6
     with pytest.raises(InputError, match=r"1e\+03 times as large as .* \(--reference-unit"):
         compare(mesh, tmp_path / "mm.stl", CompareConfig(align="none", points=2000))
+    with pytest.raises(InputError, match=r"mm\.stl: is 1e\+03 times as large as .* the cloud has to be in metres"):
+        compare(tmp_path / "mm.stl", mesh, CompareConfig(align="none", points=2000))
 
 
 def test_distances_to_points_are_the_papers_formulas(mesh: Path, tmp_path: Path) -> None:
@@ -200,6 +202,8 @@ def test_settings_that_make_no_sense(mesh: Path, config: CompareConfig, told: st
 def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no truth"):
         compare(mesh, tmp_path)
+    with pytest.raises(InputError, match="as for a simulated session"):
+        compare(mesh, tmp_path, CompareConfig(with_scale=True))
     thin = write_cloud(tmp_path / "thin.ply", on_ball(20))
     with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few to align by"):
         compare(thin, mesh, CompareConfig(points=500))

@@ -25,9 +25,12 @@ def test_held_out_frames_are_spread_evenly():
     assert gaps.max() <= 11
 
 
-def test_a_split_without_held_out_frames_is_refused():
-    with pytest.raises(InputError, match="leaves 10 of 10 frames to train on and 0 to evaluate"):
-        split_frames(10, 1.0)
+@pytest.mark.parametrize(
+    ("frames", "fraction", "told"), [(10, 1.0, "is 1.0"), (10, -0.1, "is -0.1"), (1, 0.5, "leaves 0")]
+)
+def test_a_split_without_training_or_held_out_frames_is_refused(frames, fraction, told):
+    with pytest.raises(InputError, match=f"--train-split-fraction.* {told}"):
+        split_frames(frames, fraction)
 
 
 def test_the_scene_fills_the_models_cube():

@@ -51,3 +51,19 @@ def test_guard_names_the_step_and_stops_after_the_limit_in_a_row():
     guard.record(5, ["hsi_loss"], [])
     with pytest.raises(TrainingDivergedError, match="step 6"):
         guard.record(6, ["hsi_loss"], [])
+
+
+def test_mixed_precision_counts_the_steps_that_a_small_scale_skips():
+    """A large scale overflows by design; one below 1 does not."""
+    guarded, groups = optimizers()
+    scaler = GradScaler("cpu", init_scale=4.0)
+    scaler.scale(torch.zeros(()))
+    noticed = []
+    for bad in (float("inf"),) * 5 + (1.0,) * 3:
+        groups["fields"][0].grad = torch.full((3,), bad)
+        guarded.optimizer_scaler_step_some(scaler, ["fields"])
+        scaler.update()
+        noticed.append(guarded.skipped_groups)
+    # 4, 2, 1, 1/2, 1/4, 1/8: the third, fourth and fifth skipped steps, each told at the step after it.
+    assert noticed == [(), (), (), ("fields",), ("fields",), ("fields",), (), ()]
+    assert (groups["fields"][0] < 1.0).all()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from hsi_sc_nerf.config import hsi_sc_nerf
+from hsi_sc_nerf.data.atomic import write_png
 from hsi_sc_nerf.data.packed_cube import FLAGGED
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 
 
@@ -26,15 +30,20 @@ def test_spread_of_one_view_is_zero_and_nothing_else_is_touched(monkeypatch, vie
     assert metrics["sam_std"] == pytest.approx(expected, nan_ok=True)
 
 
-@pytest.fixture
-def pipeline(flagged_dataset) -> SpectralPipeline:
+def pipeline_config(data):
+    """Of a small model."""
     config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
-    config.datamanager.data = flagged_dataset
+    config.datamanager.data = data
     config.datamanager.train_num_rays_per_batch = 256
     config.model.match_resolution = False
     config.model.num_levels, config.model.log2_hashmap_size, config.model.max_res = 4, 10, 32
     config.model.num_proposal_samples_per_ray, config.model.num_nerf_samples_per_ray = (16, 8), 8
-    return config.setup(device="cpu")
+    return config
+
+
+@pytest.fixture
+def pipeline(flagged_dataset) -> SpectralPipeline:
+    return pipeline_config(flagged_dataset).setup(device="cpu")
 
 
 def test_training_does_not_see_flagged_values(pipeline):
@@ -78,3 +87,47 @@ def test_held_out_views_are_judged_by_their_measurements(pipeline):
     assert found[0] == found[1]
     del batch["valid"]
     assert pipeline.model.get_image_metrics_and_images(outputs, batch)[0]["rmse"] > 1.5 * found[0]["rmse"]
+
+
+def test_a_view_without_its_object_is_not_judged(flagged_dataset, tmp_path):
+    """It would score as perfect."""
+    data = shutil.copytree(flagged_dataset, tmp_path / "data")
+    config = pipeline_config(data)
+    config.datamanager.dataparser.train_split_fraction = 0.7
+    held_out = config.setup(device="cpu").datamanager.eval_dataset.frames
+    assert len(held_out) == 3
+    write_png(held_out[1].mask_path, np.zeros_like(held_out[1].mask(), np.uint8))
+    loader = config.setup(device="cpu").datamanager.fixed_indices_eval_dataloader
+    assert [batch["image_idx"] for _, batch in loader] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [("field.aabb", "is not the dataset"), ("mlp_head", "is not the dataset"), (None, "other settings of the model")],
+)
+def test_weights_of_another_dataset_or_model_are_refused(pipeline, changed, told):
+    state = {name: value.clone() for name, value in pipeline.state_dict().items()}
+    pipeline.load_pipeline(state, 0)
+    if changed is None:
+        del state["_model.field.aabb"]
+    for name in [name for name in state if changed is not None and changed in name]:
+        state[name] = state[name] * 1.01 if "aabb" in name else state[name][..., :-1]
+    with pytest.raises(SystemExit, match=told):
+        pipeline.load_pipeline(state, 0)
+
+
+@pytest.mark.parametrize(("groups", "told"), [(0, "take 1 at least"), (99, "has 12 bands")])
+def test_density_groups_that_there_cannot_be(flagged_dataset, groups, told):
+    config = pipeline_config(flagged_dataset)
+    config.model.head = "direct"
+    with pytest.raises((SystemExit, InputError), match=told):
+        replace(config, model=replace(config.model, density_groups=groups)).setup(device="cpu")
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_nerfstudios_rgba_pictures_are_opaque(flagged_dataset, groups):
+    config = pipeline_config(flagged_dataset)
+    config.model.head, config.model.density_groups = "direct", groups
+    rgb = torch.rand(3, 4, 3)
+    rgba = config.setup(device="cpu").model.get_rgba_image({"rgb": rgb, "accumulation": torch.zeros(3, 4, 1)})
+    torch.testing.assert_close(rgba, torch.cat([rgb, torch.ones(3, 4, 1)], -1))

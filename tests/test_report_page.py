@@ -40,8 +40,12 @@ TRAITS = {
     "size": {"area_m2": 0.0229, "volume_l": 0.25},
     "size_sd": {"area_m2": 0.0001, "volume_l": 0.002},
     "watertight": True,
-    "classes": {"areas_m2": {HOSTILE: 0.0004}, "regions": [{"label": "bruise", "area_m2": 0.0004}]},
-    "regions": {"whole": {"indices": {"NDVI": {"mean": 0.5, "sd": None}}}},
+    "classes": {"areas_m2": {HOSTILE: 0.0004, "rot_l": 0.0001}, "regions": [{"label": "bruise", "area_m2": 0.0004}]},
+    "regions": {
+        "whole": {"indices": {"NDVI": {"mean": 0.5, "sd": None}}},
+        "mean": {"area_m2": 0.0003, "indices": {"NDVI": {"mean": 0.4, "sd": 0.1}}},
+        "mean_sd": {"area_m2": 0.0002},
+    },
     "firmness": {"value": 12.5, "unit": "N", "uncertainty": 0.5},
 }
 
@@ -145,6 +149,11 @@ def test_traits_are_entries_with_their_units_and_spreads():
     assert rows[f"classes, areas, {HOSTILE}"] == ("0.0004", "", "m²")
     assert rows["classes, regions, bruise 1, area"] == ("0.0004", "", "m²")
     assert rows["regions, whole, indices, NDVI"] == ("0.5", "", "")
+    # A user's names are names, though they look like our words.
+    assert rows["classes, areas, rot_l"] == ("0.0001", "", "m²")
+    assert rows["regions, mean, area"] == ("0.0003", "", "m²")
+    assert rows["regions, mean, indices, NDVI"] == ("0.4", "0.1", "")
+    assert rows["regions, mean_sd, area"] == ("0.0002", "", "m²")
     assert rows["firmness"] == ("12.5", "0.5", "N")
     assert not any("size sd" in name for name in rows)
 

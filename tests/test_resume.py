@@ -153,10 +153,34 @@ def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp
     assert checkpoint(made.checkpoint_dir)["training"]["completed_stage"] == "masked"
 
 
+def test_a_second_stage_after_another_runs_first_is_resumed_where_it_was(tiny_dataset, tmp_path, whole):
+    """The settings alone would put its steps back into the first stage."""
+    made = longer(tiny_dataset, tmp_path / "killed", switch=15, load_dir=whole[0].base_dir / "stage-full-frame")
+    fail_in(made, made.pipeline.datamanager, "next_train", lambda step: step == SWITCH + 3)
+    resumed = longer(tiny_dataset, tmp_path / "resumed", switch=15, load_dir=made.checkpoint_dir)
+    assert SWITCH < resumed._start_step <= SWITCH + 3
+    assert resumed.plan == made.plan
+    assert resumed.plan.at(resumed._start_step).config.name == "masked"
+
+
+def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, tmp_path, whole):
+    """Though its last step may be where the first stage of the longer run would end."""
+    made = longer(
+        tiny_dataset, tmp_path, switch=STEPS, max_num_iterations=2 * STEPS, load_dir=whole[0].checkpoint_dir
+    )
+    assert made.plan.at(STEPS).config.name == "masked"
+    assert made.plan.num_iterations == SWITCH + STEPS
+    made._keep_stage_of(made._loaded)
+    assert not list(made.base_dir.glob("stage-*"))
+
+
 def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, whole):
     with pytest.raises(SystemExit, match="holds no checkpoint; --load-dir takes"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
     damaged = tmp_path / "step-000000003.ckpt"
     damaged.write_bytes(max(whole[0].checkpoint_dir.glob("*.ckpt")).read_bytes()[:1000])
     with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is no readable checkpoint"):
+        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
+    torch.save({"step": 3}, damaged)
+    with pytest.raises(SystemExit, match="is no checkpoint that hsi-sc-nerf can go on from"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)

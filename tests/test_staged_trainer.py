@@ -103,6 +103,12 @@ def test_impossible_settings_end_in_a_sentence(tiny_dataset, tmp_path, changes, 
         trainer(tiny_dataset, tmp_path, **changes)
 
 
+def test_several_devices_are_refused(tiny_dataset, tmp_path):
+    config = trainer(tiny_dataset, tmp_path).config
+    with pytest.raises(SystemExit, match="trains on one device"):
+        config.setup(local_rank=0, world_size=2).setup()
+
+
 def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()

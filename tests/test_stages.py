@@ -9,6 +9,7 @@ from hsi_sc_nerf.models.stages import (
     masked_stage,
     plan_after,
     plan_stages,
+    plan_within,
     step_seed,
 )
 
@@ -44,6 +45,8 @@ def test_a_stage_of_no_steps_is_left_out():
 def test_impossible_plans_are_refused():
     with pytest.raises(ValueError, match="exceed"):
         plan_stages((StageConfig("a", 0.5, num_iterations=10), StageConfig("b", 0.5)), 5)
+    with pytest.raises(ValueError, match="shares add up to 0"):
+        plan_stages((StageConfig("a", 0.0), StageConfig("b", 0.0)), 5)
     with pytest.raises(ValueError, match="no iterations"):
         plan_stages((StageConfig("a", 1.0),), 0)
 
@@ -102,6 +105,7 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
     [
         ({"foreground_share": 1.2}, "foreground-share 1.2"),
         ({"rim_share": -0.1}, "rim-share -0.1"),
+        ({"share": -0.5}, "share -0.5 is below 0"),
         ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
         ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
         ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),
@@ -110,7 +114,7 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
 )
 def test_impossible_stages_are_refused(fields, sentence):
     with pytest.raises(ValueError, match=f"late: .*{sentence}"):
-        StageConfig("late", 1.0, **({"learn_after": {}} | fields)).check(("fields", "camera_opt"))
+        StageConfig("late", **({"share": 1.0, "learn_after": {}} | fields)).check(("fields", "camera_opt"))
     StageConfig("late", 1.0, foreground_share=1.0).check(("fields", "camera_opt"))
 
 
@@ -127,6 +131,17 @@ def test_a_completed_stage_is_followed_by_the_next_however_long_it_was():
     assert plan_after(plan, "a", 10) == plan
     assert plan_after(plan, "c", 12) == plan
     assert plan_after(plan, "gone", 12) == plan
+
+
+def test_a_stage_that_began_elsewhere_stays_there():
+    plan = plan_stages((StageConfig("a", 1.0), StageConfig("b", 1.0), StageConfig("c", 1.0)), 30)
+    for start in (4, 25):
+        within = plan_within(plan, "b", start)
+        assert [(stage.config.name, stage.end) for stage in within.stages] == [
+            *(("a", start), ("b", start + 10), ("c", start + 20))
+        ]
+        assert within.at(start).start == start
+    assert plan_within(plan, "b", 10) == plan_within(plan, "d", 7) == plan
 
 
 def test_every_step_has_random_numbers_of_its_own():

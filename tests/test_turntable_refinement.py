@@ -134,6 +134,19 @@ def test_corrections_equal_the_corrected_cameras_rays(frame, wobbles):
     assert_moves_like(learned, poses, corrected, frame)
 
 
+@pytest.mark.parametrize("mode", LEARNING_MODES)
+def test_mixed_precision_does_not_move_rays(mode):
+    poses = session()
+    learned = refinement(poses, TRAIN, mode)
+    learn_something(learned)
+    full, mixed = rays_of(poses, 3), rays_of(poses, 3)
+    learned.apply_to_raybundle(full)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        learned.apply_to_raybundle(mixed)
+    torch.testing.assert_close(mixed.directions, full.directions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(mixed.origins, full.origins, rtol=0, atol=1e-6)
+
+
 def test_free_corrections_are_nerfstudios():
     """A turn and a shift in the scene's axes for each view; a held-out view takes its neighbours' mean."""
     poses = session()

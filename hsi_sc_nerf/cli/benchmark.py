@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.cli.steps import run_step
-from hsi_sc_nerf.data.atomic import TEMPORARY_PREFIX, write_json
+from hsi_sc_nerf.data.atomic import TEMPORARY_PREFIX, make_folder, write_json
 from hsi_sc_nerf.data.packed import TRANSFORMS_NAME, is_packed, open_packed
 from hsi_sc_nerf.data.session import is_session
 from hsi_sc_nerf.errors import InputError
@@ -89,7 +89,7 @@ class BenchmarkCommand:
         # Broken numbers cannot be read: rather let the terminal wrap.
         console.width = max(console.width, TABLE_WIDTH)
         console.print(screen_table(runs))
-        console.print(f"Everything, and the picture: {self.output_dir / 'benchmark.md'}", soft_wrap=True)
+        console.print(f"Everything, and the picture: {escape(str(self.output_dir / 'benchmark.md'))}", soft_wrap=True)
 
 
 def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[TrainedRun]:
@@ -215,9 +215,9 @@ def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
 
 def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str, Any]) -> dict[str, Any]:
     """Do a job in a process of its own; what it finds is kept as ``NAME.json`` with the job that was asked for."""
-    folder.mkdir(parents=True, exist_ok=True)
     log = folder.parent / "logs" / f"{folder.name}-{name}.log"
-    log.parent.mkdir(exist_ok=True)
+    for needed in (folder, log.parent):
+        make_folder(needed)
     with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY_PREFIX) as temporary:
         job_path, found_path = Path(temporary, "job.json"), Path(temporary, "found.json")
         write_json(job_path, asdict(doing))

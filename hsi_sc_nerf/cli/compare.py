@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
@@ -47,4 +48,5 @@ class CompareCommand:
 
         write_comparison(self.output_dir, comparison, self.cloud.name, self.reference.name)
         Console().print(*screen_tables(comparison))
-        Console().print(f"Everything, and the pictures: {self.output_dir / 'comparison.md'}", soft_wrap=True)
+        page = escape(str(self.output_dir / "comparison.md"))
+        Console().print(f"Everything, and the pictures: {page}", soft_wrap=True)

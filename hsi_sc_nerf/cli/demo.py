@@ -10,7 +10,11 @@ from pathlib import Path
 from rich.console import Console
 
 from hsi_sc_nerf.cli.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
+from hsi_sc_nerf.data.atomic import atomic_write, make_folder
 from hsi_sc_nerf.errors import InputError
+
+MARK = ".hsi-sc-nerf-demo"
+"""A file of this name tells that a folder is a demo's, whose parts may be deleted."""
 
 # Fewer rays a step than the method's default, for two cores, and schedules for a run of some hundred steps.
 DEMO_TRAINING = {
@@ -54,9 +58,12 @@ class DemoCommand:
         console = Console()
         out = self.output_dir
         logs = out / "logs"
-        if out.exists() and any(out.iterdir()) and not logs.is_dir():
+        make_folder(out)
+        if any(out.iterdir()) and not (out / MARK).is_file():
             raise InputError(f"{out}: holds something else than a demo; choose another --output-dir.")
-        logs.mkdir(parents=True, exist_ok=True)
+        make_folder(logs)
+        with atomic_write(out / MARK) as (mark,):
+            mark.write_text("What lies here belongs to `hsi-sc-nerf demo`, which replaces it.\n", encoding="utf-8")
         session, data, runs = out / "session", out / "data", out / "runs"
         for earlier in (runs, out / "renders"):
             shutil.rmtree(earlier, ignore_errors=True)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from PIL import Image
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from scipy.spatial import cKDTree
 
@@ -103,7 +104,7 @@ def show_table(
         cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
     cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")
     console.print(quality, steps_table, cost_table)
-    console.print(f"Pictures, cloud and summary.json are in {out}.")
+    console.print(f"Pictures, cloud and summary.json are in {escape(str(out))}.")
 
 
 def draw_pictures(out: Path) -> None:

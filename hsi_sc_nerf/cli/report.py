@@ -16,7 +16,7 @@ class ReportCommand:
     the training, the calibration, the masks, the poses. It opens in any browser, without a network."""
 
     run: tyro.conf.Positional[Path]
-    """Folder of the run: the one that holds config.yml."""
+    """Folder of the run, the one that holds config.yml; or that file."""
     output: Path | None = None
     """The HTML file; report.html in the run's folder where it is not given."""
     cloud: Path | None = None
@@ -39,8 +39,9 @@ class ReportCommand:
         """
         from hsi_sc_nerf.report.build import ReportSources, write_report
 
-        output = self.output or self.run / "report.html"
+        run = self.run.parent if self.run.name == "config.yml" else self.run
+        output = self.output or run / "report.html"
         sources = ReportSources(self.cloud, self.comparison, self.traits, self.views, self.points)
-        write_report(self.run, output, sources)
+        write_report(run, output, sources)
         size_mb = output.stat().st_size / 1e6
         Console().print(f"{escape(str(output))} ({size_mb:.1f} MB)", soft_wrap=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from hsi_sc_nerf.simulate.scene import load_scene, override
 
@@ -52,6 +53,6 @@ class SimulateCommand:
         written = simulate_session(scene, self.session)
         size_px, frames = scene.camera.size_px, len(load_truth(written).captures)
         Console().print(
-            f"{written}: {frames} frames of {size_px} x {size_px} pixels x {scene.sensor.bands} bands; truth in "
-            f"{written / 'truth'}."
+            f"{escape(str(written))}: {frames} frames of {size_px} x {size_px} pixels x {scene.sensor.bands} bands; "
+            f"truth in {escape(str(written / 'truth'))}."
         )

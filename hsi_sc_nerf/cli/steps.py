@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hsi_sc_nerf.errors import InputError
-
-_RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
+from hsi_sc_nerf.evaluation.benchmark.machine import peak_memory_mib
 
 
 @dataclass(frozen=True)
@@ -52,16 +51,15 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
             raise
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
-        raise InputError(f"the step '{name}' failed with status {process.returncode}; {log} tells why.")
-    return StepCost(name, time.perf_counter() - started, usage.ru_maxrss * _RSS_UNIT_BYTES / 2**20)
+        raise InputError(
+            f"the step '{name}' failed with status {process.returncode}; what it said is above and in {log}."
+        )
+    return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
 
 
 def own_cost(name: str, started: float) -> StepCost:
     """Cost of a step that ran in this process since ``started`` (`time.perf_counter`)."""
-    import resource  # not on Windows, where the other commands run
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _RSS_UNIT_BYTES / 2**20
-    return StepCost(name, time.perf_counter() - started, peak)
+    return StepCost(name, time.perf_counter() - started, peak_memory_mib())
 
 
 def nerfstudio_command(script: str) -> list[str]:

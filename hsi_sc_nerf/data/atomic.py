@@ -46,6 +46,20 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
                 source.unlink(missing_ok=True)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder and what it lies in, where they are missing.
+
+    Raises:
+        InputError: the operating system refused, or something else has that name.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be made a folder ({error.strerror or error}); choose another one."
+        ) from error
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` as readable JSON, whole or not at all.
 

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import tyro
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 
@@ -28,6 +30,17 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     """Rays of an evaluation step during training."""
     seed: int = 0
     """Seed of the random pixels."""
+    # Pixels are read from the cubes on disk one by one: these options of nerfstudio's have nothing to act on.
+    camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
+    images_on_gpu: tyro.conf.Suppress[bool] = False
+    masks_on_gpu: tyro.conf.Suppress[bool] = False
+    patch_size: tyro.conf.Suppress[int] = 1
+    pixel_sampler: tyro.conf.Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
+    train_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
+    train_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
+    eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
+    eval_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
+    eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = (0,)
 
 
 class SpectralDataManager(VanillaDataManager[SpectralDataset]):
@@ -63,8 +76,12 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         """Open the held-out cubes."""
         self.eval_pixel_sampler = self._pixels(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        # A view in which the object was not found has nothing to be judged by: it would score as perfect.
+        judged = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
-            input_dataset=self.eval_dataset, device=self.device
+            input_dataset=self.eval_dataset,
+            image_indices=tuple(judged or range(len(self.eval_dataset))),
+            device=self.device,
         )
         # Pictures in the logs show the same view every time, so that they can be compared.
         self.eval_dataloader = FixedIndicesEvalDataloader(  # type: ignore[assignment]

@@ -108,13 +108,16 @@ class SpectralDataParser(DataParser):
 def split_frames(num_frames: int, train_fraction: float) -> tuple[np.ndarray, np.ndarray]:
     """Indices of training and held-out frames, the latter spread evenly (nerfstudio's "fraction" split).
 
-    A session of few frames still holds one out; a fraction of 1 holds none out and is refused.
+    A session of few frames still holds one out.
 
     Raises:
-        InputError: no frame would be left on one of the two sides.
+        InputError: the fraction is none, or no frame would be left on one of the two sides.
     """
-    if train_fraction < 1.0:
-        train_fraction = min(train_fraction, (num_frames - 1) / num_frames)
+    if not 0.0 < train_fraction < 1.0:
+        raise InputError(
+            f"--train-split-fraction is {train_fraction}; it has to be more than 0, and less than 1 to hold some out."
+        )
+    train_fraction = min(train_fraction, (num_frames - 1) / num_frames)
     train, held_out = get_train_eval_split_fraction([Path(str(i)) for i in range(num_frames)], train_fraction)
     if len(train) == 0 or len(held_out) == 0:
         raise InputError(

@@ -123,15 +123,15 @@ def compare(
             that features do not say how it lies.
     """
     config = config or CompareConfig()
-    _check(config)
     is_session = Path(reference_path).is_dir()
+    alignment: Alignment = config.align or ("none" if is_session else "features")
+    _check(config, alignment)
     reference, seen = (
         _true_surface(Path(reference_path), config, track)
         if is_session
         else (_shape(Path(reference_path), config, METRES[config.reference_unit]), None)
     )
     cloud = _shape(Path(cloud_path), config, 1.0)
-    alignment: Alignment = config.align or ("none" if is_session else "features")
     _check_sizes(cloud_path, cloud, reference_path, reference, alignment, config)
     registration = _registered(cloud_path, cloud, reference_path, reference, alignment, config, track)
     if registration is not None:
@@ -155,7 +155,7 @@ def compare(
     )
 
 
-def _check(config: CompareConfig) -> None:
+def _check(config: CompareConfig, alignment: Alignment) -> None:
     for option, value in {
         "--threshold-m": config.threshold_m,
         "--largest-threshold-m": config.largest_threshold_m,
@@ -164,9 +164,10 @@ def _check(config: CompareConfig) -> None:
             raise InputError(f"{option} is {value}; it must be more than 0.")
     if config.points < FEWEST_POINTS:
         raise InputError(f"--points is {config.points}; {FEWEST_POINTS} are needed at least.")
-    if config.with_scale and config.align == "none":
+    if config.with_scale and alignment == "none":
         raise InputError(
-            "--with-scale changes the cloud's size while it is aligned, but --align is none; choose one."
+            "--with-scale changes the cloud's size while it is aligned, but --align is none (as for a simulated "
+            "session where it is not given); choose one, such as --align icp."
         )
 
 
@@ -224,9 +225,12 @@ def _check_sizes(
     ratio = robust_radius(reference.points_m) / max(robust_radius(cloud.points_m), 1e-12)
     # What is scaled by features may be of any size.
     if not (config.with_scale and alignment == "features") and not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
+        larger, smaller, times = (
+            (reference_path, cloud_path, ratio) if ratio > 1.0 else (cloud_path, reference_path, 1.0 / ratio)
+        )
         raise InputError(
-            f"{reference_path}: is {ratio:.3g} times as large as {cloud_path}; give its unit (--reference-unit), or "
-            "align with a scale (--align features --with-scale)."
+            f"{larger}: is {times:.3g} times as large as {smaller}; the cloud has to be in metres, the reference in "
+            f"{config.reference_unit} (--reference-unit), or align with a scale (--align features --with-scale)."
         )
 
 

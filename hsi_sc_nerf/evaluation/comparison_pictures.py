@@ -33,14 +33,14 @@ def distance_colours(distances_m: Float[np.ndarray, "n"], limit_m: float) -> UIn
 
 
 @rc_context(_STYLE)
-def draw_curves(path: Path, curves: ThresholdCurves, best_m: float, threshold_m: float) -> None:
+def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], chosen: tuple[float, float]) -> None:
     """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
 
     Args:
         path: The PNG file.
         curves: What to draw.
-        best_m: The knee of the F-score's curve.
-        threshold_m: The threshold that was asked for.
+        knee: Threshold (metres) and F-score (percent) of the curve's knee.
+        chosen: Of the threshold that was asked for, which may lie beyond the curves.
     """
     figure = _figure(6.0, 3.4)
     axes = figure.subplots()
@@ -48,14 +48,13 @@ def draw_curves(path: Path, curves: ThresholdCurves, best_m: float, threshold_m:
     drawn = {"precision": curves.precision, "recall": curves.recall, "F-score": curves.f_score}
     for (name, values), colour in zip(drawn.items(), _COLOURS, strict=False):
         axes.plot(millimetres, values, color=colour, linewidth=2.2 if name == "F-score" else 1.3, label=name)
-    for place_m, name, line in ((best_m, "knee", "--"), (threshold_m, "chosen", ":")):
-        score = np.interp(place_m, curves.thresholds_m, curves.f_score)
+    for (place_m, score), name, line in ((knee, "knee", "--"), (chosen, "chosen", ":")):
         label = f"{name}: {1000 * place_m:.2f} mm, F-score {score:.1f} %"
         axes.axvline(1000 * place_m, color="black", linestyle=line, linewidth=1.1, label=label)
     axes.set(
         xlabel="distance threshold (mm)",
         ylabel="%",
-        xlim=(0, max(millimetres[-1], 1000 * threshold_m)),
+        xlim=(0, max(millimetres[-1], 1000 * chosen[0])),
         ylim=(0, 102),
     )
     axes.legend(loc="lower right")

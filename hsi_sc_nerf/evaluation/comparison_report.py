@@ -118,7 +118,11 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
     figures = summary(comparison)
     with atomic_write(*(folder / name for name in names)) as (page, numbers, curves, pictures, cloud):
         write_json(numbers, {"cloud": cloud_name, "reference": reference_name, **figures})
-        draw_curves(curves, comparison.curves, comparison.best_threshold_m, comparison.config.threshold_m)
+        knee, chosen = (
+            (figures["scores"][name]["threshold_m"], figures["scores"][name]["f_score"])
+            for name in ("knee", "chosen")
+        )
+        draw_curves(curves, comparison.curves, knee, chosen)
         shapes = [
             ("cloud", comparison.cloud.points_m, comparison.to_reference_m),
             ("reference", comparison.reference.points_m, comparison.to_cloud_m),

@@ -62,7 +62,12 @@ class BandGroupSum(nn.Module):
 
     Args:
         sizes: bands of each group.
+
+    Attributes:
+        background_color: as `WeightedSum.background_color`.
     """
+
+    background_color = "black"
 
     def __init__(self, sizes: Sequence[int]) -> None:
         super().__init__()

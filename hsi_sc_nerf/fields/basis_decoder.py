@@ -6,7 +6,6 @@ as compositing decoded spectra, with far fewer numbers a sample.
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -31,7 +30,3 @@ class BasisDecoder(nn.Module):
     def forward(self, coefficients: Float[Tensor, "*rays rank"]) -> Float[Tensor, "*rays bands"]:
         """Spectra of (composited) coefficients."""
         return coefficients @ self.basis.T
-
-    def project(self, spectra: Float[Tensor, "*rays bands"]) -> Float[Tensor, "*rays rank"]:
-        """Coefficients of the spectra of the basis that are nearest to these (least squares)."""
-        return spectra @ torch.linalg.pinv(self.basis).T

@@ -164,7 +164,8 @@ class SpectralField(NerfactoField):
             inputs.insert(0, encoded.expand(*density_embedding.shape[:-1], -1))
         if self.embedding_appearance is not None:
             inputs.append(self._appearance(ray_samples).expand(*density_embedding.shape[:-1], -1))
-        outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1))
+        # tiny-cuda-nn's networks emit half precision, and this one takes what it was made with.
+        outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
         return outputs
 
     def _appearance(self, ray_samples: RaySamples) -> Float[Tensor, "#rays #samples embedding"]:

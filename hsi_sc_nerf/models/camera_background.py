@@ -110,10 +110,6 @@ class CameraBackground(nn.Module):
             size = (-(-side // self._cells_per_correction) for side in (lines, samples))
             self.correction = nn.Parameter(torch.zeros(*map(int, size), bands))
 
-    def freeze(self, frozen: bool) -> None:
-        """Stop or go on learning, at the start of a stage; what was learned stays in force."""
-        self.requires_grad_(not frozen)
-
     def forward(
         self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
     ) -> Float[Tensor, "*rays bands"]:

@@ -13,6 +13,9 @@ import torch
 
 from hsi_sc_nerf.errors import InputError
 
+CONTENT = {"step", "pipeline", "optimizers", "scalers", "training"}
+"""What the staged trainer's checkpoints hold, beside what nerfstudio's commands expect."""
+
 
 def allow_nerfstudio_checkpoints() -> None:
     """Name the NumPy types that nerfstudio 1.1.5 puts into its checkpoints as safe.
@@ -91,12 +94,15 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint to the CPU.
+    """Read a checkpoint of the staged trainer to the CPU.
 
     Raises:
-        InputError: the file is damaged, missing or no checkpoint.
+        InputError: the file is damaged, missing or no such checkpoint.
     """
     try:
-        return torch.load(path, map_location="cpu")
+        state = torch.load(path, map_location="cpu")
     except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
         raise InputError(f"{path}: is no readable checkpoint ({error}); take an earlier one.") from error
+    if not isinstance(state, dict) or not state.keys() >= CONTENT:
+        raise InputError(f"{path}: is no checkpoint that hsi-sc-nerf can go on from; train anew.")
+    return state

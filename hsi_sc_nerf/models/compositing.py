@@ -11,7 +11,12 @@ class WeightedSum(nn.Module):
     """Composite what the field emits, spectra or coefficients, and nothing behind it.
 
     Takes the place of nerfstudio's renderer of colours, which clamps and knows colours of backgrounds only.
+
+    Attributes:
+        background_color: nerfstudio's exporters of textures ask for it; pictures of whole rays are opaque.
     """
+
+    background_color = "black"
 
     def forward(
         self, rgb: Float[Tensor, "*rays samples channels"], weights: Float[Tensor, "*rays samples 1"]

@@ -31,11 +31,19 @@ class GuardedOptimizers(Optimizers):
     """
 
     skipped_groups: tuple[str, ...] = ()
+    _scale: float = 1.0
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Step the optimisers of ``param_groups``, or none of them."""
+        """Step the optimisers of ``param_groups``, or none of them.
+
+        With mixed precision the scaler skips steps itself, each optimiser's by itself, and halves its scale: that is
+        by design as long as the scale is large, and a skipped step like any other once it is below 1. It is noticed
+        at the step after it.
+        """
         if grad_scaler.is_enabled():
-            # Scaled gradients overflow now and then by design; the scaler skips those steps itself.
+            scale = grad_scaler.get_scale()
+            self.skipped_groups = tuple(param_groups) if scale < min(1.0, self._scale) else ()
+            self._scale = scale
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
         gradients = {
@@ -79,6 +87,7 @@ class NonFiniteGuard:
         sentence = f"step {step} skipped: {', '.join(culprits)} not finite"
         if self.in_a_row >= self.limit:
             raise TrainingDivergedError(
-                f"{sentence}, the {self.in_a_row}th in a row; lower the learning rate, or look for damaged frames"
+                f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate, or look for "
+                "damaged frames"
             )
         return sentence

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,9 @@ from torch import Tensor
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.models.training_log import draw_spectra
 from hsi_sc_nerf.models.weight_average import WeightAverage
+
+# Buffers that place the scene in the model: weights mean nothing in another box.
+_PLACES = ("aabb", "axis_origin")
 
 
 @dataclass
@@ -32,6 +36,29 @@ class SpectralPipeline(VanillaPipeline):
 
     datamanager: SpectralDataManager
     weight_average: WeightAverage | None = None
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint's weights, if they belong to these settings and to the dataset as it is.
+
+        nerfstudio would load what fits and leave the rest; a scene box that moved since training would fit.
+        """
+        own = self.state_dict()
+        unlike = own.keys() ^ loaded_state.keys()
+        if unlike:
+            raise SystemExit(
+                "hsi-sc-nerf: the checkpoint was made with other settings of the model "
+                f"({', '.join(sorted(unlike)[:3])}); take those of the config.yml beside it."
+            )
+        if any(
+            value.shape != loaded_state[name].shape
+            or (name.rpartition(".")[2] in _PLACES and not torch.equal(value.cpu(), loaded_state[name].cpu()))
+            for name, value in own.items()
+        ):
+            raise SystemExit(
+                f"hsi-sc-nerf: {self.datamanager.get_datapath()} is not the dataset that the checkpoint was trained "
+                "on, or was processed anew since; train again, or process it with the settings of that time."
+            )
+        super().load_pipeline(loaded_state, step)
 
     def averaged(self) -> AbstractContextManager[None]:
         """The model has its averaged weights within this context, where there are any."""
@@ -77,6 +104,7 @@ class SpectralPipeline(VanillaPipeline):
         """
         with self.averaged():
             metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
-        if get_std and len(data_loader) == 1:
+        # nerfstudio's loader counts all views of its dataset, whichever it is to give.
+        if get_std and len(getattr(data_loader, "image_indices", data_loader)) == 1:
             metrics |= dict.fromkeys((name for name in metrics if name.endswith("_std")), 0.0)
         return metrics

@@ -106,8 +106,10 @@ class PoseRefinement(CameraOptimizer):
             return
         frames = raybundle.metadata[FRAME_INDEX][..., 0].long()
         rotations = raybundle.metadata[CAMERA_ROTATION].reshape(*frames.shape, 3, 3)
-        turns, raybundle.origins = self.corrections(frames, rotations, raybundle.origins)
-        raybundle.directions = torch.einsum("...ij,...j->...i", turns, raybundle.directions)
+        # Half precision would move the rays by tenths of a millimetre.
+        with torch.autocast(raybundle.origins.device.type, enabled=False):
+            turns, raybundle.origins = self.corrections(frames, rotations, raybundle.origins)
+            raybundle.directions = torch.einsum("...ij,...j->...i", turns, raybundle.directions)
 
     def forward(self, indices: Int[Tensor, "n"]) -> Float[Tensor, "n 3 4"]:
         """What nerfstudio's viewer moves the training cameras by that it draws: nothing, they stay as measured."""

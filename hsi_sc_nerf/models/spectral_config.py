@@ -98,6 +98,10 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Refinement of the measured poses."""
 
     def __post_init__(self) -> None:
+        if self.density_groups < 1:
+            raise SystemExit(
+                f"hsi-sc-nerf: --pipeline.model.density-groups is {self.density_groups}; take 1 at least."
+            )
         if self.head == "basis" and (self.background == "last-sample" or self.density_groups > 1):
             raise SystemExit(
                 "hsi-sc-nerf: --pipeline.model.head basis goes neither with the background last-sample nor with "

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from hsi_sc_nerf.data.cameras import CAMERA_ROTATION
 from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
 from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
@@ -85,6 +86,11 @@ class SpectralModel(NerfactoModel):
             own = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
         if self.subspace is not None:
             own["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
+        if config.density_groups > len(self.wavelengths_nm):
+            raise InputError(
+                f"--pipeline.model.density-groups is {config.density_groups}, but the dataset has "
+                f"{len(self.wavelengths_nm)} bands; take fewer groups."
+            )
         if config.density_groups > 1:
             own["num_groups"] = config.density_groups
         self.field = (SpectralField if config.density_groups == 1 else BandGroupField)(

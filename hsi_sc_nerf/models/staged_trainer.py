@@ -13,6 +13,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.errors import InputError
@@ -34,6 +35,7 @@ from hsi_sc_nerf.models.stages import (
     masked_stage,
     plan_after,
     plan_stages,
+    plan_within,
     step_seed,
 )
 from hsi_sc_nerf.models.training_log import stage_summary
@@ -47,9 +49,9 @@ class StagedTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: StagedTrainer)
     full_frame: StageConfig = field(default_factory=full_frame_stage)
-    """First stage: whole frames."""
+    """First stage: whole frames, the object and its rim more often than the rest."""
     masked: StageConfig = field(default_factory=masked_stage)
-    """Second stage: the masked object."""
+    """Second stage: the masked object, and what lies beside it."""
     ema_decay: float | None = None
     """Evaluate, save and export the average of the weights over the last steps instead of the last step's weights,
     which still jitter with the random pixels. 0.99 averages over about 100 steps, beginning anew in each stage. None:
@@ -73,6 +75,9 @@ class StagedTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as nerfstudio does, then place the stages."""
+        if self.world_size > 1:
+            # Rays and random numbers follow from the step: every process would train on the same.
+            raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
         stages = (self.config.full_frame, self.config.masked)
         try:
             for stage in stages:
@@ -87,6 +92,7 @@ class StagedTrainer(Trainer):
         self._steps_since_update = 0
         self._saved_step: int | None = None
         self._loaded: Path | None = None
+        self._completed: str | None = None
         self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
         try:
             super().setup(test_mode)
@@ -151,7 +157,7 @@ class StagedTrainer(Trainer):
             self.pipeline.weight_average.update(step - stage.start + 1)
         complaint = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
         if complaint is not None:
-            CONSOLE.print(f"[yellow]{complaint}")
+            CONSOLE.print(f"[yellow]{escape(complaint)}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for group, rate in rates.items():  # named as nerfstudio names those of its schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
@@ -199,7 +205,7 @@ class StagedTrainer(Trainer):
         """Keep the stage that a loaded checkpoint completed, where its run was killed before it did so itself."""
         stage = self.plan.at(self._start_step - 1)
         kept = loaded.resolve().parents[1] / f"stage-{stage.config.name}" / loaded.name
-        if self._start_step == stage.end and not kept.exists():
+        if self._completed == stage.config.name and self._start_step == stage.end and not kept.exists():
             self._keep(stage)
 
     def _keep(self, stage: Stage) -> None:
@@ -243,6 +249,7 @@ class StagedTrainer(Trainer):
             "schedulers": {},
             "scalers": self.grad_scaler.state_dict(),
             "training": {
+                "stage": {"name": stage.config.name, "start": stage.start},
                 "completed_stage": stage.config.name if step == stage.end - 1 else None,
                 "steps_since_update": self._steps_since_update,
                 "weights": {} if average is None else average.weights(),
@@ -268,26 +275,30 @@ class StagedTrainer(Trainer):
         else:
             return
         state = read_checkpoint(path)
-        unlike = set(state["pipeline"]) ^ set(self.pipeline.state_dict())
-        if unlike or set(state["optimizers"]) != set(self.optimizers.optimizers):
-            raise InputError(
-                f"{path}: was made with other settings of the model ({', '.join(sorted(unlike)[:3])}); take those of "
-                "the config.yml beside it."
-            )
         self._start_step = state["step"] + 1
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        unlike = set(state["optimizers"]) ^ set(self.optimizers.optimizers)
+        if unlike:
+            raise InputError(
+                f"{path}: was made with other parameter groups ({', '.join(sorted(unlike))}); take the settings of "
+                "the config.yml beside it."
+            )
         if self.pipeline.weight_average is not None:
             self.pipeline.weight_average.restart()
         self.optimizers.load_optimizers(state["optimizers"])
-        self.grad_scaler.load_state_dict(state["scalers"])
-        training = state.get("training", {})
-        if training.get("weights"):
+        if state["scalers"]:  # empty where training was not in mixed precision
+            self.grad_scaler.load_state_dict(state["scalers"])
+        training = state["training"]
+        if training["weights"]:
             self.pipeline.load_state_dict(training["weights"], strict=False)
-        self._steps_since_update = training.get("steps_since_update", 0)
-        if training.get("completed_stage") is not None:
-            self.plan = plan_after(self.plan, training["completed_stage"], self._start_step)
+        self._steps_since_update = training["steps_since_update"]
+        # Another run's first stage may have been longer or shorter than this run's would be.
+        self.plan = plan_within(self.plan, **training["stage"])
+        self._completed = training["completed_stage"]
+        if self._completed is not None:
+            self.plan = plan_after(self.plan, self._completed, self._start_step)
         self._loaded = path
-        CONSOLE.print(f"Going on from {path}")
+        CONSOLE.print(f"Going on from {escape(str(path))}", soft_wrap=True)
 
 
 def _flush_logs() -> None:

@@ -18,7 +18,8 @@ from hsi_sc_nerf import paper
 
 @dataclass
 class StageConfig:
-    """One stage of training. Parameter groups are those of --optimizers: fields, proposal_networks, camera_opt."""
+    """One stage of training. Parameter groups are those of --optimizers: fields, proposal_networks, camera_opt,
+    basis, background."""
 
     name: str
     """Shown in the progress bar, and the name of the stage's checkpoint folder."""
@@ -69,6 +70,8 @@ class StageConfig:
         for option, share in shares.items():
             if share is not None and not 0.0 <= share <= 1.0:
                 raise ValueError(f"{self.name}: {option} {share} is not between 0 and 1")
+        if self.share < 0.0:
+            raise ValueError(f"{self.name}: share {self.share} is below 0")
         factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
         factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
         for option, factor in factors.items():
@@ -170,13 +173,23 @@ def plan_after(plan: StagePlan, completed: str, next_step: int) -> StagePlan:
     names = [stage.config.name for stage in plan.stages]
     if completed not in names[:-1]:
         return plan
-    position = names.index(completed)
-    done = plan.stages[position]
-    shift = next_step - done.end
-    later = (
-        replace(stage, start=stage.start + shift, end=stage.end + shift) for stage in plan.stages[position + 1 :]
-    )
-    return StagePlan((replace(done, start=min(done.start, next_step - 1), end=next_step), *later))
+    return plan_within(plan, names[names.index(completed) + 1], next_step)
+
+
+def plan_within(plan: StagePlan, name: str, start: int) -> StagePlan:
+    """The plan of a run whose stage ``name`` began at the step ``start``, as after another run's first stage.
+
+    That stage and those after it keep the lengths that ``plan`` gives them; the one before it ends where it begins.
+    Where ``plan`` has no such stage, it stays as it is.
+    """
+    names = [stage.config.name for stage in plan.stages]
+    if name not in names or start == plan.stages[names.index(name)].start:
+        return plan
+    position = names.index(name)
+    shift = start - plan.stages[position].start
+    before = (replace(stage, start=min(stage.start, start - 1), end=start) for stage in plan.stages[:position][-1:])
+    later = (replace(stage, start=stage.start + shift, end=stage.end + shift) for stage in plan.stages[position:])
+    return StagePlan((*before, *later))
 
 
 def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> StagePlan:
@@ -197,6 +210,8 @@ def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> Stag
             "latter, or give every stage its own"
         )
     weight = sum(config.share for config in sharing)
+    if sharing and left > 0 and not weight > 0.0:
+        raise ValueError("the stages' shares add up to 0: one of them has to be more")
     stages: list[Stage] = []
     start, shared = 0, 0.0
     for config in configs:

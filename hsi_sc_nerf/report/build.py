@@ -165,5 +165,7 @@ def _settings(folder: Path) -> Section:
     from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
 
     config = yaml.load((folder / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
-    defaults = flat_settings(all_methods[config.method_name])
+    # A run may have a name of its own (--method-name); then every setting is shown.
+    method = all_methods.get(config.method_name)
+    defaults = {} if method is None else flat_settings(method)
     return settings_section(flat_settings(config), defaults, describe_machine() | package_versions())

@@ -12,6 +12,8 @@ from hsi_sc_nerf.report.blocks import Block, Folded, Missing, Section, Table
 
 _UNITS = {"m": "m", "m2": "m²", "l": "L", "rad": "rad", "deg": "°", "nm": "nm", "percent": "%"}
 _COMMAND = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
+# What the user named: keys in these are no words of ours, whatever they end in or hold.
+_NAMES_IN = ("regions", "areas_m2", "mixture_areas_m2")
 # How traits were measured is no trait.
 _NOT_SHOWN = ("settings", "version")
 
@@ -54,44 +56,49 @@ def _lists_mappings(content: Any) -> bool:
     return isinstance(content, list) and any(isinstance(part, Mapping) for part in content)
 
 
-def trait_rows(content: Any, path: tuple[str, ...] = (), spread: Any = None) -> Iterator[Row]:
+def trait_rows(
+    content: Any, words: tuple[str, ...] = (), unit: str = "", spread: Any = None, named: bool = False
+) -> Iterator[Row]:
     """Name, value, uncertainty and unit of everything in nested JSON.
 
     An entry is a mapping with ``value`` (and perhaps ``uncertainty``, ``unit``, ``name``) or with ``mean`` and
     ``sd``, or it is a bare value. What a mapping has under ``KEY_sd`` is the spread of what it has under ``KEY``. A
-    bare value's unit is the end of its key. What is null is left out.
+    value's unit is the end of the innermost key that ends in one. What is null is left out.
 
     Args:
         content: the JSON.
-        path: keys that lead to it.
+        words: that lead to it.
+        unit: of what leads to it.
         spread: of the same shape as ``content``, or None.
+        named: whether the keys of ``content`` are names that the user gave to regions and classes.
     """
-    if isinstance(content, Mapping) and content.keys() & {"value", "mean"}:
+    if named:
+        for name, part in content.items():
+            yield from trait_rows(part, (*words, name), unit)
+    elif isinstance(content, Mapping) and content.keys() & {"value", "mean"}:
         value, sd = content.get("value", content.get("mean")), content.get("uncertainty", content.get("sd"))
-        name = str(content.get("name", _words(path)))
-        yield name, _text(value), _text(sd), str(content.get("unit", _unit(path)))
+        name = str(content.get("name", ", ".join(words)))
+        yield name, _text(value), _text(sd), str(content.get("unit", unit))
     elif isinstance(content, Mapping):
         for key, part in content.items():
             if not (key.endswith("_sd") and key.removesuffix("_sd") in content):
                 inner = spread.get(key) if isinstance(spread, Mapping) else content.get(f"{key}_sd")
-                yield from trait_rows(part, (*path, key), inner)
+                word, own = _split(key)
+                holds_names = key in _NAMES_IN and isinstance(part, Mapping)
+                yield from trait_rows(part, (*words, word), own or unit, inner, holds_names)
     elif _lists_mappings(content):
         for number, part in enumerate(content, start=1):
             label = f"{part['label']} {number}" if isinstance(part, Mapping) and "label" in part else str(number)
-            yield from trait_rows(part, (*path, label))
+            yield from trait_rows(part, (*words, label), unit)
     elif content is not None:
-        yield _words(path), _text(content), _text(spread), _unit(path)
+        yield ", ".join(words), _text(content), _text(spread), unit
 
 
-def _unit(path: tuple[str, ...]) -> str:
-    """Of the innermost key that ends in one."""
-    return next((unit for key in reversed(path) if (unit := _UNITS.get(key.rpartition("_")[2]))), "")
-
-
-def _words(path: tuple[str, ...]) -> str:
-    """Keys as words, without their units."""
-    names = (key.rpartition("_")[0] if key.rpartition("_")[2] in _UNITS and "_" in key else key for key in path)
-    return ", ".join(name.replace("_", " ") for name in names)
+def _split(key: str) -> tuple[str, str]:
+    """A key as words, and the unit that it ends in."""
+    stem, _, end = key.rpartition("_")
+    word, unit = (stem, _UNITS[end]) if stem and end in _UNITS else (key, "")
+    return word.replace("_", " "), unit
 
 
 def _text(value: Any) -> str:

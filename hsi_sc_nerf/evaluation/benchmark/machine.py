@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from resource import struct_rusage
 
 _PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
+_RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
 def available_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def peak_memory_mib(usage: struct_rusage | None = None) -> float:
+    """The most memory that a process held at once; without its ``usage``, of this one."""
+    import resource  # not on Windows, where the commands that measure no memory run
+
+    usage = usage or resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_maxrss * _RSS_UNIT_BYTES / 2**20
 
 
 def describe_machine() -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 import traceback
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.evaluation.benchmark.configurations import training_config
+from hsi_sc_nerf.evaluation.benchmark.machine import peak_memory_mib
 from hsi_sc_nerf.evaluation.benchmark.timing import (
     Clock,
     TrainingClock,
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _REHEARSAL_ITERATIONS = 20
 _REHEARSAL_SHARE = 0.05
-_RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 _RENDERING_SPEEDS = ("num_rays_per_sec", "fps")
 
 
@@ -151,7 +150,7 @@ def train(job: Job) -> dict[str, Any]:
 
     def evaluate(step: int) -> None:
         with clock.paused() as (wall, cpu):
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _RSS_UNIT_BYTES / 2**20
+            peak = peak_memory_mib()
             before = time.perf_counter()
             metrics = trainer.pipeline.get_average_image_metrics(views, "eval", step, get_std=True)
             found.append(
