@@ -99,7 +99,11 @@ class FakeServer:
             remove_pointer_callback=lambda: setattr(self, "pointer", None),
             add_icosphere=lambda name, **sphere: self.points.update({name: sphere}),
         )
+        self.opened = []
         self.gui = SimpleNamespace(add_markdown=lambda content, image_root: SimpleNamespace(content=content))
+
+    def on_client_connect(self, callback):
+        self.opened.append(callback)
 
     def get_clients(self):
         return {0: self.client}
@@ -237,6 +241,20 @@ def test_the_camera_stands_where_a_view_was_taken_and_sees_all_of_it(attached, p
     aspect = 0.5
     half = math.tan(TrainingViews(pipeline.datamanager.train_dataset).vertical_fov(view, aspect) / 2.0)
     assert half * aspect == pytest.approx(float(frame.width / 2 / frame.fx))
+
+
+def test_a_browser_that_opens_stands_at_the_first_view_and_turns_around_the_object(attached, pipeline):
+    _, server, _ = attached
+    (opened,) = server.opened
+    opened(server.client)
+    frame = pipeline.datamanager.train_dataset.cameras[0]
+    np.testing.assert_allclose(server.moved_camera().camera_to_worlds[0], frame.camera_to_worlds, atol=1e-5)
+    ahead = torch.from_numpy((server.camera.look_at - server.camera.position) / 10.0).float()
+    torch.testing.assert_close(ahead / ahead.norm(), -frame.camera_to_worlds[:, 2], rtol=0, atol=1e-5)
+    middle = pipeline.datamanager.train_dataset.metadata["object_box"].mean(0)
+    looked_at = frame.camera_to_worlds[:, 3] + ahead
+    # The nearest point of the optical axis.
+    assert (middle - looked_at) @ ahead == pytest.approx(0.0, abs=1e-4)
 
 
 def test_the_angle_is_zero_for_the_measured_view_and_blank_elsewhere(attached, pipeline):

@@ -37,11 +37,27 @@ from hsi_sc_nerf.viewer.training_views import TrainingViews
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
+    from viser import ClientHandle
 
 Outputs = dict[str, Tensor]
 
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
+
+
+class BrowserControl(ViewerControl):
+    """nerfstudio's access to the viewer, which also tells of each browser that opens it.
+
+    Args:
+        opened: called with the browser. Left alone, its camera would stand inside the object.
+    """
+
+    def __init__(self, opened: Callable[[ClientHandle], None]) -> None:
+        self._opened = opened
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        viewer.viser_server.on_client_connect(self._opened)
 
 
 class SpectralPanel(torch.nn.Module):
@@ -89,7 +105,7 @@ class SpectralPanel(torch.nn.Module):
             hint="A click shows the spectrum of a point; until this is off again, the mouse does not move the camera",
         )
         self.spectrum = ViewerMarkdown()
-        self.control = ViewerControl()
+        self.control = BrowserControl(lambda client: self._place(client, 0))
 
     def render(self, camera: Cameras, render: Callable[[Cameras], Outputs]) -> Outputs:
         """Render a camera; a viewer's with the pictures that the controls ask for in place of whole spectra.
@@ -192,17 +208,26 @@ class SpectralPanel(torch.nn.Module):
 
     def _stand_at(self, view: int) -> None:
         """Put the cameras of all browsers where a training view was taken."""
+        viewer = self._viewer()
+        assert viewer is not None
+        for client in viewer.viser_server.get_clients().values():
+            self._place(client, view)
+
+    def _place(self, client: ClientHandle, view: int) -> None:
+        """Put a browser's camera where a training view was taken; dragging then turns it around the object."""
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
         viewer = self._viewer()
         assert viewer is not None
         views = _training_views(viewer)
         rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
-        for client in viewer.viser_server.get_clients().values():
-            with client.atomic():
-                client.camera.position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
-                client.camera.wxyz = rotation.wxyz
-                client.camera.fov = views.vertical_fov(view, client.camera.aspect)
+        place = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
+        ahead = rotation.as_matrix()[:, 2] * views.distance(view) * VISER_NERFSTUDIO_SCALE_RATIO
+        with client.atomic():
+            client.camera.position = place
+            client.camera.look_at = place + ahead
+            client.camera.wxyz = rotation.wxyz
+            client.camera.fov = views.vertical_fov(view, client.camera.aspect)
 
     def _switch_picking(self, checkbox: ViewerCheckbox) -> None:
         if checkbox.value:

@@ -44,6 +44,11 @@ class TrainingViews:
         assert metadata is not None
         return {name: values.to(device) for name, values in metadata.items()}
 
+    def distance(self, view: int) -> float:
+        """How far before a view's camera the object's middle lies, scene units."""
+        to_object = self.dataset.metadata["object_box"].mean(dim=0) - self.centres[view]
+        return float(-to_object @ self.rotations[view][:, 2])
+
     def vertical_fov(self, view: int, aspect: float) -> float:
         """Vertical field of view (radians) of a window, ``aspect`` times as wide as high, that shows a whole view."""
         lens, _ = self._lens(view)
