@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.calibrated_frames import pack_frames
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig, LampDriftConfig
 from hsi_sc_nerf.data.calibration.lamp_drift import LampDrift
 from hsi_sc_nerf.data.calibration.session import SessionCalibration, calibrate_session
-from hsi_sc_nerf.data.envi import open_cube, write_cube
+from hsi_sc_nerf.data.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed_cube import unpack
@@ -154,6 +155,63 @@ def test_without_corrections_the_same_session_is_wrong(odd, tmp_path):
     # Six percent darker, and redder.
     assert np.nanmax(ratio) > 1.15
     assert np.abs(np.nanmedian(ratio) - 1.06) < 0.02
+
+
+def leave_gaps(cube: Cube, gap: float, dtype: str) -> None:
+    """Write a cube again with no data in two whole pixels and in one reading of two thousand."""
+    counts = cube.read().astype(dtype)
+    missing = np.random.default_rng(counts.sum().astype(int)).random(counts.shape) < 5e-4
+    missing[len(counts) // 2, 36] = missing[0, 3] = True
+    counts[missing] = gap
+    ignored = {} if np.isnan(gap) else {"data ignore value": int(gap)}
+    write_cube(
+        cube.header_path,
+        counts,
+        wavelengths_nm=cube.wavelengths_nm,
+        interleave=cube.interleave,
+        data_suffix=cube.data_path.suffix,
+        extra_header={"tint": cube.integration_time_ms, **ignored},
+    )
+
+
+@pytest.mark.parametrize(
+    ("gap", "dtype", "saturation"),
+    [
+        (65_535, "uint16", ["{saturation: {exposure_factor: 1.6}}"]),
+        (65_535, "uint16", []),
+        (np.nan, "float32", ["{saturation: {exposure_factor: 1.6}}"]),
+    ],
+)
+def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtype, saturation):
+    effects = ["{lamp_drift: {percent: -6}}", *saturation, *NOISE]
+    scene = override(load_scene("pear"), size_px=72, bands=24, frames=6, effects=effects)
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    whole = calibrate_session(session, CalibrationConfig())
+    for capture in session.captures:
+        leave_gaps(capture.cube, gap, dtype)
+    gappy = calibrate_session(open_session(session.path), CalibrationConfig())
+    limit = LARGEST_COUNT if saturation else None
+    assert gappy.defects.saturation_counts == whole.defects.saturation_counts == limit
+    np.testing.assert_array_equal(gappy.defects.dead, whole.defects.dead)
+    np.testing.assert_array_equal(gappy.bands, whole.bands)
+    np.testing.assert_allclose(gappy.white.spectrum, whole.white.spectrum, rtol=2e-3)
+    assert gappy.white.roi == whole.white.roi
+    assert gappy.noise.counts_per_electron == pytest.approx(whole.noise.counts_per_electron, rel=0.05)
+    assert gappy.drift_corrected
+    assert gappy.drift.static_share == pytest.approx(whole.drift.static_share, abs=0.01)
+    np.testing.assert_allclose(gappy.drift.factor, whole.drift.factor, atol=1e-3)
+
+
+def test_hot_elements_do_not_move_the_tarp(tmp_path):
+    session = write_session(tmp_path)
+    tarp = np.full((SIZE_PX, SIZE_PX, BANDS), 0.05)
+    tarp[8:40, 8:40] = 1.0
+    write_capture(session, "white_reference", expose(tarp))
+    for capture in open_session(session).captures:
+        counts = capture.cube.read()
+        counts[:, 24, : BANDS // 4] = 60_000
+        write_capture(session, capture.name, counts)
+    assert calibrate_session(open_session(session), CalibrationConfig()).white.roi == (8, 8, 40, 40)
 
 
 def own_white(session: Session, capture, lines=3):

@@ -277,15 +277,12 @@ def test_white_of_a_capture_by_detector_column(tmp_path):
     np.testing.assert_allclose(one.spectrum[0], np.nanmean(expected, axis=0)[None][0])
 
 
-def test_white_of_one_line_leaves_no_data_out(tmp_path):
+@pytest.mark.parametrize(("gap", "header"), [(-1.0, {"data ignore value": -1}), (np.nan, {})])
+def test_white_of_one_line_leaves_no_data_out(tmp_path, gap, header):
     slab = np.broadcast_to(LAMP, (2, 5, 7)).copy()
-    slab[0, 3, 1] = slab[:, 4, 2] = -1.0
-    white = column_white(
-        cube_of(tmp_path, "WHITEREF", slab, **{"data ignore value": -1}),
-        None,
-        5,
-        CalibrationConfig(smoothing_bands=1),
-    )
+    slab[0, 3, 1] = slab[:, 4, 2] = gap
+    cube = cube_of(tmp_path, "WHITEREF", slab, **header)
+    white = column_white(cube, None, 5, CalibrationConfig(smoothing_bands=1))
     expected = np.broadcast_to(LAMP, (5, 7)).copy()
     expected[4, 2] = np.nan
     np.testing.assert_allclose(white.spectrum, expected)

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.pseudo_rgb import pseudo_rgb
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, project, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.simulate import assemble, effects
@@ -33,6 +34,10 @@ SMALL = {"frames": 4, "size_px": 40, "bands": 10}
 
 def scene(*names, name="cylinder", **values):
     return override(load_scene(name), **{**SMALL, **values}, effects=names)
+
+
+def pseudo_rgb(reflectance, wavelengths_nm):
+    return to_8_bit(reflectance[..., nearest_bands(wavelengths_nm, paper.PSEUDO_RGB_NM)])
 
 
 def signal(simulation, capture):

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.data import frames
 from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.envi import open_cube, write_cube
 from hsi_sc_nerf.data.frames import FramePaths, border_spectrum, finished_notes, process_frame
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
-from hsi_sc_nerf.data.pseudo_rgb import bands_within, pseudo_rgb
+from hsi_sc_nerf.data.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 
 WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
@@ -125,6 +126,18 @@ def test_a_frame_whose_pictures_cannot_be_written_has_no_notes(cube, tmp_path):
     assert finished_notes(FramePaths.of(tmp_path / "data", "frame"), "made") is None
 
 
+def test_notes_do_not_vouch_for_a_cube_of_other_settings(cube, tmp_path, monkeypatch):
+    paths, _ = process(cube, tmp_path / "data")
+
+    def stops(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(frames, "write_png", stops)
+    with pytest.raises(KeyboardInterrupt):
+        process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
+    assert finished_notes(paths, "made") is None
+
+
 def test_border_spectrum_of_measured_values(tmp_path):
     rng = np.random.default_rng(2)
     reflectance = rng.random((12, 12, BANDS))
@@ -142,7 +155,7 @@ def test_border_spectrum_of_measured_values(tmp_path):
 def test_pictures_of_bands():
     reflectance = np.zeros((2, 2, BANDS), np.float32)
     reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, -0.5, 1.5]
-    image = pseudo_rgb(reflectance, WAVELENGTHS_NM, (990.0, 640.0, 490.0))
+    image = to_8_bit(reflectance[..., nearest_bands(WAVELENGTHS_NM, (990.0, 640.0, 490.0))])
     assert image[0, 0].tolist() == [255, 0, round(0.2 * 255)]
     assert bands_within(WAVELENGTHS_NM, (500.0, 700.0)).tolist() == [1, 2, 3, 4]
     assert bands_within(WAVELENGTHS_NM, (2000.0, 2500.0)).tolist() == list(range(BANDS))

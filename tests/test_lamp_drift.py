@@ -168,7 +168,7 @@ def test_dark_of_each_frame():
     assert isinstance(measure(counts), NotMeasurable)
 
 
-def test_saturated_and_dead_elements_are_left_out():
+def test_saturated_and_dead_elements_and_no_data_are_left_out():
     counts, dead = drawn(), np.zeros((SAMPLES, BANDS), bool)
     dead[::5, ::3] = True
     counts[:, :, dead] = np.random.default_rng(2).choice([100, 4095], (FRAMES, LINES, dead.sum()))
@@ -178,6 +178,10 @@ def test_saturated_and_dead_elements_are_left_out():
     limit = 1900
     drift = measure(counts.clip(max=limit), saturation_counts=limit, dead=dead)
     np.testing.assert_allclose(drift.factor, TRUE, atol=2e-3)
+    gaps = np.random.default_rng(5).random(counts.shape) < 1e-3
+    drift = measure(np.where(gaps, np.nan, drawn()), saturation_counts=4095)
+    np.testing.assert_allclose(drift.factor, TRUE, atol=1e-3)
+    assert np.isfinite(drift.measured).all()
     # Unknown ones take their samples out of what stands still.
     assert not measure(counts).static[:, ::5].any()
 
@@ -188,6 +192,10 @@ def test_what_cannot_be_measured_says_why():
     assert "stand still" in moving.reason
     darkness = measure(np.full((FRAMES, LINES, SAMPLES, BANDS), 100, np.uint16))
     assert isinstance(darkness, NotMeasurable)
+    few = measure_lamp_drift(
+        drawn()[..., :2].__getitem__, FRAMES, [np.zeros((1, 2))], QUIET, WAVELENGTHS_NM[:2], CONFIG
+    )
+    assert few == NotMeasurable("2 bands are too few for its curve over the wavelength")
     single = measure_lamp_drift(drawn().__getitem__, 1, [np.zeros((1, BANDS))], QUIET, WAVELENGTHS_NM, CONFIG)
     assert single == NotMeasurable("there is a single frame")
 

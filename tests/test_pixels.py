@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import gc
+import os
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +66,29 @@ def test_a_cube_that_becomes_shorter_is_one_sentence(tmp_path, counts):
     (tmp_path / "2.bip").write_bytes(b"")
     with pytest.raises(InputError, match="a cube became shorter"):
         reader.read(INDICES)
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts the process's files in /proc")
+def test_a_reader_holds_one_file_a_frame_until_it_is_closed(tmp_path):
+    reader_of(tmp_path, np.zeros((20, *SHAPE), np.uint16)).close()
+    gc.collect()  # what earlier tests left
+    before, maps = open_files(), []
+
+    def cubes():
+        for i in range(20):
+            cube = open_cube(tmp_path / f"{i}.hdr").memmap()
+            maps.append(weakref.ref(cube))
+            assert sum(earlier() is not None for earlier in maps) <= 2
+            yield cube
+
+    reader = PixelReader(cubes())
+    assert open_files() == before + 20
+    reader.close()
+    assert open_files() == before
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the process's memory from /proc")
@@ -157,12 +183,22 @@ def test_the_rest_is_found_without_a_list_of_it(sampler, masks):
     np.testing.assert_array_equal(sampler(1)._rest(np.arange(len(rest))), rest)
 
 
-@pytest.mark.parametrize("share", [0.75, 1.0])
-def test_without_an_object_there_is_nothing_to_train_on(tmp_path, counts, masks, share):
-    pixels = PixelSampler(reader_of(tmp_path, counts), np.zeros_like(masks), 8, 0, has_flagged=False)
-    with pytest.raises(InputError, match="masks of all training frames are empty"):
-        pixels.sample(0, share)
-    assert not pixels.sample(0, 0.0)["mask"].any()
+@pytest.mark.parametrize(
+    ("share", "covered", "sentence"),
+    [
+        (0.75, False, "are empty"),
+        (1.0, False, "are empty"),
+        (0.75, True, "cover whole im"),
+        (0.0, True, "cover whole"),
+    ],
+)
+def test_without_an_object_or_anything_else_there_is_nothing_to_train_on(
+    tmp_path, counts, masks, share, covered, sentence
+):
+    pixels = PixelSampler(reader_of(tmp_path, counts), np.full_like(masks, covered), 8, 0, has_flagged=False)
+    with pytest.raises(InputError, match=f"masks of all training frames {sentence}"):
+        pixels.sample(0, share, rim_share=0.5)
+    assert (pixels.sample(0, float(covered))["mask"] == covered).all()
 
 
 def test_fixed_pixels_are_spread_over_the_object(masks):

@@ -140,14 +140,20 @@ def test_no_way_works(pear, monkeypatch):
 
 
 CAMERA = KnownCamera(
-    PinholeIntrinsics(64, 48, 100.0, 100.0, 32.0, 24.0), (0.01, 0.0, 0.0, 0.0), look_at([0.4, 0.0, 0.2], [0, 0, 0.06])
+    PinholeIntrinsics(64, 48, 100.0, 100.0, 32.0, 24.0),
+    (0.01, 0.0, 0.0, 0.0),
+    look_at([0.4, 0.0, 0.2], [0, 0, 0.06]),
+    "ccw",
 )
 BLANK = [np.zeros((48, 64), np.uint8)] * 4
 
 
-@pytest.mark.parametrize(("direction", "sign"), [("ccw", 1.0), ("cw", -1.0), (None, 1.0)])
-def test_an_earlier_camera_and_known_angles_are_enough(direction, sign):
-    known = SessionFacts(camera=CAMERA, frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=direction)
+@pytest.mark.parametrize(
+    ("told", "before", "sign"), [("ccw", None, 1.0), ("cw", "ccw", -1.0), (None, "ccw", 1.0), (None, "cw", -1.0)]
+)
+def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
+    camera = replace(CAMERA, direction=before)
+    known = SessionFacts(camera=camera, frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=told)
     poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
     np.testing.assert_allclose(poses.angles_deg, sign * np.array([0.0, 10.0, 25.0, 80.0]))
     for pose, angle in zip(poses.camera_to_world, poses.angles_deg, strict=True):
@@ -164,6 +170,12 @@ def test_angles_that_are_not_there():
     few = SessionFacts(camera=CAMERA, frame_angles_deg=(0.0, 1.0))
     with pytest.raises(InputError, match="2 frame angles are given for 4 frames"):
         find_poses(BLANK, list("abcd"), few, "angles", CONFIG, progress=False)
+
+
+def test_a_direction_that_nothing_tells():
+    known = SessionFacts(camera=replace(CAMERA, direction=None), nominal_step_deg=90.0)
+    with pytest.raises(InputError, match=r"which way the turntable turns is not known.*give direction"):
+        find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
 
 
 def test_a_camera_of_other_images():

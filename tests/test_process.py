@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import logging
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -27,10 +28,13 @@ from capture_factory import (
 
 from hsi_sc_nerf.data import calibrated_frames as frames_module
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig, LampDriftConfig
+from hsi_sc_nerf.data.envi import write_cube
 from hsi_sc_nerf.data.masks import MaskConfig
 from hsi_sc_nerf.data.packed import Container, open_packed
 from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.data.posed_frames import session_facts
 from hsi_sc_nerf.data.process import ProcessConfig, process_session
+from hsi_sc_nerf.data.session import open_session
 from hsi_sc_nerf.errors import InputError
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -98,6 +102,20 @@ def test_session_to_dataset(tmp_path, specim):
     assert not [path for path in output.rglob("*") if "partial" in path.name]
 
 
+def test_a_session_of_finished_reflectance(tmp_path):
+    session = tmp_path / "session"
+    for number, angle in enumerate(ANGLES_DEG, start=1):
+        finished = frame_reflectance(angle).astype(np.float32)
+        write_cube(session / f"REFLECTANCE_ball_{number}.hdr", finished, wavelengths_nm=WAVELENGTHS_NM)
+    (session / "session.json").write_text(json.dumps(INFO))
+    output = run(session, tmp_path / "data")
+    dataset = open_packed(output)
+    assert dataset.uncertainty is None
+    for frame, angle in zip(dataset.frames, ANGLES_DEG, strict=True):
+        np.testing.assert_allclose(frame.cube() / REFLECTANCE_SCALE, frame_reflectance(angle), atol=1e-4)
+    assert sorted(path.name for path in (output / "report").iterdir()) == ["masks.png", "poses.png"]
+
+
 def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
     info = {**INFO, "nominal_step_deg": 90, "direction": "ccw", "marker_dictionary": "DICT_4X4_50"}
     session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
@@ -133,6 +151,40 @@ def test_other_settings_redo_what_depends_on_them(session, tmp_path, calls):
     assert len(calls) == 4
     run(session, output, ProcessConfig(calibration=CalibrationConfig(bounds=(0.0, 0.9))))
     assert len(calls) == 8
+
+
+@pytest.mark.parametrize("kind", ["panel", "camera"])
+def test_a_changed_file_that_a_setting_names_is_noticed(session, tmp_path, calls, kind):
+    if kind == "panel":
+        named = tmp_path / "panel.csv"
+        named.write_text("400,1.0\n1000,1.0\n")
+        config = ProcessConfig(calibration=CalibrationConfig(panel=named))
+    else:
+        named = run(session, tmp_path / "earlier") / "transforms.json"
+        config = ProcessConfig(camera=named.parent)
+    output = run(session, tmp_path / "data", config)
+    named.write_text(named.read_text().replace("1.0\n", "0.9\n") + "\n")
+    with pytest.raises(InputError, match="no marker was found"):
+        run(session, output, config, poses=no_markers)
+    run(session, output, config)
+    assert len(calls) == 8
+    white = 0.9 if kind == "panel" else 1.0
+    np.testing.assert_allclose(
+        open_packed(output).frames[0].cube() / REFLECTANCE_SCALE, white * frame_reflectance(0.0), atol=1e-3
+    )
+
+
+def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
+    dataset = open_packed(run(session, tmp_path / "data"))
+
+    def told(*angles_deg):
+        frames = [replace(frame, angle_deg=a) for frame, a in zip(dataset.frames, angles_deg, strict=False)]
+        return session_facts(open_session(session), None, replace(dataset, frames=tuple(frames))).camera.direction
+
+    assert told(0.0, 90.0, 180.0) == "ccw"
+    assert told(0.0, -90.0, -180.0) == "cw"
+    assert told(0.0, 90.0, -90.0) is None
+    assert told(0.0) is None
 
 
 def test_a_changed_capture_is_done_again_alone(session, tmp_path, calls):
@@ -221,6 +273,40 @@ def test_frames_without_a_pose_are_left_out_with_a_warning(session, tmp_path, ca
         output = run(session, tmp_path / "data", poses=partial(true_poses, unused=("ball_2",)))
     assert "ball_2" in caplog.text
     assert [frame.capture for frame in open_packed(output).frames] == ["ball_1", "ball_3", "ball_4"]
+
+
+def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
+    angles_deg = tuple(np.arange(20) * 18.0)
+    session = write_session(tmp_path / "session", angles_deg)
+    write_capture(session, "ball_7", expose(np.full((48, 48, len(WAVELENGTHS_NM)), BACKGROUND)))
+    with caplog.at_level(logging.WARNING):
+        output = run(session, tmp_path / "data", poses=partial(true_poses, angles_deg=angles_deg))
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["ball_7"]
+    assert [frame.capture for frame in open_packed(output).frames if not frame.mask().any()] == ["ball_7"]
+
+
+def test_names_are_printed_as_they_are(tmp_path, capsys):
+    info = {**INFO, "white_reference": "[white]"}
+    session = write_session(tmp_path / "[session]", ANGLES_DEG, info=info)
+    (session / "white_reference").rename(session / "[white]")
+    for _ in range(2):
+        process_session(session, tmp_path / "[apple]", estimate_poses=true_poses)
+    # Lines are broken wherever the folder's path makes them too long.
+    printed = "".join(capsys.readouterr().err.split())
+    for words in ("the tarp in [white].", "[apple]: 4 frames are ready", "[apple]: is up to date"):
+        assert words.replace(" ", "") in printed
+
+
+@pytest.mark.parametrize(
+    ("config", "sentence"),
+    [
+        (ProcessConfig(workers=0), "--workers is 0, but must be 1 or more"),
+        (ProcessConfig(masks=MaskConfig(spectral_bins=0)), "--masks.spectral-bins is 0, but must be 2 or more"),
+    ],
+)
+def test_settings_that_cannot_be(session, tmp_path, config, sentence):
+    with pytest.raises(InputError, match=sentence):
+        run(session, tmp_path / "data", config)
 
 
 def test_marker_size_is_needed(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.scene import Sensor
 from hsi_sc_nerf.simulate.sensor import band_centres_nm, digitise, lamp_photons, quantum_efficiency, white_signal
@@ -74,6 +75,11 @@ def test_white_peaks_at_its_level_and_dark_at_its():
     # Each band has signal enough to calibrate with.
     assert white.min() > sensor.dark_level + 90
     assert (quantum_efficiency(WAVELENGTHS_NM) < 1.0).all()
+
+
+def test_a_dark_level_without_room_for_light_is_refused():
+    with pytest.raises(InputError, match=r"sensor\.dark_level is 250, but the white counts no more than 209.1"):
+        white_signal(Sensor(bit_depth=8, dark_level=250), WAVELENGTHS_NM)
 
 
 def test_counts_are_whole_and_stop_at_both_ends():

@@ -80,7 +80,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         judged = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
             input_dataset=self.eval_dataset,
-            image_indices=tuple(judged or range(len(self.eval_dataset))),
+            image_indices=tuple(judged or range(len(self.eval_dataset))),  # type: ignore[arg-type]
             device=self.device,
         )
         # Pictures in the logs show the same view every time, so that they can be compared.

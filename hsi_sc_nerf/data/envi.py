@@ -70,14 +70,6 @@ class Cube:
         """The stored numbers in memory, contiguous, in this machine's byte order."""
         return np.ascontiguousarray(self.memmap(), dtype=self.dtype.newbyteorder("="))
 
-    def reflectance(self) -> Float[np.ndarray, "lines samples bands"]:
-        """The stored numbers over ``reflectance_scale``, float32; nan where they are ``ignore_value``."""
-        stored = self.memmap()
-        reflectance = np.ascontiguousarray(stored, dtype=np.float32) / np.float32(self.reflectance_scale)
-        if self.ignore_value is not None:
-            reflectance[stored == self.ignore_value] = np.nan
-        return reflectance
-
 
 def open_cube(header_path: Path, wavelengths_nm: Float[np.ndarray, "bands"] | None = None) -> Cube:
     """Open the ENVI pair that ``header_path`` describes.

@@ -95,19 +95,19 @@ def read_header(path: Path) -> EnviHeader:
             than bands, or a feature that would give wrong pixels (complex numbers, frame offsets, compression,
             a spectral library).
     """
-    fields = _mended_fields(path)
+    fields = mended_fields(path)
     try:
         shape = (int(fields["lines"]), int(fields["samples"]), int(fields["bands"]))
         parameters = envi.gen_params(fields)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
     dtype = np.dtype(parameters.dtype)
-    _check_layout(path, fields, shape, dtype, parameters.offset)
-    scale = _number(path, fields, "reflectance scale factor")
+    check_layout(path, fields, shape, dtype, parameters.offset)
+    scale = number_in(path, fields, "reflectance scale factor")
     if scale is not None and not scale > 0.0:
         raise InputError(f"{path}: reflectance scale factor {scale:g} is not positive; correct it.")
-    tint = _number(path, fields, "tint")
-    nm_per_unit, wavelengths_nm = _wavelengths_nm(path, fields, shape[2])
+    tint = number_in(path, fields, "tint")
+    nm_per_unit, wavelengths_nm = wavelengths_of(path, fields, shape[2])
     fwhm = _numbers(path, fields, "fwhm", shape[2])
     bad_band_list = _numbers(path, fields, "bbl", shape[2])
     return EnviHeader(
@@ -120,20 +120,20 @@ def read_header(path: Path) -> EnviHeader:
         fwhm_nm=None if fwhm is None else fwhm * nm_per_unit,
         good_bands=np.ones(shape[2], bool) if bad_band_list is None else bad_band_list != 0.0,
         reflectance_scale=1.0 if scale is None else scale,
-        ignore_value=_number(path, fields, "data ignore value"),
+        ignore_value=number_in(path, fields, "data ignore value"),
         integration_time_ms=tint if tint and tint > 0.0 else None,
         fields=fields,
     )
 
 
-def _mended_fields(path: Path) -> dict[str, Any]:
+def mended_fields(path: Path) -> dict[str, Any]:
     """SPy's dictionary of the header, with what ENVI itself takes for granted filled in."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such ENVI header; check the path.")
     try:
         fields = _parse(path)
     except (InvalidFileError, OSError) as error:
-        raise InputError(f"{path}: is no readable ENVI header; export the cube again.") from error
+        raise InputError(f"{path}: is no readable ENVI header; export the file again.") from error
     fields.setdefault("byte order", "0")
     missing = [key for key in _REQUIRED if not fields.get(key)]
     if missing:
@@ -172,7 +172,7 @@ def _parse_plain(path: Path) -> dict[str, Any]:
         return envi.read_envi_header(str(path))
 
 
-def _check_layout(
+def check_layout(
     path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int
 ) -> None:
     """Refuse what would be read as wrong pixels."""
@@ -195,7 +195,7 @@ def _check_layout(
             raise InputError(f"{path}: has {key}, which are not supported; export the cube without them.")
 
 
-def _number(path: Path, fields: dict[str, Any], key: str) -> float | None:
+def number_in(path: Path, fields: dict[str, Any], key: str) -> float | None:
     """A field's number; None where the field is missing or empty."""
     value = fields.get(key, "")
     if not value:
@@ -222,9 +222,7 @@ def _numbers(path: Path, fields: dict[str, Any], key: str, bands: int) -> Float[
     return numbers
 
 
-def _wavelengths_nm(
-    path: Path, fields: dict[str, Any], bands: int
-) -> tuple[float, Float[np.ndarray, "bands"] | None]:
+def wavelengths_of(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
     """The factor from the header's unit to nm, and the band centres, or None where it lists none."""
     unit = str(fields.get("wavelength units", "")).strip().lower().removesuffix("s")
     listed = _numbers(path, fields, "wavelength", bands)

@@ -48,9 +48,10 @@ def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
     return [shared_files(session), *(capture_files(session, frame) for frame in session.frames)]
 
 
-def session_fingerprint(session: Session, config: Any) -> str:
-    """Fingerprint of a whole session and of the settings (a dataclass) that it is processed with."""
-    return fingerprint([session_files(session), asdict(config)])
+def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = ()) -> str:
+    """Fingerprint of a whole session, of its settings (a dataclass), and of the files that these name."""
+    named = _stamps(session.path, [path for path in files if path.is_file()])
+    return fingerprint([session_files(session), asdict(config), named])
 
 
 def _stamps(root: Path, paths: Iterable[Path]) -> list[tuple[str, int, int]]:

@@ -1,6 +1,7 @@
 """The work on one frame: calibrate, pack, and keep what later steps need, so that a stopped run can go on.
 
-A frame's cube and picture are written first and its notes last: a frame whose notes are there is finished.
+A frame's cube and picture are written first and its notes last: a frame whose notes are there is finished. Earlier
+notes go before the first of its files is replaced, or they would vouch for a cube of other settings.
 """
 
 from __future__ import annotations
@@ -111,6 +112,7 @@ def process_frame(
     def upright(image: Num[np.ndarray, "lines samples *channels"]) -> Num[np.ndarray, "h w *channels"]:
         return np.rot90(image, calibration.quarter_turns)
 
+    paths.notes.unlink(missing_ok=True)
     write_packed_cube(paths.cube, upright(frame.packed), wavelengths_nm, widths_nm)
     write_png(paths.flags, upright(frame.flags))
     write_png(paths.image, upright(to_8_bit(np.moveaxis(frame.rgb, 0, -1))))

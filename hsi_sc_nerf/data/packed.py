@@ -133,10 +133,16 @@ class PackedDataset:
         return np.stack([frame.camera_to_world for frame in self.frames])
 
 
+def transforms_path(path: Path) -> Path:
+    """The ``transforms.json`` of a dataset that is given by its folder or by that file."""
+    path = Path(path)
+    return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
+
+
 def is_packed(path: Path) -> bool:
     """Whether ``path`` is the folder (or the ``transforms.json``) of a packed hyperspectral dataset."""
     try:
-        return "wavelengths_nm" in json.loads(_transforms_path(path).read_text(encoding="utf-8"))
+        return "wavelengths_nm" in json.loads(transforms_path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
 
@@ -148,7 +154,7 @@ def open_packed(path: Path) -> PackedDataset:
         InputError: there is no ``transforms.json``, it is no JSON, a key is missing or unreadable, no frame is
             listed, or a frame's file is missing.
     """
-    path = _transforms_path(path)
+    path = transforms_path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no packed dataset here; make one with `hsi-sc-nerf process`.")
     try:
@@ -214,14 +220,9 @@ def write_transforms(dataset: PackedDataset) -> Path:
             for frame in dataset.frames
         ],
     }
-    path = _transforms_path(dataset.root)
+    path = transforms_path(dataset.root)
     write_json(path, content)
     return path
-
-
-def _transforms_path(path: Path) -> Path:
-    path = Path(path)
-    return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
 
 
 def _float_or_none(value: Any) -> float | None:

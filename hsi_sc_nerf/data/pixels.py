@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cached_property
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -27,21 +28,33 @@ class PixelReader:
     a disk then serves many at once (benchmarks/pixel_fetch.py).
 
     Args:
-        cubes: memory maps of BIP cubes of one shape, one a frame. Only where the system cannot read by position
-            (Windows) are they read through.
+        cubes: memory maps of BIP cubes of one shape, one a frame; a generator of them never has more than two open,
+            each of which is one of the files that a process may hold. Only where the system cannot read by position
+            (Windows) are they kept and read through.
     """
 
-    def __init__(self, cubes: Sequence[np.memmap]) -> None:
-        self.shape: tuple[int, int, int] = cubes[0].shape
-        self.dtype = cubes[0].dtype
-        self._paths = [Path(str(cube.filename)) for cube in cubes]
-        if hasattr(os, "pread"):
-            self._files = [path.open("rb", buffering=0) for path in self._paths]
-            self._starts = np.array([cube.offset for cube in cubes])
-            self._read = self._read_by_position
-        else:
-            self._cubes = cubes
-            self._read = self._read_through_maps
+    def __init__(self, cubes: Iterable[np.memmap]) -> None:
+        by_position = hasattr(os, "pread")
+        self._paths: list[Path] = []
+        self._files: list[FileIO] = []
+        self._cubes: list[np.memmap] = []
+        starts = []
+        for cube in cubes:
+            self.shape: tuple[int, int, int] = cube.shape
+            self.dtype = cube.dtype
+            self._paths.append(Path(str(cube.filename)))
+            starts.append(cube.offset)
+            if by_position:
+                self._files.append(self._paths[-1].open("rb", buffering=0))
+            else:
+                self._cubes.append(cube)
+        self._starts = np.array(starts)
+
+    def close(self) -> None:
+        """Give the files back: for a reader that is done before the process is."""
+        for file in self._files:
+            file.close()
+        self._cubes.clear()
 
     def read(self, indices: Int[np.ndarray, "count 3"]) -> UInt16[np.ndarray, "count bands"]:
         """Packed spectra at (frame, line, sample).
@@ -49,7 +62,7 @@ class PixelReader:
         Raises:
             InputError: a file became shorter since it was opened.
         """
-        return self._read(indices)
+        return self._read_by_position(indices) if self._files else self._read_through_maps(indices)
 
     def _read_by_position(self, indices: np.ndarray) -> np.ndarray:
         _, samples, bands = self.shape
@@ -120,7 +133,7 @@ class PixelSampler:
             What `at` returns.
 
         Raises:
-            InputError: pixels of the foreground are asked for, and there are none.
+            InputError: pixels of the foreground, or of the rest, are asked for, and there are none.
         """
         rng = np.random.default_rng((self.seed, step))
         count = self.num_rays_per_batch
@@ -134,10 +147,15 @@ class PixelSampler:
                     "report/ in the dataset and process again."
                 )
             in_rim = round((count - in_foreground) * rim_share) if rim_share > 0.0 and len(self._rim) > 0 else 0
-            num_rest = self.masks.size - len(self._foreground)
+            in_rest, num_rest = count - in_foreground - in_rim, self.masks.size - len(self._foreground)
+            if in_rest > 0 and num_rest == 0:
+                raise InputError(
+                    "the masks of all training frames cover whole images, so that nothing tells where the object "
+                    "ends; look at report/ in the dataset and process again with a larger --masks.threshold."
+                )
             drawn = [
                 self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
-                self._rest(rng.integers(0, num_rest, count - in_foreground - in_rim)),
+                self._rest(rng.integers(0, num_rest, in_rest)),
             ]
             if in_rim > 0:
                 drawn.append(self._rim[rng.integers(0, len(self._rim), in_rim)])

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -202,7 +203,16 @@ def _camera(earlier: PackedDataset) -> KnownCamera:
         intrinsics=earlier.intrinsics,
         distortion=(k1, k2, p1, p2),
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
+        direction=_direction([frame.angle_deg for frame in earlier.frames]),
     )
+
+
+def _direction(angles_deg: Sequence[float]) -> Literal["ccw", "cw"] | None:
+    """How a turntable turned, by the sign of its frames' angles; None where both occur, or neither."""
+    forth, back = max(angles_deg) > 0.0, min(angles_deg) < 0.0
+    if forth == back:
+        return None
+    return "ccw" if forth else "cw"
 
 
 def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,7 @@ from hsi_sc_nerf.data.calibration.session import calibrate_session
 from hsi_sc_nerf.data.calibration.tally import Tally
 from hsi_sc_nerf.data.calibration.uncertainty import typical_uncertainty
 from hsi_sc_nerf.data.fingerprint import session_fingerprint
-from hsi_sc_nerf.data.frames import border_spectrum, object_spectrum
+from hsi_sc_nerf.data.frames import FrameNotes, border_spectrum, object_spectrum
 from hsi_sc_nerf.data.masks import MaskConfig, above_lid, choose_threshold, foreground_mask, shaded_parts
 from hsi_sc_nerf.data.packed import (
     TRANSFORMS_NAME,
@@ -34,6 +35,7 @@ from hsi_sc_nerf.data.packed import (
     PackedFrame,
     is_packed,
     open_packed,
+    transforms_path,
     write_transforms,
 )
 from hsi_sc_nerf.data.posed_frames import (
@@ -53,6 +55,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import PoseWay, find_poses
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -99,14 +103,16 @@ def process_session(
     whole.
 
     Raises:
-        InputError: the session cannot be used (``open_session``, ``white_reference``), has no marker size, shows no
-            markers or no object; or the output cannot be written or holds another dataset.
+        InputError: a setting is out of range; the session cannot be used (``open_session``, ``white_reference``), has
+            no marker size, shows no markers or no object; or the output cannot be written or holds another dataset.
     """
     config = config or ProcessConfig()
+    _check_settings(config)
     output_dir = Path(output_dir)
-    console = Console(stderr=True, quiet=not progress)
+    # A folder's name in square brackets, or between colons, is no command to the console.
+    console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
     session = open_session(session_dir)
-    stamp = session_fingerprint(session, config)
+    stamp = session_fingerprint(session, config, _named_files(config))
     if _is_done(output_dir, stamp):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
@@ -154,6 +160,8 @@ def process_session(
     masks = _make_masks(used_notes, camera_to_worlds, poses, container, config.masks)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
+        if not mask.any():
+            _log.warning("%s: nothing of the object was found in this frame (see report/masks.png)", frame.capture)
     mask_picture(
         output_dir / "report" / "masks.png",
         [frame.pseudo_rgb() for frame in frames],
@@ -201,6 +209,19 @@ def process_session(
     write_transforms(dataset)
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir
+
+
+def _check_settings(config: ProcessConfig) -> None:
+    bins = config.masks.spectral_bins
+    for option, value, least in (("workers", config.workers, 1), ("masks.spectral-bins", bins, 2)):
+        if value < least:
+            raise InputError(f"--{option} is {value}, but must be {least} or more; correct it.")
+
+
+def _named_files(config: ProcessConfig) -> list[Path]:
+    """Files outside of the session that settings name and the dataset depends on."""
+    panel, camera = config.calibration.panel, config.camera
+    return ([] if panel is None else [panel]) + ([] if camera is None else [transforms_path(camera)])
 
 
 def _is_done(output_dir: Path, stamp: str) -> bool:

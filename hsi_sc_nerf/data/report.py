@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hsi_sc_nerf.data.atomic import atomic_write, write_png
+from hsi_sc_nerf.data.calibration.no_data import filled
 from hsi_sc_nerf.data.calibration.white_reference import White, WhiteReference
 from hsi_sc_nerf.data.calibration.white_steps import mean_over_columns, white_mask
 from hsi_sc_nerf.data.envi import Cube
@@ -32,7 +33,8 @@ def white_reference_picture(path: Path, cube: Cube, white: WhiteReference, rgb_n
         InputError: the operating system refused to write.
     """
     x0, y0, x1, y1 = white.roi
-    raw = cube.memmap()[..., nearest_bands(cube.wavelengths_nm, rgb_nm)].astype(float)
+    shown_counts = cube.memmap()[..., nearest_bands(cube.wavelengths_nm, rgb_nm)]
+    raw = filled(shown_counts, cube.ignore_value).astype(float)
     image = to_8_bit(raw / np.maximum(np.percentile(raw, 95.0, axis=(0, 1)), 1e-9))
     figure = _figure(14.0, 14.0)
     axes = figure.subplot_mosaic(

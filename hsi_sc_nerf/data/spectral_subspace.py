@@ -8,6 +8,7 @@ with weights below 1, which is what a ray collects.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +103,8 @@ def find_subspace(
     if whole.sum() < FEWEST_SPECTRA:
         raise InputError(
             f"only {whole.sum()} of {len(spectra)} sampled spectra are free of flagged values, and a spectral basis "
-            f"needs {FEWEST_SPECTRA}; sample more pixels, or train with the direct head."
+            f"needs {FEWEST_SPECTRA}; calibration.json in the dataset counts the flags of each band: list the worst "
+            "bands as bad (bbl) in the headers and process again, or train with --pipeline.model.head direct."
         )
     bands = spectra.shape[1]
     if rank is not None and not 1 <= rank <= bands:
@@ -209,7 +211,8 @@ def sample_training_spectra(
         foreground_share: share drawn from the foreground; None for pixels of whole frames.
         seed: of the choice.
     """
-    reader = PixelReader([frame.cube() for frame in frames])
     masks = np.stack([frame.mask() for frame in frames])
-    batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_share)
+    # The training pixels' own reader has a file open for each of these frames as well.
+    with closing(PixelReader(frame.cube() for frame in frames)) as reader:
+        batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_share)
     return batch["spectral"], batch["valid"]

@@ -7,6 +7,7 @@ the pixels that show neither is the chamber without its noise. What neither fram
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import cv2
@@ -91,13 +92,13 @@ def estimate_static_background(
         free[k] = ~dilate(turning, margin_px)[np.ix_(y, x)]
 
     least = max(1, int(np.ceil(config.least_share * len(chosen))))
-    reader = PixelReader([frame.cube() for frame in chosen])
-    image = np.empty((*free.shape[1:], reader.shape[2]), np.float32)
-    variance = np.empty_like(image)
-    for line in range(len(image)):
-        indices = [np.stack(np.broadcast_arrays(k, y[line], x), axis=-1) for k, (y, x) in enumerate(places)]
-        counts = reader.read(np.concatenate(indices)).reshape(len(chosen), len(image[0]), -1)
-        image[line], variance[line] = median_over_frames(counts, free[:, line], least)
+    with closing(PixelReader(frame.cube() for frame in chosen)) as reader:
+        image = np.empty((*free.shape[1:], reader.shape[2]), np.float32)
+        variance = np.empty_like(image)
+        for line in range(len(image)):
+            indices = [np.stack(np.broadcast_arrays(k, y[line], x), axis=-1) for k, (y, x) in enumerate(places)]
+            counts = reader.read(np.concatenate(indices)).reshape(len(chosen), len(image[0]), -1)
+            image[line], variance[line] = median_over_frames(counts, free[:, line], least)
     if config.smoothing_cells > 1:
         image = quieten(image, variance, config.smoothing_cells)
     coverage = free.mean(axis=0)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from hsi_sc_nerf.poses.adjust import angle_slopes
 from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, rotation_about_z
 from hsi_sc_nerf.poses.initialise import Observations, Turntable, square_corners
+from hsi_sc_nerf.poses.loop_closure import chained_turn_deg
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
 # in marker sides.
@@ -94,17 +95,4 @@ def loop_closure_deg(
     """
     slopes = np.einsum("nij,nj->ni", weights, angle_slopes(turntable, observations, centre_px, side_m))
     residual = np.einsum("nij,nj->ni", weights, residual_px.reshape(-1, 8))
-    stiffness = (slopes**2).sum(-1)
-    own = -(slopes * residual).sum(-1) / stiffness
-    by_frame = [
-        dict(zip(observations.marker[rows].tolist(), zip(own[rows], stiffness[rows], strict=True), strict=True))
-        for rows in (observations.frame == f for f in turntable.frames)
-    ]
-    left = 0.0
-    for here, there in zip(by_frame, by_frame[1:] + by_frame[:1], strict=True):
-        shared = here.keys() & there.keys()
-        if not shared:
-            return None
-        weight = {m: 1.0 / (1.0 / here[m][1] + 1.0 / there[m][1]) for m in shared}
-        left += sum(weight[m] * (there[m][0] - here[m][0]) for m in shared) / sum(weight.values())
-    return float(np.rad2deg(left))
+    return chained_turn_deg(turntable.frames, observations.frame, observations.marker, slopes, residual)

@@ -22,6 +22,8 @@ class KnownCamera:
     distortion: tuple[float, float, float, float]
     camera_to_world: Float[np.ndarray, "4 4"]
     """Pose at the angle 0, object frame, metres."""
+    direction: Literal["ccw", "cw"] | None = None
+    """How the turntable turned, seen from above; None where the earlier session does not tell."""
 
 
 def poses_by_known_camera(

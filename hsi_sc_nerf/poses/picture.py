@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX, describe_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 
@@ -16,9 +16,12 @@ _ARROW_SHARE = 0.15
 _ABOVE_THE_BARS = 1.4
 
 
-def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
-    """Draw cameras and markers in space and from above, and errors and steps by frame, into a picture file."""
-    path = Path(path)
+def draw_poses(poses: TurntablePoses, path: Path) -> None:
+    """Draw cameras and markers in space and from above, and errors and steps by frame, into a picture file.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
     figure = Figure(figsize=(16, 6))
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.1, top=0.86, wspace=0.2, hspace=0.35)
     figure.suptitle(_summary(poses), fontsize=10)
@@ -75,12 +78,8 @@ def draw_poses(poses: TurntablePoses, path: Path | str) -> None:
     turn.set(xlabel="frame", ylabel="step since the last (degrees)")
     turn.legend(loc="upper right", fontsize=8)
 
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
+    with atomic_write(path) as (temporary,):
         figure.savefig(temporary, dpi=110)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _summary(poses: TurntablePoses) -> str:

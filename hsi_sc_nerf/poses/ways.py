@@ -154,6 +154,7 @@ def _by(
         )
     if way == "colmap":
         return _checked(poses_by_colmap(images, names, facts, config))
+    facts = _turning_as_before(facts)
     angles_deg = facts.angles_deg(len(names))
     if angles_deg is None:
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
@@ -168,3 +169,19 @@ def _by(
         nominal_step_deg=facts.nominal_step_deg,
         direction=facts.direction,
     )
+
+
+def _turning_as_before(facts: SessionFacts) -> SessionFacts:
+    """With a camera of an earlier session, the table turns as it did then where nothing else is told.
+
+    Raises:
+        InputError: nothing tells how it turns; the poses would be mirrored as likely as not.
+    """
+    if facts.camera is None or facts.direction is not None:
+        return facts
+    if facts.camera.direction is None:
+        raise InputError(
+            "which way the turntable turns is not known, nor do the angles of the earlier session tell; give "
+            "direction (ccw or cw) in session.json"
+        )
+    return replace(facts, direction=facts.camera.direction)

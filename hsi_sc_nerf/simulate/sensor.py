@@ -7,6 +7,7 @@ from importlib import resources
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.lamps import lamp_photons
 from hsi_sc_nerf.simulate.scene import Sensor
 
@@ -31,11 +32,21 @@ def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.n
 def white_signal(
     sensor: Sensor, wavelengths_nm: Float[np.ndarray, "*samples bands"]
 ) -> Float[np.ndarray, "*samples bands"]:
-    """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count."""
+    """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count.
+
+    Raises:
+        InputError: the dark counts leave no room for it.
+    """
+    white = sensor.white_level * largest_count(sensor)
+    if white <= sensor.dark_level:
+        raise InputError(
+            f"sensor.dark_level is {sensor.dark_level}, but the white counts no more than {white:g} (white_level of "
+            f"the largest count {largest_count(sensor)}); lower it, or take a larger bit_depth."
+        )
     signal = _electrons_of_white(sensor, wavelengths_nm)
     # The peak is that of the header's bands, even where a pixel sees another wavelength.
     peak = _electrons_of_white(sensor, band_centres_nm(sensor.bands)).max()
-    return signal / peak * (sensor.white_level * largest_count(sensor) - sensor.dark_level)
+    return signal / peak * (white - sensor.dark_level)
 
 
 def _electrons_of_white(

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, Num
 from scipy import stats
 
 from hsi_sc_nerf.data.calibration.config import LampDriftConfig
+from hsi_sc_nerf.data.calibration.no_data import no_data
 from hsi_sc_nerf.data.calibration.noise import NoiseModel
 from hsi_sc_nerf.data.calibration.static_pixels import static_pixels
 
@@ -99,8 +100,8 @@ def measure_lamp_drift(
     """Measure the drift over ``frames`` frames of one exposure.
 
     Args:
-        read_lines: the raw counts of the surveyed lines of a frame, by its number; called twice for each frame, so
-            that they need not all be held in memory.
+        read_lines: the raw counts of the surveyed lines of a frame, by its number, nan where there is no data;
+            called twice for each frame, so that they need not all be held in memory.
         frames: how many there are.
         dark: counts without light, of each frame, or one for all.
         noise: of one reading.
@@ -111,6 +112,8 @@ def measure_lamp_drift(
     """
     if frames < 2:
         return NotMeasurable("there is a single frame")
+    if len(wavelengths_nm) <= config.degree:
+        return NotMeasurable(f"{len(wavelengths_nm)} bands are too few for its curve over the wavelength")
     survey = _Survey(read_lines, frames, dark, noise, saturation_counts, dead)
     static, unusable = survey.find_static(_bins(wavelengths_nm))
     share = float(static.mean())
@@ -206,29 +209,31 @@ class _Survey:
     def find_static(
         self, bins: Bool[np.ndarray, "bands bins"]
     ) -> tuple[Bool[np.ndarray, "survey samples"], Bool[np.ndarray, "survey samples bands"]]:
-        """Pixels that stand still, and which readings cannot be used: of dead elements or saturated in some frame."""
+        """Pixels that stand still, and which readings cannot be used: dead, or saturated or no data in some frame."""
         first = self.read_lines(0)
         samples, bands = first.shape[1:]
         summed = bins.astype(np.float32)
         binned = np.empty((*first.shape[:2], self.frames, bins.shape[1]), np.float32)
-        saturated = np.zeros_like(first, dtype=bool)
+        unusable = np.zeros_like(first, dtype=bool)
         dead = np.nonzero(np.zeros((samples, bands), bool) if self.dead is None else self.dead)
         for frame in range(self.frames):
-            counts, dark = self.read_lines(frame), self._dark(frame, samples)
+            (counts, missing), dark = self._read(frame), self._dark(frame, samples)
+            if missing is not None:
+                unusable |= missing
             if self.saturation_counts is not None and counts.max() >= self.saturation_counts:
-                saturated |= counts >= self.saturation_counts
+                unusable |= counts >= self.saturation_counts
             light = counts.astype(np.float32)
             light[:, dead[0], dead[1]] = dark[dead]
             binned[:, :, frame] = light @ summed - dark @ summed
         # A dead element is in no sum, and spoils none if it is stuck at the largest count.
-        saturated[:, dead[0], dead[1]] = False
-        spoilt = np.stack([saturated[..., members].any(axis=-1) for members in bins.T], axis=-1)
-        saturated[:, dead[0], dead[1]] = True
+        unusable[:, dead[0], dead[1]] = False
+        spoilt = np.stack([unusable[..., members].any(axis=-1) for members in bins.T], axis=-1)
+        unusable[:, dead[0], dead[1]] = True
         binned = binned.reshape(-1, *binned.shape[2:])
         of_light = self.noise.counts_per_electron * np.maximum(binned.mean(axis=1), 0.0)
         variance = of_light + self.noise.read_noise**2 @ bins
         static = static_pixels(binned, np.where(spoilt.reshape(variance.shape), np.inf, variance))
-        return static.reshape(first.shape[:2]), saturated
+        return static.reshape(first.shape[:2]), unusable
 
     def sum_over(
         self, static: Bool[np.ndarray, "survey samples"], unusable: Bool[np.ndarray, "survey samples bands"]
@@ -240,12 +245,18 @@ class _Survey:
         of_element = static.sum(axis=0)[:, None] - (unusable & static[..., None]).sum(axis=0)
         total = np.empty((self.frames, bands))
         for frame in range(self.frames):
-            counts = self.read_lines(frame)
+            counts, _ = self._read(frame)
             total[frame] = np.matmul(weight, counts.astype(np.float32)).sum(axis=(0, 1), dtype=np.float64)
             total[frame] -= np.bincount(left_out[2], counts[left_out], minlength=bands)
             total[frame] -= (of_element * self._dark(frame, samples)).sum(axis=0)
         readings = of_element.sum(axis=0)
         return total, self.noise.counts_per_electron * np.maximum(total, 0.0) + readings * self.noise.read_noise**2
+
+    def _read(self, frame: int) -> tuple[Num[np.ndarray, "survey samples bands"], np.ndarray | None]:
+        """Raw counts of a frame's lines, 0 where there is no data, and where that is; None where there is nowhere."""
+        counts = self.read_lines(frame)
+        missing = no_data(counts, None)
+        return counts if missing is None else np.where(missing, 0, counts), missing
 
     def _dark(self, frame: int, samples: int) -> Float[np.ndarray, "samples bands"]:
         dark = self.dark[frame if len(self.dark) > 1 else 0].astype(np.float32)

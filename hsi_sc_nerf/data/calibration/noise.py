@@ -59,7 +59,7 @@ def measure_noise(
 
     Args:
         white: counts of the white tarp; a memory map is read in part only.
-        region: where the image shows nothing but tarp.
+        region: where the image shows nothing but tarp, and all of it is data.
         dark: counts without light that belong to it; without any, the dark level is taken for 0.
         saturation_counts: counts from which a reading is saturated; None where nothing is.
         dead: detector elements that do not follow the light.
@@ -176,7 +176,8 @@ def _second_differences(
     total = np.zeros(white.shape[1:])
     saturated = np.zeros(white.shape[1:], bool)
     for n, centre in enumerate(centres):
-        three = white[centre - 1 : centre + 2].astype(np.float32) * inside[n][:, None]
+        # Counts outside may be no numbers, which times 0 would still be none.
+        three = np.where(inside[n][:, None], white[centre - 1 : centre + 2], 0).astype(np.float32)
         difference[n] = three[0] - 2.0 * three[1] + three[2]
         total += three[1]
         if saturation_counts is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
@@ -20,14 +20,14 @@ from hsi_sc_nerf.data.calibration.lamp_drift import (
     survey_count,
     survey_lines,
 )
+from hsi_sc_nerf.data.calibration.no_data import filled, no_data
 from hsi_sc_nerf.data.calibration.noise import NoiseModel, measure_noise
 from hsi_sc_nerf.data.calibration.panel import read_panel
 from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty, reflectance_uncertainty
-from hsi_sc_nerf.data.calibration.white_reference import White, WhiteReference
+from hsi_sc_nerf.data.calibration.white_reference import White, WhiteReference, tarp_roi
 from hsi_sc_nerf.data.calibration.white_source import (
     exposure_over,
-    tarp_roi,
     white_cubes,
     white_over_sample_time,
     white_source,
@@ -121,8 +121,6 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     first = captures[0].cube
     lines, samples, bands = first.shape
     darks = _dark_spectra(captures)
-    if source == "tarp":
-        config = replace(config, roi=config.roi or tarp_roi(session, config))
     defects = _defects(session, source, config)
     whites = whites_of_frames(session, source, config, defects)
     panel = np.ones(bands)
@@ -136,7 +134,11 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     exposures = np.array([exposure_over(capture, captures[0]) for capture in captures])
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
-        counts = np.asarray(captures[frame].cube.memmap()[survey])
+        cube = captures[frame].cube
+        counts = np.asarray(cube.memmap()[survey])
+        missing = no_data(counts, cube.ignore_value)
+        if missing is not None:
+            counts = np.where(missing, np.float32(np.nan), counts)
         return counts if exposures[frame] == 1.0 else counts / exposures[frame]
 
     drift = measure_lamp_drift(
@@ -227,7 +229,12 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     of_frames = [_readings(captures[i].cube, captures[i].dark, rows) for i in chosen]
     good_bands = np.logical_and.reduce([capture.cube.good_bands for capture in captures])
     cube, dark = white_cubes(session, source)
-    inside = slice(None) if source == "capture" or config.roi is None else slice(max(0, config.roi[1]), config.roi[3])
+    roi = None if source == "capture" else config.roi
+    if source == "tarp" and roi is None:
+        assert session.white is not None
+        # Once the dead elements are known, it is found again without them (`white_reference`).
+        roi = tarp_roi(session.white, config)
+    inside = slice(None) if roi is None else slice(max(0, roi[1]), roi[3])
     white = _readings(cube, dark, np.arange(cube.shape[0])[inside])
     if white.counts.shape[1] != samples:
         white, of_frames = of_frames[0], of_frames[1:]
@@ -235,7 +242,8 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
 
 
 def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> Readings:
-    return Readings(np.asarray(cube.memmap()[rows]), None if dark is None else dark.memmap())
+    counts = filled(np.asarray(cube.memmap()[rows]), cube.ignore_value)
+    return Readings(counts, None if dark is None else dark.memmap())
 
 
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:
@@ -245,9 +253,14 @@ def _noise(session: Session, source: WhiteSource, white: White, defects: Defects
         x0, y0, x1, y1 = white.roi
         region[:] = False
         region[y0:y1, x0:x1] = white.mask
+    counts = cube.memmap()
+    for number in np.flatnonzero(region.any(axis=1)):
+        missing = no_data(counts[number], cube.ignore_value)
+        if missing is not None:
+            region[number] &= ~missing.any(axis=-1)
     same_detector = cube.shape[1:] == defects.dead.shape
     return measure_noise(
-        cube.memmap(),
+        counts,
         region,
         None if dark is None else dark.memmap(),
         saturation_counts=defects.saturation_counts,

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig
 from hsi_sc_nerf.data.calibration.dark import dark_columns
 from hsi_sc_nerf.data.calibration.defects import Defects, unlit_bands
+from hsi_sc_nerf.data.calibration.no_data import filled, no_data
 from hsi_sc_nerf.data.calibration.white_steps import (
     ColumnSums,
     column_sums,
@@ -84,16 +85,31 @@ def white_reference(capture: Capture, config: CalibrationConfig, defects: Defect
         InputError: a ROI outside the image, a tarp with no usable region, or a white that is not lit in half of the
             bands.
     """
-    header = capture.cube.header_path
-    roi = config.roi
+    return _white_in(capture, config.roi or tarp_roi(capture, config, defects), config, defects)
+
+
+def tarp_roi(
+    capture: Capture, config: CalibrationConfig, defects: Defects | None = None
+) -> tuple[int, int, int, int]:
+    """Step 1: where the tarp is in its image (x0, y0, x1, y1), by the brightness of what is neither dead nor no data.
+
+    Raises:
+        InputError: the image is dark.
+    """
+    cube = capture.cube
+    live = ~_dead(defects, *cube.shape[1:])
+    brightness = []
+    for line in cube.memmap():
+        missing = no_data(line, cube.ignore_value)
+        used = live if missing is None else live & ~missing
+        # A sample of which nothing is used is dark.
+        brightness.append(np.where(used, line, 0).sum(axis=-1, dtype=np.float64) / np.maximum(used.sum(axis=-1), 1))
+    roi = find_coarse_roi(np.stack(brightness), config.roi_brightness)
     if roi is None:
-        live = ~_dead(defects, *capture.cube.shape[1:])
-        # A sample whose elements are all dead is dark.
-        brightness = [line.sum(axis=-1, dtype=np.float64, where=live) for line in capture.cube.read()]
-        roi = find_coarse_roi(np.stack(brightness) / np.maximum(live.sum(axis=-1), 1), config.roi_brightness)
-    if roi is None:
-        raise InputError(f"{header}: the tarp has no usable region, because the image is dark; take it again.")
-    return _white_in(capture, roi, config, defects)
+        raise InputError(
+            f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
+        )
+    return roi
 
 
 def target_white(frame: Capture, config: CalibrationConfig, defects: Defects | None = None) -> WhiteReference:
@@ -161,7 +177,7 @@ def _white_in(
         )
     inside = np.ascontiguousarray(cube.memmap()[y0:y1, x0:x1], dtype=cube.dtype.newbyteorder("="))
     dead = _dead(defects, samples, bands)[x0:x1]
-    deviation = deviation_map(inside, dead)
+    deviation = deviation_map(filled(inside, cube.ignore_value), dead)
     kernel_px = max(config.morphology_min_px, min(inside.shape[:2]) // config.morphology_fraction)
     mask = white_mask(deviation, percentile=config.percentile, kernel_px=kernel_px)
     if not mask.any() or not deviation[mask].mean() <= config.max_deviation:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from hsi_sc_nerf.data.calibration.config import CalibrationConfig, WhiteSource
 from hsi_sc_nerf.data.calibration.defects import Defects
 from hsi_sc_nerf.data.calibration.white_reference import White, column_white, target_white, white_reference
-from hsi_sc_nerf.data.calibration.white_steps import find_coarse_roi
 from hsi_sc_nerf.data.envi import Cube
 from hsi_sc_nerf.data.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
@@ -38,23 +35,6 @@ def white_source(session: Session, config: CalibrationConfig) -> WhiteSource:
         }[config.white_source]
         raise InputError(f"{session.path}: {lacks}; choose another --calibration.white-source, or auto.")
     return config.white_source
-
-
-def tarp_roi(session: Session, config: CalibrationConfig) -> tuple[int, int, int, int]:
-    """Where the tarp is in its image (x0, y0, x1, y1), found by its brightness.
-
-    Raises:
-        InputError: the image is dark.
-    """
-    assert session.white is not None
-    cube = session.white.cube
-    brightness = np.stack([line.mean(axis=-1, dtype=np.float64) for line in cube.memmap()])
-    roi = find_coarse_roi(brightness, config.roi_brightness)
-    if roi is None:
-        raise InputError(
-            f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
-        )
-    return roi
 
 
 def whites_of_frames(

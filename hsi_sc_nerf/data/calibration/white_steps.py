@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
+from hsi_sc_nerf.data.calibration.no_data import no_data
 from hsi_sc_nerf.data.regions import ellipse_close_open, largest_component
 
 
@@ -77,11 +78,12 @@ def column_sums(
     ignore_value: float | None = None,
     saturation_counts: float | None = None,
 ) -> ColumnSums:
-    """Add up each column's counts inside the mask; counts that equal ``ignore_value`` are no data and left out."""
+    """Add up each column's counts inside the mask; what is no data (`no_data`) is left out."""
     sums = np.zeros(white.shape[1:])
     numbers, saturated = np.zeros((2, *white.shape[1:]), np.int64)
     for line, kept in zip(white, mask, strict=True):
-        valid = kept[:, None] if ignore_value is None else kept[:, None] & (line != ignore_value)
+        missing = no_data(line, ignore_value)
+        valid = kept[:, None] if missing is None else kept[:, None] & ~missing
         np.add(sums, line, out=sums, where=valid)
         numbers += valid
         if saturation_counts is not None:

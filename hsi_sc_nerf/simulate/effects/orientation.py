@@ -26,7 +26,3 @@ class ImageRotation(OrientationEffect):
     def orient(self, image: np.ndarray) -> np.ndarray:
         """Turn an upright image (lines, samples, ...) to how it lies in the file."""
         return np.ascontiguousarray(np.rot90(image, self.quarter_turns))
-
-    def upright(self, image: np.ndarray) -> np.ndarray:
-        """Turn an image (lines, samples, ...) of the file back."""
-        return np.ascontiguousarray(np.rot90(image, -self.quarter_turns))
