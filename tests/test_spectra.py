@@ -76,10 +76,11 @@ def test_composites_show_their_wavelengths(device, name, rgb_nm):
 
 def test_wavelengths_without_a_band_near_them_are_refused():
     visible = np.arange(400.0, 701.0, 5.0)
-    assert covered(visible, (400.0, 551.0, 705.0, 710.0, 710.5)).tolist() == [True, True, True, True, False]
+    assert covered(visible, (400.0, 551.0, 710.0)).all()
+    assert covered(visible, (400.0, 551.0, 710.5)).tolist() == [True, True, False]
     with pytest.raises(InputError, match="NDVI needs a band near 800 nm, and the 61 bands given, 400 to 700 nm"):
         index_values(INDICES["NDVI"], np.ones((1, 61)), visible)
-    with pytest.raises(InputError, match="near 980, 850 nm"):
+    with pytest.raises(InputError, match="near 980 and another near 850 nm, and the 61 bands"):
         require_bands(visible, (980.0, 850.0, 550.0), "a picture")
 
 
@@ -87,5 +88,21 @@ def test_a_gap_is_no_band_but_coarse_bands_are():
     with_gap = np.concatenate([np.arange(400.0, 880.0, 3.0), np.arange(990.0, 1003.0, 3.0)])
     assert covered(with_gap, (900.0, 970.0, 995.0)).tolist() == [False, False, True]
     coarse = np.linspace(397.32, 1003.58, 12)
-    assert covered(coarse, tuple(np.arange(371.0, 1030.0))).all()
+    assert all(covered(coarse, (nm,)).all() for nm in np.arange(371.0, 1030.0))
     assert not covered(coarse, (365.0, 1035.0)).any()
+    assert covered(coarse, (450.0, 450.0)).all()
+
+
+@pytest.mark.parametrize(
+    ("centres_nm", "index", "missing"),
+    [
+        # Too far away, however far apart the bands are.
+        ([550.0, 670.0, 800.0], "red-edge NDVI", "750 and another near 705 nm, and the 3 bands"),
+        ([449.0, 598.0, 980.0], "water index", "900 nm, and the 3 bands"),
+        # Near both: the index would be 0 whatever the surface.
+        ([620.0, 727.0, 800.0], "red-edge NDVI", "750 and another near 705 nm, and the 3 bands"),
+    ],
+)
+def test_a_band_stands_for_one_wavelength_near_it(centres_nm, index, missing):
+    with pytest.raises(InputError, match=f"{index} needs a band near {missing}"):
+        index_values(INDICES[index], np.ones((1, 3)), np.array(centres_nm))

@@ -111,24 +111,27 @@ def small_cloud(path):
 
 
 @pytest.mark.slow
-def test_command_writes_all_results(tmp_path):
+def test_command_writes_all_results(tmp_path, capsys):
     true = small_cloud(tmp_path / "cloud.ply")
     rows = [f"{nm},{skin},{bruise}" for nm, skin, bruise in zip(NM, *true.endmembers, strict=True)]
     (tmp_path / "library.csv").write_text("\n".join(["wavelength_nm,skin,bruise", *rows]))
+    # Brackets would be taken for colours of the terminal.
+    output = tmp_path / "out[bold]"
     TraitsCommand(
         tmp_path / "cloud.ply",
-        tmp_path / "out",
+        output,
         mesh=MeshConfig(octree_depth=6, base_height_m=STAND_M),
         splits=1,
         library=tmp_path / "library.csv",
         roi=(("spot", 0.0, 0.02, STAND_M + 0.025, 0.006),),
     ).main()
-    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert str(output / "traits.md") in capsys.readouterr().err
+    written = {path.name for path in output.iterdir()}
     assert written == {
         *("traits.md", "traits.json", "spectra.csv", "mesh.ply"),
         *("composites.png", "indices.png", "classes.png", "classes_by_mixture.png", "region_spectra.png"),
     }
-    content = json.loads((tmp_path / "out" / "traits.json").read_text())
+    content = json.loads((output / "traits.json").read_text())
     assert content["watertight"]
     assert content["size"]["area_m2"] == pytest.approx(true.mesh.area_m2(), rel=0.03)
     assert content["size"]["volume_l"] == pytest.approx(1000.0 * true.mesh.volume_m3(), rel=0.03)
@@ -137,11 +140,11 @@ def test_command_writes_all_results(tmp_path):
     for area in ("areas_m2", "mixture_areas_m2"):
         assert content["classes"][area] == pytest.approx({"skin": side_m2, "bruise": side_m2}, rel=0.1)
     assert content["regions"]["spot"]["area_m2"] == pytest.approx(np.pi * 0.006**2, rel=0.15)
-    table = np.loadtxt(tmp_path / "out" / "spectra.csv", delimiter=",", skiprows=1)
+    table = np.loadtxt(output / "spectra.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(table[:, 0], NM, rtol=1e-5)
     np.testing.assert_allclose(table[:, -2], true.endmembers[1], atol=0.002)
-    assert len(read_spectral_ply(tmp_path / "out" / "mesh.ply").points) > 1000
-    page = (tmp_path / "out" / "traits.md").read_text()
+    assert len(read_spectral_ply(output / "mesh.ply").points) > 1000
+    page = (output / "traits.md").read_text()
     assert "watertight" in page
     assert all(f"({name})" in page for name in written if name.endswith(".png"))
 
@@ -153,6 +156,8 @@ def test_command_writes_all_results(tmp_path):
         ({"classes": ("bruise",)}, "give it with --library"),
         ({"mesh": MeshConfig(octree_depth=20)}, "octree-depth is 20"),
         ({"mesh": MeshConfig(smoothing_radius_m=0.0)}, "smoothing-radius-m is 0.0"),
+        ({"angle_rad": 0.0}, "--angle-rad is 0.0"),
+        ({"angle_rad": 10.0}, "--angle-rad is 10.0"),
         ({"roi_file": "none.yaml"}, "no such file"),
         ({}, "no such file"),
     ],
@@ -161,3 +166,14 @@ def test_command_refuses_what_it_cannot_use(tmp_path, settings, says):
     with pytest.raises(InputError, match=says):
         TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", **settings).main()
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("bands", "says"), [(slice(None), "covers the cloud"), (slice(3, 4), "has one band")])
+def test_a_library_that_does_not_fit_is_refused_before_the_work(tmp_path, monkeypatch, bands, says):
+    monkeypatch.setattr("hsi_sc_nerf.traits.poisson.closed_mesh", None)
+    nothing = np.zeros((2, 3))
+    spectra = np.ones((2, len(NM[bands])))
+    write_spectral_ply(tmp_path / "cloud.ply", nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    (tmp_path / "library.csv").write_text("nm,a\n450,0.1\n900,0.2\n")
+    with pytest.raises(InputError, match=says):
+        TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", library=tmp_path / "library.csv").main()

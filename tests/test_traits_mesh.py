@@ -179,3 +179,28 @@ def test_too_few_or_flat_points_are_refused():
         closed_mesh(points * [1.0, 1.0, 0.0], normals, MeshConfig())
     with pytest.raises(InputError, match="it is in metres"):
         closed_mesh(points * 1e-3, normals, MeshConfig())
+
+
+@pytest.mark.parametrize(
+    ("scale", "side", "base_height_m", "says"),
+    [
+        (100.0, 1.0, None, "is it in metres"),
+        (1e8, 1.0, None, "is it in metres"),
+        (1.0, -1.0, STAND_M, "normals do not point out"),
+        (1.0, 0.0, None, "normals do not point out"),
+        (1.0, 1.0, 1000.0 * STAND_M, "below the base at 70 m"),
+        (1.0, 1.0, STAND_M + 0.02, "below the base at 0.09 m"),
+    ],
+)
+def test_clouds_in_other_units_inside_out_or_below_their_base_are_refused(scale, side, base_height_m, says):
+    points, normals = sphere_points(3000, above=-0.93)
+    with pytest.raises(InputError, match=says):
+        closed_mesh(scale * points, side * normals, MeshConfig(base_height_m=base_height_m))
+
+
+def test_a_base_a_little_above_the_edge_needs_no_wall():
+    points, normals = sphere_points(20000, above=-0.5)
+    edge_m = STAND_M + 0.5 * RADIUS_M
+    closing, outward = find_base(points, normals, edge_m + 0.002).points(0.0005)
+    np.testing.assert_allclose(closing[:, 2], edge_m + 0.002)
+    np.testing.assert_allclose(outward, np.tile([0.0, 0.0, -1.0], (len(outward), 1)))

@@ -1,4 +1,6 @@
-"""Spectra on a mesh: classes and their areas, regions, libraries, the PLY file."""
+"""Spectra on a mesh: classes and their areas, regions, pictures, the PLY file."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ from hsi_sc_nerf.traits.classes import (
     spectral_angles,
     vertex_areas_m2,
 )
-from hsi_sc_nerf.traits.library import SpectralLibrary, read_library
+from hsi_sc_nerf.traits.library import SpectralLibrary
+from hsi_sc_nerf.traits.pictures import SideViews
 from hsi_sc_nerf.traits.regions import PickedRegion, picked_region, read_regions, weighted_mean_and_sd
 from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh, vertex_normals, with_spectra, write_mesh
 
@@ -138,26 +141,31 @@ def test_vertices_take_the_spectra_of_points_near_them():
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
 
 
-def test_points_seen_too_obliquely_give_no_spectra():
+@pytest.mark.parametrize(("spectrum", "incidence_deg"), [(9.0, 71.0), (np.nan, 0.0)])
+def test_points_seen_too_obliquely_or_without_a_spectrum_give_none(spectrum, incidence_deg):
     surface = two_halves()
     points = surface.mesh.vertices
     left = points[:, 1] < 0.0
-    spectra = np.where(left[:, None], 9.0, surface.spectra).astype(np.float32)
+    spectra = np.where(left[:, None], spectrum, surface.spectra).astype(np.float32)
     colours = np.zeros((len(points), 3), np.uint8)
-    cloud = SpectralCloud(points, points, colours, spectra, NM, {INCIDENCE: np.where(left, 71.0, 69.0)})
+    cloud = SpectralCloud(points, points, colours, spectra, NM, {INCIDENCE: np.where(left, incidence_deg, 69.0)})
     found = with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=70.0)
     assert found.spectra.max() <= 1.0
     assert not found.seen[points[:, 1] < -0.002].any()
     assert found.seen[~left].all()
-    assert with_spectra(surface.mesh, cloud, 0.001).seen.all()
+    assert with_spectra(surface.mesh, cloud, 0.001).seen.all() == np.isfinite(spectrum)
     with pytest.raises(InputError, match="no point of the cloud is seen at 60 degrees or less"):
         with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=60.0)
+    with pytest.raises(InputError, match="no point of the cloud has a spectrum"):
+        with_spectra(surface.mesh, replace(cloud, spectra=np.full_like(spectra, np.nan)), 0.001)
 
 
-def test_mesh_is_a_cloud_with_triangles(tmp_path):
+@pytest.mark.parametrize("bands", [slice(None), slice(25, 26)])
+def test_mesh_is_a_cloud_with_triangles(tmp_path, bands):
     import open3d as o3d
 
     surface = two_halves()
+    surface = replace(surface, spectra=surface.spectra[:, bands], wavelengths_nm=NM[bands])
     write_mesh(tmp_path / "mesh.ply", surface, {"class": np.ones(len(surface.seen))})
     read = read_spectral_ply(tmp_path / "mesh.ply")
     np.testing.assert_allclose(read.spectra, surface.spectra)
@@ -167,50 +175,12 @@ def test_mesh_is_a_cloud_with_triangles(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
 
 
-def test_library_from_csv(tmp_path):
-    path = tmp_path / "library.csv"
-    path.write_text("wavelength_um,green,brown\n0.4,0.1,0.4\n1.0,0.6,0.3\n")
-    library = read_library(path)
-    np.testing.assert_allclose(library.at(NM).spectra, LIBRARY.spectra, atol=1e-12)
-    assert library.only(("brown",)).names == ("brown",)
-    with pytest.raises(InputError, match=r"no moss; it has green, brown"):
-        library.only(("moss",))
-    with pytest.raises(InputError, match="covers the cloud"):
-        library.at(np.array([390.0, 500.0]))
-
-
-def test_library_from_envi(tmp_path):
-    from spectral.io import envi
-
-    header = {"wavelength": [f"{nm / 1000:.5f}" for nm in NM], "wavelength units": "Micrometers"}
-    header |= {"spectra names": list(LIBRARY.names)}
-    envi.SpectralLibrary(LIBRARY.spectra.astype(np.float32), header).save(str(tmp_path / "library"))
-    for name in ("library.sli", "library.hdr"):
-        read = read_library(tmp_path / name)
-        assert read.names == LIBRARY.names
-        np.testing.assert_allclose(read.wavelengths_nm, NM, atol=0.01)
-        np.testing.assert_allclose(read.spectra, LIBRARY.spectra, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "content", ["", "wavelength_nm\n400\n", "nm,a\n400,x\n", "nm,a\n400,0.1,0.2\n", "nm,a\n400,nan\n"]
-)
-def test_unreadable_tables_are_refused(tmp_path, content):
-    path = tmp_path / "library.csv"
-    path.write_text(content)
-    with pytest.raises(InputError, match=r"library\.csv"):
-        read_library(path)
-
-
-def test_missing_or_broken_envi_libraries_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_library(tmp_path / "none.sli")
-    (tmp_path / "lonely.sli").write_bytes(b"")
-    with pytest.raises(InputError, match=r"lonely\.hdr is missing"):
-        read_library(tmp_path / "lonely.sli")
-    (tmp_path / "lonely.hdr").write_text("no header")
-    with pytest.raises(InputError, match="no readable ENVI spectral library"):
-        read_library(tmp_path / "lonely.sli")
+@pytest.mark.parametrize(("width_m", "height_m", "columns"), [(0.02, 0.05, 168), (0.1, 0.005, 840)])
+def test_pictures_hold_tall_and_flat_objects(width_m, height_m, columns):
+    for hit, *_ in SideViews(cylinder(width_m, height_m, segments=64)).sides:
+        assert hit.shape == pytest.approx((420, columns), abs=1)
+        assert np.ptp(np.flatnonzero(hit.any(axis=0))) == pytest.approx(columns / 1.04, rel=0.01)
+        assert hit.any(axis=1).mean() == pytest.approx(height_m / width_m * columns / 420 / 1.04, rel=0.05)
 
 
 def test_regions_from_yaml(tmp_path):

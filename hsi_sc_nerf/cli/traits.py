@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
@@ -80,6 +82,8 @@ class TraitsCommand:
             library = library.only(self.classes)
         config = replace(self.mesh, base_height_m=self._base_height_m())
         cloud = read_spectral_ply(self.cloud)
+        if library is not None:
+            library = library.at(cloud.wavelengths_nm)
 
         console = Console(stderr=True)
         with console.status("closing the surface"):
@@ -94,7 +98,7 @@ class TraitsCommand:
             traits = analyse(surface, picked, found)
         with console.status("tables and pictures"):
             self._write(surface, size, spread, traits, config)
-        console.print(f"Traits, with pictures: {self.output_dir / 'traits.md'}", soft_wrap=True)
+        console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
 
     def _check(self) -> None:
         """Refuse now what would fail after minutes."""
@@ -104,6 +108,8 @@ class TraitsCommand:
             raise InputError(f"--mesh.octree-depth is {self.mesh.octree_depth}; it must be from 4 to 12.")
         if not self.mesh.smoothing_radius_m > 0.0:
             raise InputError(f"--mesh.smoothing-radius-m is {self.mesh.smoothing_radius_m}; it must be more than 0.")
+        if not 0.0 < self.angle_rad <= math.pi:
+            raise InputError(f"--angle-rad is {self.angle_rad}; give more than 0 and at most pi (0.1 is usual).")
         if self.classes and self.library is None:
             raise InputError("--classes names spectra of a library; give it with --library.")
 

@@ -17,13 +17,21 @@ Spectra = TypeVar("Spectra", np.ndarray, Tensor)
 
 NEAR_NM = 10.0
 """A band whose centre is this near stands for a wavelength; so does one nearer than half the distance of bands."""
+FAR_NM = 30.0
+"""A band further away than this does not, however far apart the bands are."""
 
 
 def covered(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Sequence[float]) -> Bool[np.ndarray, "targets"]:
-    """Which wavelengths have a band near enough to stand for them: not those beyond the ends or in a gap."""
+    """Which of the wavelengths that one formula names have a band near enough to stand for them, and only for them.
+
+    Not those beyond the ends or in a gap; nor two that share a band, of which any ratio is 1 and any difference 0.
+    """
+    targets = np.asarray(targets_nm, float)
     spacing_nm = np.median(np.diff(np.sort(wavelengths_nm))) if len(wavelengths_nm) > 1 else 0.0
-    nearest = wavelengths_nm[nearest_bands(wavelengths_nm, targets_nm)]
-    return np.abs(nearest - np.asarray(targets_nm, float)) <= max(NEAR_NM, spacing_nm / 2.0)
+    bands = nearest_bands(wavelengths_nm, targets)
+    near = np.abs(wavelengths_nm[bands] - targets) <= np.clip(spacing_nm / 2.0, NEAR_NM, FAR_NM)
+    shared = (bands[:, None] == bands) & (targets[:, None] != targets) & near
+    return near & ~shared.any(axis=1)
 
 
 def require_bands(
@@ -32,13 +40,14 @@ def require_bands(
     """Index of the band that stands for each wavelength, which ``what`` is made of.
 
     Raises:
-        InputError: a wavelength has no band near it.
+        InputError: a wavelength has no band near it, or none that stands for it alone.
     """
     missing = np.asarray(targets_nm, float)[~covered(wavelengths_nm, targets_nm)]
     if len(missing):
+        near = " and another near ".join(f"{target:g}" for target in missing)
         raise InputError(
-            f"{what} needs a band near {', '.join(f'{target:g}' for target in missing)} nm, and the "
-            f"{len(wavelengths_nm)} bands given, {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm, have none "
-            "there; choose something else, or give more bands."
+            f"{what} needs a band near {near} nm, and the {len(wavelengths_nm)} bands given, "
+            f"{wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm, do not have that; choose something else, or "
+            "give more bands."
         )
     return nearest_bands(wavelengths_nm, targets_nm)

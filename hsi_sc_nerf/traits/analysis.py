@@ -86,10 +86,8 @@ def classified(
     by mixture, to the class that holds most of it: a blurred edge stays where it was, because half is half.
 
     Raises:
-        InputError: the library does not cover the bands, or the threshold is no angle.
+        InputError: the library does not cover the bands.
     """
-    if not 0.0 < threshold_rad <= np.pi:
-        raise InputError(f"the spectral angle's threshold is {threshold_rad} rad; give more than 0 (0.1 is usual).")
     references = library.at(surface.wavelengths_nm).spectra
     names = tuple(dict.fromkeys(library.names))
     # The last entry is what the index -1 finds.

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 
+from hsi_sc_nerf.errors import InputError
+
 SECTORS = 72
 # Share of a sector's points that lie below its edge: strays.
 _STRAYS = 0.005
@@ -15,6 +17,8 @@ _STRAYS = 0.005
 _STRIP_M = 0.003
 # A skirt that is flatter than this (radius to height) would reach far on little evidence.
 _FLATTEST = 2.0
+# How far errors of the cloud and of the base's height may put the surface's edge below the base.
+_BELOW_BASE_M = 0.005
 
 
 @dataclass(frozen=True)
@@ -44,12 +48,14 @@ class Base:
             self._at(values, azimuth) for values in (self.edge_height_m, self.edge_radius_m, self.foot_radius_m)
         )
         out = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-        length_m = np.hypot(edge_r - foot_r, edge_z - self.height_m)
+        # An edge a little below the base needs no wall.
+        drop_m = np.maximum(edge_z - self.height_m, 0.0)
+        length_m = np.hypot(edge_r - foot_r, drop_m)
         steps = int(np.ceil(length_m.max() / spacing_m))
         share = (np.arange(steps) + 0.5)[:, None] / max(steps, 1)
-        radius, z = edge_r + share * (foot_r - edge_r), edge_z + share * (self.height_m - edge_z)
+        radius, z = edge_r + share * (foot_r - edge_r), edge_z - share * drop_m
         wall = np.concatenate([radius[..., None] * out, z[..., None]], axis=-1)
-        wall_normals = np.concatenate([(edge_z - self.height_m)[:, None] * out, (foot_r - edge_r)[:, None]], axis=-1)
+        wall_normals = np.concatenate([drop_m[:, None] * out, (foot_r - edge_r)[:, None]], axis=-1)
         wall_normals = np.broadcast_to(wall_normals, wall.shape)
         # Where the seen surface reaches the base there is no wall.
         real = np.broadcast_to(length_m > spacing_m, wall.shape[:2])
@@ -77,6 +83,9 @@ def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
         points_m: the seen surface.
         normals: unit normals, outwards.
         height_m: z of the plane that the object stands on.
+
+    Raises:
+        InputError: the surface ends clearly below that plane.
     """
     z, centre = points_m[:, 2], _centre(points_m)
     offset = points_m[:, :2] - centre
@@ -91,6 +100,11 @@ def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
         edge_r[index] = np.median(radius[strip][z[strip] <= np.median(z[strip])])
         slope[index] = np.clip(-normals[strip, 2].mean() / max(outwards[strip].mean(), 1e-6), 0.0, _FLATTEST)
     edge_z, edge_r, slope = (_smooth_around(values) for values in (edge_z, edge_r, slope))
+    if (edge_m := float(np.median(edge_z))) < height_m - _BELOW_BASE_M:
+        raise InputError(
+            f"the cloud ends at a height of {edge_m:.4f} m, below the base at {height_m:g} m; take away what is "
+            "under the object (export without --keep-turntable), or correct the base's height (metres)."
+        )
     foot_r = np.maximum(edge_r - slope * np.maximum(edge_z - height_m, 0.0), 0.0)
     return Base(centre, height_m, edge_z, edge_r, foot_r)
 

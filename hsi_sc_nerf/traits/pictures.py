@@ -22,6 +22,8 @@ from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
 
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
+_LABEL_IN = 1.4
+"""What the label beside a row needs."""
 _GREY = 0.85
 """What was not seen."""
 _NEAR_WHITE = 0.97
@@ -29,7 +31,10 @@ _NEAR_WHITE = 0.97
 
 
 class SideViews:
-    """Parallel projections of a mesh, seen from the sides; each pixel knows its triangle."""
+    """Parallel projections of a mesh, seen from the sides; each pixel knows its triangle.
+
+    What is flat stands in the middle of pictures that are twice as wide as high.
+    """
 
     def __init__(self, mesh: Mesh, height_px: int = _HEIGHT_PX) -> None:
         self._mesh = mesh
@@ -37,7 +42,7 @@ class SideViews:
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         middle = (low + high) / 2.0
         reach_m = float(np.linalg.norm(mesh.vertices[:, :2] - middle[:2], axis=1).max())
-        step_m = 1.04 * (high[2] - low[2]) / height_px
+        step_m = 1.04 * max(high[2] - low[2], reach_m) / height_px
         columns = int(np.ceil(2.08 * reach_m / step_m))
         across = (np.arange(columns) + 0.5 - columns / 2) * step_m
         up = (height_px / 2 - np.arange(height_px) - 0.5) * step_m
@@ -110,7 +115,8 @@ def _draw_rows(
 ) -> None:
     first = next(iter(rows.values()))[0]
     width_in = 1.75
-    figure = _figure(width_in * len(SIDES_DEG) + 1.0, width_in * first.shape[0] / first.shape[1] * len(rows) + 0.35)
+    row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
+    figure = _figure(width_in * len(SIDES_DEG) + 1.0, row_in * len(rows) + 0.35)
     grid = figure.subplots(len(rows), len(SIDES_DEG), squeeze=False)
     for line, (label, pictures) in zip(grid, rows.items(), strict=True):
         for axes, picture in zip(line, pictures, strict=True):
@@ -164,7 +170,9 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
         colour = "0.35" if index == 0 else _COLOURS[(index - 1) % len(_COLOURS)]
         mean, sd = region.mean[order], region.sd[order]
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
-        axes.plot(nm, mean, color=colour, linewidth=1.5, label=f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)")
-    axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", xlim=(nm[0], nm[-1]), ylim=(0, None))
+        label = f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)"
+        axes.plot(nm, mean, color=colour, linewidth=1.5, marker="o" if len(nm) == 1 else None, label=label)
+    axes.margins(x=0.0)
+    axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", ylim=(0, None))
     figure.legend(loc="outside right upper", fontsize=8)
     _save(figure, path)

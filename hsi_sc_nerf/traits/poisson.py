@@ -17,6 +17,8 @@ from hsi_sc_nerf.traits.smoothing import NEIGHBOURS, smoothed, thinned
 
 # Points that a quadric is fitted to lie a third of its radius apart: about thirty weigh in.
 _THINNING = 3.0
+# Cubes of the thinning's size along the cloud's longest side, above which memory would not do.
+_MOST_CUBES = 5000
 # Share of the triangles below which a piece is a speck.
 _SMALLEST_PIECE = 0.001
 
@@ -47,15 +49,21 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
         config: settings.
 
     Raises:
-        InputError: there are too few points, or they lie in one place.
+        InputError: there are too few points, they lie in one place or too far apart, their normals do not point
+            outwards, or they end below the base.
     """
     if len(points_m) < NEIGHBOURS or np.ptp(points_m, axis=0).min() <= 0.0 or not np.isfinite(points_m).all():
         raise InputError(
             f"the cloud has {len(points_m)} points that do not surround a solid; export more points of the object."
         )
     points, facing = np.asarray(points_m, float), np.asarray(normals, float)
+    spacing_m, extent_m = config.smoothing_radius_m / _THINNING, float(np.ptp(points, axis=0).max())
+    if extent_m > _MOST_CUBES * spacing_m:
+        raise InputError(
+            f"the cloud is {extent_m:.4g} m large, too large for a smoothing radius of {config.smoothing_radius_m} "
+            "m; is it in metres? Scale it to metres, take away what is not the object, or raise the radius."
+        )
     base_height_m = lowest_edge_m(points) if config.base_height_m is None else config.base_height_m
-    spacing_m = config.smoothing_radius_m / _THINNING
     points, facing = thinned(points, facing, spacing_m)
     inner = ~lower_rim(points, config.smoothing_radius_m / 2.0)
     points, facing = points[inner], facing[inner]
@@ -64,6 +72,10 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
             f"the cloud is too small for a smoothing radius of {config.smoothing_radius_m} m, which leaves "
             f"{len(points)} points; check that it is in metres, or lower the radius."
         )
+    # Over a surface that is open at its foot, and seen from there, outward normals add up to its volume.
+    from_foot = points - [*points[:, :2].mean(axis=0), points[:, 2].min()]
+    if not np.einsum("pi,pi->", from_foot, facing) > 0.0:
+        raise InputError("the cloud's normals do not point out of the object; flip them, or export the cloud again.")
     points, outward = smoothed(points, facing, config.smoothing_radius_m)
     base_points, base_normals = find_base(points, outward, base_height_m).points(spacing_m)
     return solid_pieces(

@@ -102,6 +102,7 @@ def write_traits_json(
             "areas_m2": dict(zip(classes.names, classes.areas_m2.tolist(), strict=True)),
             "unclassified_m2": classes.unclassified_m2,
             "mixture_areas_m2": dict(zip(classes.names, classes.mixture_areas_m2.tolist(), strict=True)),
+            "mixture_unclassified_m2": classes.mixture_unclassified_m2,
             "regions": [{**asdict(region), "label": classes.names[region.label]} for region in classes.regions],
         },
         "regions": {region.name: {"area_m2": region.area_m2} for region in traits.spectra},

@@ -13,12 +13,11 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.atomic import atomic_write
-from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.data.pseudo_rgb import nearest_bands, to_8_bit
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
 from hsi_sc_nerf.mesh import Mesh
-from hsi_sc_nerf.spectra.composites import composite
 from hsi_sc_nerf.traits.classes import vertex_areas_m2
 
 NEIGHBOURS = 8
@@ -52,6 +51,8 @@ def with_spectra(
 ) -> SpectralMesh:
     """Give each vertex the mean spectrum of the `NEIGHBOURS` nearest points, near ones weighing more.
 
+    Points whose spectrum is not finite are left out: `hsi-sc-nerf sample` writes NaN where no view sees a point.
+
     Args:
         mesh: in the frame of the cloud.
         cloud: the points it was made from.
@@ -62,7 +63,10 @@ def with_spectra(
     Raises:
         InputError: that leaves no point.
     """
-    used = np.flatnonzero(cloud.extra.get(INCIDENCE, np.zeros(len(cloud))) <= max_incidence_deg)
+    known = np.isfinite(cloud.spectra).all(axis=1)
+    if not known.any():
+        raise InputError("no point of the cloud has a spectrum; export the cloud again.")
+    used = np.flatnonzero(known & (cloud.extra.get(INCIDENCE, np.zeros(len(cloud))) <= max_incidence_deg))
     if len(used) == 0:
         raise InputError(
             f"no point of the cloud is seen at {max_incidence_deg:g} degrees or less from the front; raise "
@@ -100,7 +104,7 @@ def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndar
         InputError: the file cannot be written.
     """
     mesh = surface.mesh
-    colours = to_8_bit(composite(surface.spectra, surface.wavelengths_nm, paper.PSEUDO_RGB_NM, "pseudo-RGB"))
+    colours = to_8_bit(surface.spectra[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
     faces = np.empty(len(mesh.triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.triangles
     with atomic_write(path) as (temporary,):
