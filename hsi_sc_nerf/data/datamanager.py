@@ -60,7 +60,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
 
     def _pixels(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         return PixelSampler(
-            PixelReader([frame.cube() for frame in dataset.frames]),
+            PixelReader(frame.cube() for frame in dataset.frames),
             np.stack([frame.mask() for frame in dataset.frames]),
             num_rays_per_batch=num_rays,
             seed=self.config.seed,
