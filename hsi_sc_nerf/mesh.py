@@ -1,4 +1,4 @@
-"""Triangle meshes as plain arrays: area, volume, and casting rays at them."""
+"""Triangle meshes as plain arrays: area, volume, casting rays at them, and the triangles of PLY files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
+from plyfile import PlyData, PlyListProperty, PlyParseError
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -47,6 +48,31 @@ class Mesh:
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return np.cross(b - a, c - a)
+
+
+def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:
+    """Triangles of a PLY file that has vertices, larger faces cut into fans; a point cloud has 0.
+
+    Raises:
+        PlyParseError: the faces do not name their vertices, or name some that are not there.
+    """
+    if "face" not in content or not content["face"].count:
+        return np.zeros((0, 3), np.int64)
+    lists = [column.name for column in content["face"].properties if isinstance(column, PlyListProperty)]
+    name = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
+    if name is None:
+        raise PlyParseError("its faces have no vertex_indices")
+    faces = content["face"][name]
+    corners = np.array([len(face) for face in faces])
+    fans = [
+        np.stack(faces[corners == count])[:, [0, step, step + 1]]
+        for count in np.unique(corners)
+        for step in range(1, count - 1)
+    ]
+    triangles = np.concatenate(fans).astype(np.int64) if fans else np.zeros((0, 3), np.int64)
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < content["vertex"].count:
+        raise PlyParseError("its faces name vertices that it has not")
+    return triangles
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> RaycastingScene:

@@ -8,7 +8,7 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, stream
-from hsi_sc_nerf.export.formats import write_cloud
+from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 
 WAVELENGTHS_NM = np.array([397.32, 400.2, 650.0, 1003.58])
@@ -48,6 +48,9 @@ def test_las_says_how_many_bands_it_holds(tmp_path: Path) -> None:
     write_cloud(tmp_path / "fits", stream(fits), "las")
     with pytest.raises(InputError, match=r"room for 336 bands and the cloud has 337.*--bands"):
         write_cloud(tmp_path / "cloud", stream(cloud(2, 337)), "las")
+    require_format(tmp_path / "cloud", "las", 336, 2)
+    with pytest.raises(InputError, match=r"cloud\.las: LAS has room for 336 bands"):
+        require_format(tmp_path / "cloud", "las", 337, 2)
 
 
 @pytest.mark.parametrize(("file_format", "name"), [("netcdf", "cloud.nc"), ("zarr", "cloud.zarr")])
@@ -98,6 +101,8 @@ def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     (tmp_path / "cloud.zarr" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="is no Zarr folder"):
         write_cloud(tmp_path / "cloud", stream(cloud()), "zarr")
+    with pytest.raises(InputError, match=r"cloud\.zarr: is no Zarr folder"):
+        require_format(tmp_path / "cloud", "zarr", 4, 2)
     assert (tmp_path / "cloud.zarr" / "notes.txt").read_text() == "mine"
 
 

@@ -9,6 +9,7 @@ import torch
 from known_ball import FRAMES, LENS, POSES, RADIUS, SIZE_PX, WAVELENGTHS_NM, BallModel, known_run, true_spectra
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.camera_views import (
     SEARCH_DEPTH,
     SEARCH_STEPS,
@@ -140,6 +141,65 @@ def test_regions_keep_what_lies_in_them_and_the_number_of_points(run, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.fixture
+def tried(monkeypatch):
+    """How many places each attempt tries."""
+    counts = []
+
+    def counted(vertices, triangles, count, seed):
+        counts.append(count)
+        return sample_surface(vertices, triangles, count, seed)
+
+    monkeypatch.setattr("hsi_sc_nerf.export.even_points.sample_surface", counted)
+    return counts
+
+
+def test_a_small_region_is_searched_only_near_it(run, tmp_path, tried):
+    box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)  # 9 mm2 of the ball's 31,000
+    cloud = read_spectral_ply(export_cloud(run, tmp_path, CloudOptions(num_points=300, roi_box=box)))
+    assert 280 <= len(cloud) <= 300
+    np.testing.assert_allclose(np.ptp(cloud.points[:, 1:], axis=0), 0.003, rtol=0.05)
+    assert sum(tried) < 60_000
+
+
+def test_a_region_with_hardly_any_surface_gives_what_it_has(run, tmp_path, tried, monkeypatch, capsys):
+    monkeypatch.setattr("hsi_sc_nerf.export.even_points._LARGEST_ATTEMPT", 2000)
+    monkeypatch.setattr("hsi_sc_nerf.export.even_points._TRIES_A_POINT", 10)
+    box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)
+    options = CloudOptions(num_points=2000, roi_box=box, remove_outliers=False)
+    count = len(read_spectral_ply(export_cloud(run, tmp_path, options)))
+    assert 0 < count < 1000
+    assert max(tried) <= 2000
+    assert f"Only {count} points were found" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_few_points_are_no_outliers_and_a_cloud_is_never_empty(run, tmp_path, monkeypatch):
+    assert len(read_spectral_ply(export_cloud(run, tmp_path, CloudOptions(num_points=2)))) == 2
+    monkeypatch.setattr("hsi_sc_nerf.export.spectral_export.statistical_inliers", lambda *_: np.zeros(0, int))
+    with pytest.raises(InputError, match="every point counts as an outlier"):
+        export_cloud(run, tmp_path / "none", CloudOptions(num_points=100))
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_cannot_be_written_is_refused_before_the_model_is_asked(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "hsi_sc_nerf.export.spectral_export.look_from_cameras", lambda *_: pytest.fail("the model was asked")
+    )
+    with pytest.raises(InputError, match="holds no mask of a training frame"):
+        export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
+    monkeypatch.setattr("hsi_sc_nerf.export.las.MAX_DIMENSIONS", 10)
+    (tmp_path / "point_cloud.zarr").mkdir()
+    for file_format, message in (("las", "LAS has room for 2 bands"), ("zarr", "is no Zarr folder")):
+        pytest.importorskip({"las": "laspy"}.get(file_format, file_format))
+        with pytest.raises(InputError, match=message):
+            export_cloud(run, tmp_path, CloudOptions(format=file_format))
+
+
+def test_a_path_is_shown_as_it_is(run, tmp_path, capsys):
+    path = export_cloud(run, tmp_path / "[bold]", CloudOptions(num_points=5))
+    assert str(path) in capsys.readouterr().out
+
+
 def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path):
     painted = np.zeros((LENS.h, LENS.w), np.uint8)
     painted[:, : LENS.w // 2] = 255
@@ -173,6 +233,7 @@ def test_nerfstudios_options_work(run, tmp_path):
     turned = run.to_scene(crop.points)[:, :2] - (0.0, 0.5)
     turned = turned @ np.array([[1, -1], [1, 1]]) / np.sqrt(2)
     assert np.abs(turned).max() < 0.2 + 1e-4
+    assert (np.abs(turned).max(axis=0) > 0.19).all()
     outward = exported(normal_method="open3d")
     assert ((outward.normals * run.to_scene(outward.points)).sum(axis=1) / RADIUS > 0.9).all()
     predicted = exported(normal_output_name="pred_normals", rgb_output_name="pred_normals")

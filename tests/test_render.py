@@ -165,7 +165,13 @@ def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
 def test_an_orbit_of_another_size_has_no_truth_and_no_cubes_if_so_wished(tmp_path, run, monkeypatch):
     monkeypatch.setattr(trained_run, "open_run", lambda _: run)
     RenderCommand(
-        tmp_path, tmp_path / "out", views="orbit", orbit_views=3, orbit_size=0.5, cubes="none", video=("pseudo-RGB",)
+        tmp_path,
+        tmp_path / "out",
+        views="orbit",
+        orbit_views=3,
+        orbit_size=0.5,
+        cubes="none",
+        video=("pseudo-RGB", "PSEUDO-rgb"),
     ).main()
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "render.md",

@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.cli.sample import SampleCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.export import trained_run
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.sample_points import frontal_views, mean_and_spread, outward
@@ -110,7 +111,7 @@ def test_a_ball_gives_its_spectrum_where_cameras_see_it(tmp_path, sample, capsys
         np.testing.assert_array_equal(after["vertex"][name], given["vertex"][name])
     assert [list(f) for f in after["face"]["vertex_indices"]] == [list(f) for f in given["face"]["vertex_indices"]]
     np.testing.assert_allclose(cloud.wavelengths_nm, factory.WAVELENGTHS_NM, atol=0.01)
-    np.testing.assert_allclose(np.abs((cloud.normals * radial).sum(axis=1)), 1.0, atol=1e-3)
+    np.testing.assert_allclose((cloud.normals * radial).sum(axis=1), 1.0, atol=1e-3)
 
     poses = np.stack([factory.true_pose(angle) for angle in ball_run.ANGLES_DEG])
     held_out = np.setdiff1d(np.arange(10), run_training_frames())
@@ -149,6 +150,14 @@ def test_units_binary_files_and_normals_to_either_side(tmp_path, sample, sign):
     np.testing.assert_array_equal(np.isnan(inwards.spectra), np.isnan(expected.spectra))
     np.testing.assert_allclose(inwards.points, 1000.0 * expected.points, rtol=1e-5)
     np.testing.assert_allclose(PlyData.read(str(millimetres))["vertex"]["nx"], inwards.normals[:, 0], atol=1e-6)
+
+
+def test_normals_that_a_cloud_lacks_point_outwards(tmp_path, sample):
+    path = tmp_path / "ball.ply"
+    radial = sphere_mesh(path)
+    PlyData([PlyData.read(str(path))["vertex"]]).write(str(path))
+    assert (read_points(path).normals() * radial).sum(axis=1).min() < -0.9
+    assert (read_spectral_ply(sample(path)).normals * radial).sum(axis=1).min() > 0.9
 
 
 def test_points_off_the_surface_have_no_spectrum(tmp_path, sample):
@@ -191,6 +200,39 @@ def test_bad_points_are_refused_in_a_sentence(tmp_path):
         read_points(empty)
     with pytest.raises(InputError, match="--views"):
         SampleCommand(text, load_config=text, views=0).main()
+
+
+TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize(
+    ("face", "told"),
+    [
+        ("property list uchar int corners\nend_header\n{}3 0 1 2\n", "its faces have no vertex_indices"),
+        ("property int vertex_index\nend_header\n{}2\n", "its faces have no vertex_indices"),
+        (
+            "property list uchar int vertex_indices\nend_header\n{}3 0 1 3\n",
+            "its faces name vertices that it has not",
+        ),
+        (
+            "property list uchar int vertex_indices\nend_header\n{}3 0 1 -1\n",
+            "its faces name vertices that it has not",
+        ),
+    ],
+)
+def test_odd_faces_are_refused_in_a_sentence(tmp_path, face, told):
+    path = tmp_path / "odd.ply"
+    path.write_text(TRIANGLE + "element face 1\n" + face.format("0 0 0\n1 0 0\n0 1 0\n"))
+    for read in (lambda path: read_points(path).normals(), read_surface):
+        with pytest.raises(InputError, match=rf"odd\.ply.*{told}"):
+            read(path)
+
+
+def test_points_that_hold_lists_are_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "lists.ply"
+    path.write_text(TRIANGLE + "property list uchar int near\nend_header\n0 0 0 1 1\n1 0 0 1 0\n0 1 0 1 0\n")
+    with pytest.raises(InputError, match=r"lists\.ply: its points hold lists \(near\)"):
+        read_points(path)
 
 
 def test_what_is_no_run_is_refused_in_a_sentence(tmp_path, run_config):

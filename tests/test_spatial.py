@@ -98,9 +98,11 @@ def test_two_samplings_of_one_surface_agree() -> None:
     assert precision_recall_f_score(a, b, 0.002).f_score > 99.9
 
 
-def test_distance_to_the_surface_not_to_its_vertices() -> None:
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), (4.5e5, 5.2e6, 120.0)], ids=["object", "survey grid"])
+def test_distance_to_the_surface_not_to_its_vertices(origin_m: tuple[float, ...]) -> None:
     points = np.array([[0.05, 0.05, 0.003], [0.05, 0.05, -0.003], [0.05, 0.02, 0.0], [0.13, 0.05, 0.04]])
-    np.testing.assert_allclose(distance_to_surface(points, SQUARE, TRIANGLES), [0.003, 0.003, 0.0, 0.05], atol=1e-8)
+    distances = distance_to_surface(points + origin_m, SQUARE + origin_m, TRIANGLES)
+    np.testing.assert_allclose(distances, [0.003, 0.003, 0.0, 0.05], atol=1e-8)
 
 
 def test_scores_need_no_open3d() -> None:

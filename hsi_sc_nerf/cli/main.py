@@ -37,8 +37,9 @@ Commands = (
 
 def main() -> None:
     """Run the command that the user asked for; bad input ends in one sentence and status 2."""
-    command = tyro.cli(Commands, description=__doc__)  # type: ignore[var-annotated]
     try:
+        # Some options are refused while they are read.
+        command = tyro.cli(Commands, description=__doc__)  # type: ignore[var-annotated]
         command.main()
     except InputError as error:
         Console(stderr=True).print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)

@@ -64,7 +64,8 @@ class RenderCommand:
         from hsi_sc_nerf.export.video import open_video
 
         run = open_run(self.load_config)
-        looks = [find_look(name, run.dataset.wavelengths_nm) for name in self.video]
+        found = [find_look(name, run.dataset.wavelengths_nm) for name in self.video]
+        looks = list({look.name: look for look in found}.values())  # a name may be given twice
         if self.camera_path is not None:
             views = views_of_path(self.camera_path)
         elif self.views == "orbit":

@@ -51,6 +51,7 @@ class SampleCommand:
         from hsi_sc_nerf.export.sampled_ply import SpectralColumns, read_points
 
         given = read_points(self.points)
+        normals = given.normals()
         output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
 
         from hsi_sc_nerf.export.progress import progress_bar
@@ -58,16 +59,14 @@ class SampleCommand:
         from hsi_sc_nerf.export.trained_run import open_run
 
         run = open_run(self.load_config)
-        normals = given.normals()
         columns = SpectralColumns(given, run.dataset.wavelengths_nm, _EXTRA)
-        columns.set_normals(normals)
         without = 0
         points_m = given.positions() * _METRES[self.unit]
         parts = sample_points(run, points_m, normals, self.reach_mm / 1e3, self.views)
         with progress_bar("sampling", "points", len(given)) as done:
-            for rows, found in parts:
+            for rows, outward, found in parts:
                 extra = dict(zip(_EXTRA, (found.views, found.spectral_std), strict=True))
-                columns.fill(rows, found.spectra, run.model.rgb_bands, extra)
+                columns.fill(rows, outward, found.spectra, run.model.rgb_bands, extra)
                 without += int((found.views == 0).sum())
                 done(rows.stop)
         if without == len(given):

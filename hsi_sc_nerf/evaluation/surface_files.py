@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.mesh import ply_triangles
 
 FORMATS = (".ply", ".obj", ".stl")
 
@@ -40,22 +41,7 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     # Mapped, not read: of a spectral cloud's hundreds of columns three are wanted.
     content = PlyData.read(path)
     vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
-    if "face" not in content or not content["face"].count:
-        return vertices, np.zeros((0, 3), np.int64)
-    name = next((p.name for p in content["face"].properties if p.name in ("vertex_indices", "vertex_index")), None)
-    if name is None:
-        raise PlyParseError("its faces have no vertex_indices")
-    faces = content["face"][name]
-    corners = np.array([len(face) for face in faces])
-    fans = [
-        np.stack(faces[corners == count])[:, [0, step, step + 1]]
-        for count in np.unique(corners)
-        for step in range(1, count - 1)
-    ]
-    triangles = np.concatenate(fans).astype(np.int64) if fans else np.zeros((0, 3), np.int64)
-    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
-        raise PlyParseError("its faces name vertices that it has not")
-    return vertices, triangles
+    return vertices, ply_triangles(content)
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -21,10 +21,14 @@ def open3d_cloud(points: Float[np.ndarray, "n 3"]) -> Any:
 def statistical_inliers(points: Float[np.ndarray, "n 3"], std_ratio: float) -> Int[np.ndarray, "inliers"]:
     """Indices of the points whose mean distance to their neighbours is usual for the cloud.
 
+    Without ``OUTLIER_NEIGHBOURS`` neighbours each, nothing is usual: all points stay.
+
     Args:
         points: positions, any unit.
-        std_ratio: standard deviations above the cloud's mean from which a point is an outlier.
+        std_ratio: standard deviations above the cloud's mean from which a point is an outlier, above 0.
     """
+    if len(points) <= OUTLIER_NEIGHBOURS:
+        return np.arange(len(points))
     _, inliers = open3d_cloud(points).remove_statistical_outlier(nb_neighbors=OUTLIER_NEIGHBOURS, std_ratio=std_ratio)
     return np.asarray(inliers, dtype=np.int64)
 

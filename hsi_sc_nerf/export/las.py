@@ -22,6 +22,20 @@ _COLOURS = ("red", "green", "blue")
 _EIGHT_TO_SIXTEEN_BITS = 257
 
 
+def require_room(path: Path, num_bands: int, num_extra: int) -> None:
+    """Refuse a cloud of more bands, beside its extra columns, than a LAS file holds.
+
+    Raises:
+        InputError: there are too many bands.
+    """
+    room = MAX_DIMENSIONS - len(_NORMALS) - num_extra
+    if num_bands > room:
+        raise InputError(
+            f"{path}: LAS has room for {room} bands and the cloud has {num_bands}; choose some with --bands, or "
+            "export as PLY."
+        )
+
+
 def write_las_stream(path: Path, cloud: CloudStream) -> None:
     """Write a cloud as LAS, piece by piece, whole or not at all.
 
@@ -33,14 +47,9 @@ def write_las_stream(path: Path, cloud: CloudStream) -> None:
         ValueError: the pieces do not fit together.
     """
     laspy = require("laspy", "a LAS file")
+    require_room(path, len(cloud.wavelengths_nm), len(cloud.extra_names))
     bands = [name.removeprefix("scalar_") for name in band_property_names(cloud.wavelengths_nm)]
     names = [*_NORMALS, *bands, *cloud.extra_names]
-    if len(names) > MAX_DIMENSIONS:
-        room = MAX_DIMENSIONS - (len(names) - len(bands))
-        raise InputError(
-            f"{path}: LAS has room for {room} bands and the cloud has {len(bands)}; choose some with --bands, or "
-            "export as PLY."
-        )
     header = laspy.LasHeader(point_format=_WITH_COLOURS, version="1.4")
     header.scales = np.full(3, COORDINATE_STEP_M)
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])

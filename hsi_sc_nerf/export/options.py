@@ -63,6 +63,8 @@ class CloudOptions:
             raise InputError("--obb-center, --obb-rotation and --obb-scale belong together; give all three or none.")
         if self.num_points < 1 or self.num_rays_per_batch < 1:
             raise InputError("--num-points and --num-rays-per-batch must be at least 1.")
+        if not self.std_ratio > 0.0:
+            raise InputError("--std-ratio must be greater than 0.")
         box, cylinder = self.roi_box, self.roi_cylinder
         if box is not None and any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
             raise InputError("--roi-box takes the smallest x, y and z first, then the largest; give six numbers so.")

@@ -7,7 +7,6 @@ sees is left out. The spectrum of a point is that ray's: seen from the front, as
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -31,7 +30,7 @@ from hsi_sc_nerf.export.camera_views import (
 )
 from hsi_sc_nerf.export.even_points import even_points
 from hsi_sc_nerf.export.progress import progress_bar
-from hsi_sc_nerf.export.regions import in_box
+from hsi_sc_nerf.export.regions import EVERYWHERE, Region, in_box
 from hsi_sc_nerf.export.surface_mesh import SurfaceMesh, fuse_depth_maps
 from hsi_sc_nerf.export.visibility import DepthMaps, most_frontal
 from hsi_sc_nerf.models.spectral_model import SpectralModel
@@ -73,15 +72,6 @@ def join(parts: list[SurfacePoints]) -> SurfacePoints:
     )
 
 
-Region = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
-"""Which points (scene units, with outward unit normals) are wanted."""
-
-
-def everywhere(points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """The region that holds every point."""
-    return np.ones(len(points), bool)
-
-
 def spread_points(
     model: SpectralModel,
     seen: SeenSurface,
@@ -96,7 +86,7 @@ def spread_points(
     Args:
         model: trained model, in evaluation mode.
         seen: what its training cameras see.
-        num_points: how many points to return.
+        num_points: how many points to return; fewer come where hardly anything of the surface is wanted.
         rays_per_batch: rays searched at a time.
         box: the surface is sought in this box, scene units: it cuts the container away.
         region: which points are wanted.
@@ -119,13 +109,15 @@ def spread_points(
         parts = []
         for start in range(0, len(places), rays_per_batch):
             moved = _moved_to_surface(model, seen.maps, mesh, places[start : start + rays_per_batch])
-            parts.append(moved.select(in_box(moved.points, box) & region(moved.points, moved.facing)))
+            parts.append(moved.select(in_box(moved.points, box) & region.holds(moved.points, moved.facing)))
             placed += len(parts[-1])
             done(placed)
         return join(parts)
 
     with progress_bar("spreading points", "points", num_points) as done:
-        found = even_points(mesh.vertices, mesh.triangles, num_points, keep, seed)
+        # An oblique ray moves a place by more than FARTHEST_MOVE, but no farther than it is searched.
+        triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
+        found = even_points(mesh.vertices, triangles, num_points, keep, seed)
     if not found:
         raise InputError("no point of the object lies in the region that was asked for; make it larger.")
     return join(found)
@@ -235,4 +227,4 @@ def sample_surface_points(
         InputError: the model holds no object.
     """
     seen = look_from_cameras(model, cameras, masks, rays_per_batch)
-    return spread_points(model, seen, num_points, rays_per_batch, box.cpu().numpy(), everywhere, seed)
+    return spread_points(model, seen, num_points, rays_per_batch, box.cpu().numpy(), EVERYWHERE, seed)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,6 +13,30 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra.bands import require_bands
 
 _RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Which points are wanted.
+
+    Attributes:
+        holds: which points (scene units, with outward unit normals) it holds.
+        bounds: minimum and maximum of a box around it, scene units; it spares the search elsewhere.
+    """
+
+    holds: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
+    bounds: Float[np.ndarray, "2 3"] = field(default_factory=lambda: np.array([[-np.inf] * 3, [np.inf] * 3]))
+
+    def __and__(self, other: Region) -> Region:
+        """What lies in both."""
+        return Region(
+            lambda points, facing: self.holds(points, facing) & other.holds(points, facing),
+            np.stack([np.maximum(self.bounds[0], other.bounds[0]), np.minimum(self.bounds[1], other.bounds[1])]),
+        )
+
+
+EVERYWHERE = Region(lambda points, _: np.ones(len(points), bool))
+"""The region that holds every point."""
 
 
 def in_box(points_m: Float[np.ndarray, "n 3"], box_m: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, "n"]:
@@ -32,6 +57,12 @@ def in_cylinder(
     """
     from_axis = np.hypot(points_m[:, 0] - centre_m[0], points_m[:, 1] - centre_m[1])
     return (from_axis <= radius_m) & (points_m[:, 2] >= z_m[0]) & (points_m[:, 2] <= z_m[1])
+
+
+def around_cylinder(centre_m: Sequence[float], radius_m: float, z_m: tuple[float, float]) -> Float[np.ndarray, "2 3"]:
+    """Minimum and maximum of the box around an upright cylinder, which is given as `in_cylinder` takes it."""
+    x, y = centre_m
+    return np.array([[x - radius_m, y - radius_m, z_m[0]], [x + radius_m, y + radius_m, z_m[1]]])
 
 
 def chosen_bands(wavelengths_nm: Float[np.ndarray, "bands"], wanted: Sequence[str]) -> Int[np.ndarray, "chosen"]:

@@ -94,14 +94,14 @@ def sample_points(
     normals: Float[np.ndarray, "n 3"],
     reach_m: float,
     views: int,
-) -> Iterator[tuple[slice, PointSpectra]]:
-    """Spectra of points of the object frame, some at a time, so that memory does not grow with their number.
+) -> Iterator[tuple[slice, Float[np.ndarray, "part 3"], PointSpectra]]:
+    """Outward normals and spectra of points, some at a time, so that memory does not grow with their number.
 
     Lens distortion is neglected where it is decided which images hold a point.
 
     Args:
         run: the trained run.
-        points_m: metres.
+        points_m: object frame, metres.
         normals: unit vectors, to either side of the surface; 0 for a point that gets no spectrum.
         reach_m: how far from the model's surface a point may lie, along its normal.
         views: how many training cameras' views are averaged, at most.
@@ -113,7 +113,8 @@ def sample_points(
         rows = slice(start, min(start + POINTS_AT_A_TIME, len(points_m)))
         points = run.to_scene(points_m[rows])
         intrinsics, reach = run.dataset.intrinsics, reach_m * run.scale
-        yield rows, spectra_of_points(run.model, poses, intrinsics, points, normals[rows], reach, views)
+        turned = _outward(run.model, normals[rows], points, reach)
+        yield rows, turned, spectra_of_points(run.model, poses, intrinsics, points, turned, reach, views)
 
 
 @torch.no_grad()
@@ -133,13 +134,10 @@ def spectra_of_points(
         poses: camera-to-world of the training cameras as refined, scene units.
         intrinsics: of the cameras.
         points: scene units.
-        normals: as `sample_points` takes them.
+        normals: unit vectors out of the surface; 0 for a point that gets no spectrum.
         reach: as `sample_points` takes it, scene units.
         views: likewise.
     """
-    device = model.device
-    where = torch.from_numpy(points).float().to(device)
-    normals = outward(torch.from_numpy(normals).float().to(device), where, _density(model), reach).cpu().numpy()
     to_point = points[:, None] - poses[:, :3, 3]
     distances = np.linalg.norm(to_point, axis=-1)
     directions = to_point / distances[..., None]
@@ -159,8 +157,12 @@ def spectra_of_points(
     return mean_and_spread(np.concatenate(kept), np.concatenate([np.zeros(0, int), *seen]), len(points))
 
 
-def _density(model: SpectralModel) -> Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]]:
-    return lambda places: model.field.density_fn(places[:, None])[:, 0]
+@torch.no_grad()
+def _outward(
+    model: SpectralModel, normals: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"], reach: float
+) -> Float[np.ndarray, "n 3"]:
+    given, where = (torch.from_numpy(array).float().to(model.device) for array in (normals, points))
+    return outward(given, where, lambda places: model.field.density_fn(places[:, None])[:, 0], reach).cpu().numpy()
 
 
 def _in_frame(

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import band_property_names
+from hsi_sc_nerf.mesh import ply_triangles
 
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
@@ -42,13 +43,16 @@ class PlyPoints:
         """Unit normals, to either side: the file's, else the faces', else those of neighbouring points.
 
         0 for a point that has none, such as a vertex of no face.
+
+        Raises:
+            InputError: the faces make no sense.
         """
         if self.has(_NORMAL):
             normals = self._columns(_NORMAL)
-        elif (faces := self._faces()) is not None:
+        elif len(triangles := self._triangles()):
             import trimesh
 
-            normals = np.array(trimesh.Trimesh(self.positions(), faces, process=False).vertex_normals)
+            normals = np.array(trimesh.Trimesh(self.positions(), triangles, process=False).vertex_normals)
         else:
             from hsi_sc_nerf.export.clean import estimate_normals
 
@@ -63,21 +67,18 @@ class PlyPoints:
     def _columns(self, names: tuple[str, ...]) -> np.ndarray:
         return np.stack([np.asarray(self.content["vertex"][name], float) for name in names], axis=1)
 
-    def _faces(self) -> np.ndarray | None:
-        """Triangles, larger faces cut into fans; None without any."""
-        if "face" not in self.content or not self.content["face"].count:
-            return None
-        name = next(column.name for column in self.content["face"].properties if column.name.startswith("vertex_ind"))
-        corners = self.content["face"][name]
-        fans = [[(face[0], face[i], face[i + 1]) for i in range(1, len(face) - 1)] for face in corners]
-        return np.array([triangle for fan in fans for triangle in fan], dtype=np.int64)
+    def _triangles(self) -> np.ndarray:
+        try:
+            return ply_triangles(self.content)
+        except PlyParseError as error:
+            raise InputError(f"{self.path}: {error}; export the mesh again, or only its points.") from error
 
 
 def read_points(path: Path) -> PlyPoints:
     """Read a PLY file of any kind: ASCII or binary, with or without faces.
 
     Raises:
-        InputError: it is missing, is no PLY, or has no points.
+        InputError: it is missing, is no PLY, or has no points, or such that hold more than numbers.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give a point cloud or a mesh as PLY.")
@@ -88,6 +89,9 @@ def read_points(path: Path) -> PlyPoints:
     points = PlyPoints(path, content)
     if "vertex" not in content or not len(points) or not points.has(("x", "y", "z")):
         raise InputError(f"{path}: has no points (an element vertex with x, y, z); export the cloud or mesh again.")
+    lists = [column.name for column in content["vertex"].properties if isinstance(column, PlyListProperty)]
+    if lists:
+        raise InputError(f"{path}: its points hold lists ({', '.join(lists)}); save it without them.")
     if not np.isfinite(points.positions()).all():
         raise InputError(f"{path}: some points are not at finite places; remove them.")
     return points
@@ -121,21 +125,19 @@ class SpectralColumns:
         as_bytes = self._rows.view(np.uint8).reshape(len(points), -1)
         self._spectra = as_bytes[:, offset : offset + 4 * len(bands)].view("<f4")
 
-    def set_normals(self, normals: Float[np.ndarray, "n 3"]) -> None:
-        """Give the points normals where the file has none."""
-        if self._normals_missing:
-            for name, column in zip(_NORMAL, normals.T, strict=True):
-                self._rows[name] = column
-
     def fill(
         self,
         rows: slice,
+        normals: Float[np.ndarray, "n 3"],
         spectra: Float[np.ndarray, "n bands"],
         rgb_bands: list[int],
         extra: dict[str, Float[np.ndarray, "n"]],
     ) -> None:
-        """Set spectra and extra columns of some points, and pseudo-RGB where the file has no colours."""
+        """Set spectra and extra columns of some points, and normals and pseudo-RGB where the file has none."""
         self._spectra[rows] = spectra
+        if self._normals_missing:
+            for name, column in zip(_NORMAL, normals.T, strict=True):
+                self._rows[name][rows] = column
         for name, values in extra.items():
             self._rows[name][rows] = values
         if self._colours_missing:

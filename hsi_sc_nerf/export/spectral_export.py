@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
@@ -20,9 +23,9 @@ from hsi_sc_nerf.export.clean import estimate_normals, statistical_inliers
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, INCIDENCE, CloudStream, SpectralCloud
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions
-from hsi_sc_nerf.export.point_cloud import Region, SurfacePoints, everywhere, render_points, spread_points
+from hsi_sc_nerf.export.point_cloud import SurfacePoints, render_points, spread_points
 from hsi_sc_nerf.export.progress import progress_bar
-from hsi_sc_nerf.export.regions import chosen_bands, in_box, in_cylinder
+from hsi_sc_nerf.export.regions import EVERYWHERE, Region, around_cylinder, chosen_bands, in_box, in_cylinder
 from hsi_sc_nerf.export.roi_masks import in_roi_masks, read_roi_masks
 from hsi_sc_nerf.export.silhouettes import silhouettes, within_silhouettes
 from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from nerfstudio.scripts.exporter import ExportPointCloud
 
 NAME = "point_cloud"
+EXTRA = ("opacity", INCIDENCE, *COLUMNS)
 
 
 def export_spectral_point_cloud(options: ExportPointCloud) -> None:
@@ -55,19 +59,28 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Pa
     Raises:
         InputError: the model holds no object, an option cannot be met, or the file cannot be written.
     """
-    require_format(options.format)
+    target = Path(output_dir) / NAME
     bands = chosen_bands(run.model.wavelengths_nm, options.bands)
+    require_format(target, options.format, len(bands), len(EXTRA))
     sampler = run.manager.train_pixel_sampler
+    painted = None
+    if options.roi_masks is not None:
+        painted = read_roi_masks(options.roi_masks, run.manager.train_dataset.frames, sampler.masks[0].shape)
     masks = np.ones_like(sampler.masks) if options.keep_turntable else sampler.masks
     batch = min(options.num_rays_per_batch, run.model.config.eval_num_rays_per_chunk)
     cameras = run.manager.train_dataset.cameras
     seen = look_from_cameras(run.model, cameras, masks, batch, options.depth_output_name)
     box_m = run.dataset.scene_box_m if options.keep_turntable else run.dataset.object_box_m
-    surface = spread_points(
-        run.model, seen, options.num_points, batch, run.to_scene(box_m), _region(run, seen, options)
-    )
+    region = _region(run, seen, options, painted)
+    surface = spread_points(run.model, seen, options.num_points, batch, run.to_scene(box_m), region)
+    if len(surface) < options.num_points:
+        CONSOLE.print(
+            f"[yellow]Only {len(surface):,} points were found: hardly any of the surface lies in the region."
+        )
     if options.remove_outliers:
         surface = surface.select(statistical_inliers(surface.points, options.std_ratio))
+        if not len(surface):
+            raise InputError("every point counts as an outlier; give a larger --std-ratio.")
     normals = None
     if options.normal_method == "open3d":
         facing = surface.facing if options.reorient_normals else np.zeros_like(surface.facing)
@@ -77,15 +90,21 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Pa
         flags = np.stack([frame.flags() for frame in run.manager.train_dataset.frames])
     pieces = _Pieces(run, seen, MeasuredFrames(sampler.reader, flags), surface, normals, bands, options, batch)
     wavelengths_nm = run.model.wavelengths_nm[bands]
-    cloud = CloudStream(len(surface), wavelengths_nm, ("opacity", INCIDENCE, *COLUMNS), pieces)
-    path = write_cloud(Path(output_dir) / NAME, cloud, options.format)
-    CONSOLE.print(f"[bold green]{cloud.count:,} points with {len(bands)} bands, in metres: {path}", soft_wrap=True)
+    cloud = CloudStream(len(surface), wavelengths_nm, EXTRA, pieces)
+    path = write_cloud(target, cloud, options.format)
+    summary = f"{cloud.count:,} points with {len(bands)} bands, in metres: {escape(str(path))}"
+    CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
     return path
 
 
-def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region:
-    """Which points the options keep."""
-    tests: list[Region] = []
+def _region(
+    run: TrainedRun,
+    seen: SeenSurface,
+    options: CloudOptions,
+    painted: Mapping[int, Bool[np.ndarray, "lines samples"]] | None,
+) -> Region:
+    """Which points the options and the painted masks, by frame, keep."""
+    regions: list[Region] = []
     device = run.model.device
     if not options.keep_turntable:
         outlines = silhouettes(seen.maps.masks)
@@ -94,31 +113,29 @@ def _region(run: TrainedRun, seen: SeenSurface, options: CloudOptions) -> Region
             where = torch.from_numpy(points).float().to(device)
             return within_silhouettes(seen.maps, outlines, where).cpu().numpy()
 
-        tests.append(on_object)
+        regions.append(Region(on_object))
     if options.obb_center is not None and options.obb_rotation is not None and options.obb_scale is not None:
         crop = OrientedBox.from_params(options.obb_center, options.obb_rotation, options.obb_scale)
-        tests.append(lambda points, _: crop.within(torch.from_numpy(points).float()).numpy())
+        reach = np.abs(crop.R.numpy()) @ np.divide(options.obb_scale, 2.0)
+        bounds = np.array(options.obb_center) + np.stack([-reach, reach])
+        regions.append(Region(lambda points, _: crop.within(torch.from_numpy(points).float()).numpy(), bounds))
     if options.roi_box is not None:
         box_m = np.reshape(options.roi_box, (2, 3))
-        tests.append(lambda points, _: in_box(run.to_metres(points), box_m))
+        regions.append(Region(lambda points, _: in_box(run.to_metres(points), box_m), run.to_scene(box_m)))
     if options.roi_cylinder is not None:
-        x, y, radius_m, *z_m = options.roi_cylinder
-        tests.append(lambda points, _: in_cylinder(run.to_metres(points), (x, y), radius_m, (z_m[0], z_m[1])))
-    if options.roi_masks is not None:
-        lines, samples = seen.maps.masks.shape[1:]
-        painted = read_roi_masks(options.roi_masks, run.manager.train_dataset.frames, (lines, samples))
+        x, y, radius_m, low_m, high_m = options.roi_cylinder
+        cylinder = ((x, y), radius_m, (low_m, high_m))
+        bounds = run.to_scene(around_cylinder(*cylinder))
+        regions.append(Region(lambda points, _: in_cylinder(run.to_metres(points), *cylinder), bounds))
+    if painted is not None:
         masks = {frame: torch.from_numpy(mask).to(device) for frame, mask in painted.items()}
 
         def in_painted(points: np.ndarray, facing: np.ndarray) -> np.ndarray:
             where, outwards = (torch.from_numpy(array).float().to(device) for array in (points, facing))
             return in_roi_masks(masks, seen.maps, where, outwards).cpu().numpy()
 
-        tests.append(in_painted)
-
-    def region(points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        return np.logical_and.reduce([test(points, facing) for test in (everywhere, *tests)])
-
-    return region
+        regions.append(Region(in_painted))
+    return reduce(and_, regions, EVERYWHERE)
 
 
 @dataclass(frozen=True, eq=False)

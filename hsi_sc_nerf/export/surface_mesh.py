@@ -12,6 +12,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.export.visibility import DepthMaps
+from hsi_sc_nerf.mesh import Mesh
 
 FINEST_VOXEL = 1 / 160
 """Of the longest side of the box: half a millimetre on what stands on a turntable. Voxels are no smaller than what a
@@ -36,6 +37,12 @@ class SurfaceMesh:
         _, nearest = self._nearest.query(points, k=min(NORMAL_VERTICES, len(self.vertices)))
         normals = self._vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1)
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+    def triangles_near(self, box: Float[np.ndarray, "2 3"], margin: float) -> Int[np.ndarray, "near 3"]:
+        """Those with an area whose own bounding box comes within ``margin`` of a box in each direction."""
+        corners = self.vertices[self.triangles]
+        near = (corners.max(axis=1) >= box[0] - margin) & (corners.min(axis=1) <= box[1] + margin)
+        return self.triangles[near.all(axis=1) & (Mesh(self.vertices, self.triangles).triangle_areas_m2() > 0.0)]
 
     @cached_property
     def _nearest(self) -> cKDTree:

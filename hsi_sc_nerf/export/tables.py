@@ -78,6 +78,16 @@ def write_netcdf_stream(path: Path, cloud: CloudStream) -> None:
                 file.variables[variable.name][rows] = variable.rows_of(chunk)
 
 
+def require_replaceable(path: Path) -> None:
+    """Refuse a place where something else than a Zarr folder is.
+
+    Raises:
+        InputError: it is.
+    """
+    if path.exists() and not (path / "zarr.json").is_file():
+        raise InputError(f"{path}: is no Zarr folder and will not be replaced by one; choose another output folder.")
+
+
 def write_zarr_stream(path: Path, cloud: CloudStream) -> None:
     """Write a cloud as a Zarr folder (format 3), piece by piece, whole or not at all; one that is there is replaced.
 
@@ -86,8 +96,7 @@ def write_zarr_stream(path: Path, cloud: CloudStream) -> None:
         ValueError: the pieces do not fit together.
     """
     zarr = require("zarr", "a Zarr folder")
-    if path.exists() and not (path / "zarr.json").is_file():
-        raise InputError(f"{path}: is no Zarr folder and will not be replaced by one; choose another output folder.")
+    require_replaceable(path)
     sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
     pieces = {"point": max(1, min(CHUNK_POINTS, cloud.count)), "wavelength": len(cloud.wavelengths_nm)}
     variables = _variables(cloud)
