@@ -34,7 +34,7 @@ DEMO_TRAINING = {
 class DemoCommand:
     """Make a capture of a virtual fruit, reconstruct it, and compare the result with the known truth.
 
-    Takes four to five minutes on two cores.
+    Takes two to five minutes on two cores.
     """
 
     output_dir: Path = Path("hsi-sc-nerf-demo")
