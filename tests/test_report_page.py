@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
@@ -10,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from headless_browser import launch, needs_browser
 
 from hsi_sc_nerf.data.packed import open_packed
 from hsi_sc_nerf.data.packed_cube import unpack
@@ -174,21 +174,14 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run):
     assert not (run / "report.html").exists()
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no browser")
+@needs_browser
 def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
     """No message in the console, colours that follow from the numbers, the spectrum of the point under a click."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     write_report(run, run / "report.html", ReportSources())
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-            timeout=120_000,
-        )
+        browser = launch(playwright)
         page = browser.new_page(viewport={"width": 700, "height": 600}, reduced_motion="reduce")
         page.set_default_timeout(120_000)
         messages, requests = [], []

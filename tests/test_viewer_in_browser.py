@@ -2,16 +2,15 @@
 
 import io
 import re
-import shutil
 import threading
 
 import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
+from headless_browser import launch, needs_browser
 from PIL import Image
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 WINDOW = {"width": 900, "height": 700}
 ON_THE_BALL = (300, 345)  # pixels of the window from its upper left; the panel is at the right
 
@@ -41,16 +40,12 @@ def address(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no browser")
+@needs_browser
 def test_pictures_and_spectra_of_a_ball(address):
     """It opens before the object; composites have their colours; a click tells place and opacity."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-            timeout=120_000,
-        )
+        browser = launch(playwright)
         page = browser.new_page(viewport=WINDOW)
         page.set_default_timeout(120_000)
         page.goto(address, wait_until="domcontentloaded")
