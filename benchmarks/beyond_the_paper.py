@@ -23,22 +23,22 @@ from rich.console import Console
 from rich.table import Table
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.benchmark.configurations import named_configuration
+from hsi_sc_nerf.benchmark.machine import describe_machine
+from hsi_sc_nerf.benchmark.results import TrainedRun, describe_in_words
+from hsi_sc_nerf.benchmark.run import HeldOutViews
+from hsi_sc_nerf.benchmark.timing import Clock
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
-from hsi_sc_nerf.data.atomic import write_json
-from hsi_sc_nerf.data.packed import open_packed
-from hsi_sc_nerf.data.packed_cube import unpack
-from hsi_sc_nerf.data.process import process_session
-from hsi_sc_nerf.evaluation.benchmark.configurations import named_configuration
-from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
-from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_words
-from hsi_sc_nerf.evaluation.benchmark.run import HeldOutViews
-from hsi_sc_nerf.evaluation.benchmark.timing import Clock
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
-from hsi_sc_nerf.evaluation.processing import score_processing
+from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.evaluation.threshold_curves import score_at
-from hsi_sc_nerf.models.metrics import spectral_metrics
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scores.processing import score_processing
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 

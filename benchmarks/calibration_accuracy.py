@@ -20,14 +20,14 @@ from rich.progress import track
 from rich.table import Table
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.calibrated_frames import pack_frames
-from hsi_sc_nerf.data.calibration.config import CalibrationConfig, LampDriftConfig
-from hsi_sc_nerf.data.calibration.report import draw_calibration
-from hsi_sc_nerf.data.calibration.session import calibrate_session
-from hsi_sc_nerf.data.masks import MaskConfig
-from hsi_sc_nerf.data.session import open_session
-from hsi_sc_nerf.evaluation.calibration import CalibrationScore, score_calibration
+from hsi_sc_nerf.calibration.config import CalibrationConfig, LampDriftConfig
+from hsi_sc_nerf.calibration.report import draw_calibration
+from hsi_sc_nerf.calibration.session_calibration import calibrate_session
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.processing.calibrated_frames import pack_frames
+from hsi_sc_nerf.processing.masks import MaskConfig
 from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scores.calibration import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 

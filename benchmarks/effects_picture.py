@@ -14,9 +14,9 @@ import tyro
 from rich.progress import track
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 SHOWN = (
     "chamber_shading",

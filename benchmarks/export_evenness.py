@@ -19,12 +19,12 @@ import tyro
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.evaluation.seen_surface import seen_points
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
-from hsi_sc_nerf.export.surface_mesh import SurfaceMesh
-from hsi_sc_nerf.export.visibility import MIN_COSINE
+from hsi_sc_nerf.simulate.scores.visible_surface import seen_points
 from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.surface.surface_mesh import SurfaceMesh
+from hsi_sc_nerf.surface.visibility import MIN_COSINE
 
 REFERENCE_POINTS = 100_000
 HEIGHTS = 10

@@ -16,13 +16,13 @@ from page import write_table
 from rich.console import Console
 from rich.table import Table
 
+from hsi_sc_nerf.benchmark.configurations import Configuration, named_configuration
+from hsi_sc_nerf.benchmark.machine import describe_machine
+from hsi_sc_nerf.benchmark.results import TrainedRun, describe_in_words
+from hsi_sc_nerf.benchmark.timing import Clock
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
-from hsi_sc_nerf.data.process import process_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.benchmark.configurations import Configuration, named_configuration
-from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
-from hsi_sc_nerf.evaluation.benchmark.report import TrainedRun, describe_in_words
-from hsi_sc_nerf.evaluation.benchmark.timing import Clock
+from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 

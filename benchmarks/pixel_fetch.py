@@ -28,9 +28,9 @@ from rich.table import Table
 from spectral.io import envi
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.envi import open_cube, write_cube
-from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged, write_packed_cube
-from hsi_sc_nerf.data.pixels import PixelReader
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged, write_packed_cube
+from hsi_sc_nerf.packed.pixels import PixelReader
 
 COLUMNS = ["read from", "cold, ms", "warm, ms", "warm, of float32 in RAM", "memory taken, MiB"]
 # Share of the free memory that the frames in RAM may take.

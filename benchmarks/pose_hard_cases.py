@@ -22,14 +22,14 @@ from page import write_table
 from rich.console import Console
 from rich.table import Table
 
-from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.from_features import FeatureConfig
-from hsi_sc_nerf.poses.geometry import rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 TABLE = "markers table"
 COLUMNS = (

@@ -32,15 +32,15 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.cli.demo import DEMO_TRAINING
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.dataparser import scene_scaling
-from hsi_sc_nerf.data.packed import PackedDataset, open_packed, write_transforms
-from hsi_sc_nerf.data.process import process_session
 from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
-from hsi_sc_nerf.export.point_cloud import sample_surface_points
+from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.models.staged_trainer import StagedTrainer, StagedTrainerConfig
-from hsi_sc_nerf.poses.geometry import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, write_transforms
+from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
+from hsi_sc_nerf.surface.point_cloud import sample_surface_points
 
 COLUMNS = {
     "poses": "{poses}",

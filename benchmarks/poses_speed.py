@@ -24,15 +24,15 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.data.pseudo_rgb import bands_within, to_8_bit
-from hsi_sc_nerf.data.session import Session, open_session
+from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.poses.from_features import FeatureConfig
-from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL
 from hsi_sc_nerf.poses.ways import PoseWay, SessionFacts, find_poses
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
+from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, to_8_bit
 
 GRAY_RANGE_NM = (450.0, 700.0)
 WALL = ("textured_background",)

@@ -34,14 +34,14 @@ from rich.table import Table
 from spectral.io import envi
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.config import CalibrationConfig
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.calibration.session_calibration import calibrate_session
+from hsi_sc_nerf.capture.envi import Cube, write_cube
+from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.cli.steps import run_step
-from hsi_sc_nerf.data.calibration.config import CalibrationConfig
-from hsi_sc_nerf.data.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.data.calibration.session import calibrate_session
-from hsi_sc_nerf.data.envi import Cube, write_cube
-from hsi_sc_nerf.data.frames import FramePaths, process_frame
-from hsi_sc_nerf.data.masks import MaskConfig
-from hsi_sc_nerf.data.session import Capture, Session, open_session
+from hsi_sc_nerf.processing.frames import FramePaths, process_frame
+from hsi_sc_nerf.processing.masks import MaskConfig
 
 COLUMNS = ["way", "frames", "workers", "a frame, ms", "of copying", "processor, ms", "of copying", "peak memory, MiB"]
 DARK_COUNTS, WHITE_COUNTS = 100, 3000

@@ -20,11 +20,11 @@ from open3d.core import Tensor as Open3DTensor
 from rich.console import Console
 from rich.table import Table
 
-from hsi_sc_nerf.export.camera_views import camera_rays
-from hsi_sc_nerf.export.surface import opacity_crossing_depth
-from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
-from hsi_sc_nerf.mesh import ray_scene
+from hsi_sc_nerf.meshes.mesh import ray_scene
+from hsi_sc_nerf.models.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.surface.crossing import opacity_crossing_depth
+from hsi_sc_nerf.surface.depth_renders import camera_rays
 
 LEVELS = (0.05, 0.07, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
 BEFORE_M, BEHIND_M, STEP_M = 0.006, 0.008, 0.0001

@@ -15,9 +15,9 @@ import torch
 import yaml
 from nerfstudio.field_components.field_heads import FieldHeadNames
 
-from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame, write_transforms
-from hsi_sc_nerf.data.packed_cube import pack, write_packed_cube
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint
+from hsi_sc_nerf.packed.cube import pack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame, write_transforms
 
 ANGLES_DEG = np.arange(0.0, 360.0, 36.0)
 DENSITY = 400.0  # opaque within some hundredths of the scene's unit

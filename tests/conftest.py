@@ -23,7 +23,7 @@ def one_blas_thread():
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory):
     """A processed session of ten small frames with few bands, and the session that it was made from."""
-    from hsi_sc_nerf.data.process import process_session
+    from hsi_sc_nerf.processing.process import process_session
     from hsi_sc_nerf.simulate.scene import load_scene, override
     from hsi_sc_nerf.simulate.session import simulate_session
 
@@ -41,8 +41,8 @@ def flagged_dataset(tiny_dataset, tmp_path_factory):
 
     import numpy as np
 
-    from hsi_sc_nerf.data.packed import open_packed, write_transforms
-    from hsi_sc_nerf.data.packed_cube import FLAGGED, write_packed_cube
+    from hsi_sc_nerf.packed.cube import FLAGGED, write_packed_cube
+    from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
     data = tmp_path_factory.mktemp("flagged") / "data"
     shutil.copytree(tiny_dataset[0], data)

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from hsi_sc_nerf.data.packed import PackedFrame
-from hsi_sc_nerf.data.packed_cube import pack, write_packed_cube
-from hsi_sc_nerf.data.pixels import PixelReader
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
+from hsi_sc_nerf.packed.cube import pack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.pixels import PixelReader
 
 RADIUS = 0.5
 SCALE = 10.0

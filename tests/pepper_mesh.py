@@ -12,7 +12,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.interpolate import CubicSpline
 
-from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import revolve
 from hsi_sc_nerf.simulate.shapes import smoothstep
 from hsi_sc_nerf.simulate.texture import over, smooth_noise

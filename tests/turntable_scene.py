@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at, project, rotation_about_z
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, project, rotation_about_z
 
 CELLS = 7  # a 5 x 5 marker with its black border
 TEXELS = 16  # texels a cell

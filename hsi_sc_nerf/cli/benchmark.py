@@ -17,12 +17,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from hsi_sc_nerf.cli.steps import run_step
-from hsi_sc_nerf.data.atomic import TEMPORARY_PREFIX, make_folder, write_json
-from hsi_sc_nerf.data.packed import TRANSFORMS_NAME, is_packed, open_packed
-from hsi_sc_nerf.data.session import is_session
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.benchmark.configurations import (
+from hsi_sc_nerf.benchmark.configurations import (
     CONFIGURATIONS,
     Configuration,
     named_configuration,
@@ -30,8 +25,8 @@ from hsi_sc_nerf.evaluation.benchmark.configurations import (
     split_words,
     training_config,
 )
-from hsi_sc_nerf.evaluation.benchmark.machine import available_cores, describe_machine
-from hsi_sc_nerf.evaluation.benchmark.report import (
+from hsi_sc_nerf.benchmark.machine import available_cores, describe_machine
+from hsi_sc_nerf.benchmark.results import (
     TABLE_WIDTH,
     TrainedRun,
     screen_table,
@@ -39,8 +34,13 @@ from hsi_sc_nerf.evaluation.benchmark.report import (
     write_page,
     write_results,
 )
-from hsi_sc_nerf.evaluation.benchmark.run import Checkpoint, Job
-from hsi_sc_nerf.evaluation.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.run import Checkpoint, Job
+from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.capture.session import is_session
+from hsi_sc_nerf.cli.steps import run_step
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, write_json
+from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -
 def _packed(data: Path) -> Path:
     """The packed dataset that training will read; a session is processed as ``ns-train`` would."""
     from hsi_sc_nerf.data.dataparser import processed_dir
-    from hsi_sc_nerf.data.process import process_session
+    from hsi_sc_nerf.processing.process import process_session
 
     if not is_packed(data) and is_session(data):
         data = process_session(data, processed_dir(data.resolve()))
@@ -221,7 +221,7 @@ def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str
     with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY_PREFIX) as temporary:
         job_path, found_path = Path(temporary, "job.json"), Path(temporary, "found.json")
         write_json(job_path, asdict(doing))
-        module = "hsi_sc_nerf.evaluation.benchmark.run"
+        module = "hsi_sc_nerf.benchmark.run"
         run_step(f"{name} of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
         found = json.loads(found_path.read_text(encoding="utf-8"))
     write_json(folder / f"{name}.json", {"job": asdict(asked), **identity, **found})
@@ -238,7 +238,7 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
 
 
 def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
-    from hsi_sc_nerf.evaluation.benchmark.plot import draw_accuracy_and_time
+    from hsi_sc_nerf.benchmark.plot import draw_accuracy_and_time
 
     settings = {
         "data": command.data.name,

@@ -10,8 +10,8 @@ from pathlib import Path
 from rich.console import Console
 
 from hsi_sc_nerf.cli.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
-from hsi_sc_nerf.data.atomic import atomic_write, make_folder
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import atomic_write, make_folder
 
 MARK = ".hsi-sc-nerf-demo"
 """A file of this name tells that a folder is a demo's, whose parts may be deleted."""

@@ -19,14 +19,14 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.cli.steps import StepCost
-from hsi_sc_nerf.data.atomic import write_json
-from hsi_sc_nerf.data.packed import PackedDataset, open_packed
-from hsi_sc_nerf.data.packed_cube import unpack
-from hsi_sc_nerf.evaluation.pictures import draw_cloud, draw_spectra, draw_views
-from hsi_sc_nerf.evaluation.processing import ProcessingScore, score_processing
 from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
-from hsi_sc_nerf.poses.geometry import project
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.geometry.camera import project
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed
+from hsi_sc_nerf.plotting.result_pictures import draw_cloud, draw_spectra, draw_views
+from hsi_sc_nerf.simulate.scores.processing import ProcessingScore, score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
 SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")

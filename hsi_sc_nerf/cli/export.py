@@ -34,6 +34,6 @@ class ExportCommand:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
         from hsi_sc_nerf.export.spectral_export import export_cloud
-        from hsi_sc_nerf.export.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_run
 
         export_cloud(open_run(self.load_config), self.output_dir, self.options)

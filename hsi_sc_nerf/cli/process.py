@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from hsi_sc_nerf.data.process import ProcessConfig, process_session
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 
 @dataclass(frozen=True)

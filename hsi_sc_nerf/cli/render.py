@@ -53,15 +53,15 @@ class RenderCommand:
             raise InputError("--orbit-views, --orbit-size and --frames-per-second have to be positive; correct them.")
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
-        from hsi_sc_nerf.data.atomic import atomic_write
-        from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
-        from hsi_sc_nerf.export.progress import progress_bar
-        from hsi_sc_nerf.export.render_cubes import render_view, write_view
-        from hsi_sc_nerf.export.render_pictures import find_look
-        from hsi_sc_nerf.export.render_report import compare, write_report
-        from hsi_sc_nerf.export.rendered_views import views_of_frames, views_of_orbit, views_of_path
-        from hsi_sc_nerf.export.trained_run import open_run
-        from hsi_sc_nerf.export.video import open_video
+        from hsi_sc_nerf.files import atomic_write
+        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.progress import progress_bar
+        from hsi_sc_nerf.rendering.cubes import render_view, write_view
+        from hsi_sc_nerf.rendering.pictures import find_look
+        from hsi_sc_nerf.rendering.report import compare, write_report
+        from hsi_sc_nerf.rendering.video import open_video
+        from hsi_sc_nerf.rendering.views import views_of_frames, views_of_orbit, views_of_path
+        from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
         run = open_run(self.load_config)
         found = [find_look(name, run.dataset.wavelengths_nm) for name in self.video]

@@ -54,9 +54,9 @@ class SampleCommand:
         normals = given.normals()
         output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
 
-        from hsi_sc_nerf.export.progress import progress_bar
         from hsi_sc_nerf.export.sample_points import sample_points
-        from hsi_sc_nerf.export.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.progress import progress_bar
 
         run = open_run(self.load_config)
         columns = SpectralColumns(given, run.dataset.wavelengths_nm, _EXTRA)

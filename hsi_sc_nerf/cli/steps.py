@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hsi_sc_nerf.benchmark.machine import peak_memory_mib
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.benchmark.machine import peak_memory_mib
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.poisson import MeshConfig
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
-from hsi_sc_nerf.traits.poisson import MeshConfig
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.traits.analysis import Traits
-    from hsi_sc_nerf.traits.size import Size
-    from hsi_sc_nerf.traits.spectral_mesh import SpectralMesh
+    from hsi_sc_nerf.analysis.size import Size
+    from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+    from hsi_sc_nerf.analysis.traits import Traits
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
+        from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.poisson import closed_mesh
+        from hsi_sc_nerf.analysis.regions import picked_region, read_regions
+        from hsi_sc_nerf.analysis.size import size_of, size_spread
+        from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
+        from hsi_sc_nerf.analysis.traits import analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
-        from hsi_sc_nerf.export.progress import progress_bar
-        from hsi_sc_nerf.traits.analysis import analyse, classified
-        from hsi_sc_nerf.traits.library import read_library
-        from hsi_sc_nerf.traits.poisson import closed_mesh
-        from hsi_sc_nerf.traits.regions import picked_region, read_regions
-        from hsi_sc_nerf.traits.size import size_of, size_spread
-        from hsi_sc_nerf.traits.spectral_mesh import with_spectra
+        from hsi_sc_nerf.progress import progress_bar
 
         self._check()
         picked = [picked_region(*words) for words in self.roi]
@@ -117,7 +117,7 @@ class TraitsCommand:
         """Height of what the object stands on, where it is known."""
         if self.mesh.base_height_m is not None or self.data is None:
             return self.mesh.base_height_m
-        from hsi_sc_nerf.data.packed import open_packed
+        from hsi_sc_nerf.packed.dataset import open_packed
 
         container = open_packed(self.data).container
         return container.height_m if container else None
@@ -126,9 +126,9 @@ class TraitsCommand:
         self, surface: SpectralMesh, size: Size, spread: Size | None, traits: Traits, config: MeshConfig
     ) -> None:
         """Pictures, the mesh and tables; the page, which names them, comes last."""
-        from hsi_sc_nerf.traits import pictures, report
-        from hsi_sc_nerf.traits.poisson import open_edges
-        from hsi_sc_nerf.traits.spectral_mesh import write_mesh
+        from hsi_sc_nerf.analysis import pictures, report
+        from hsi_sc_nerf.analysis.poisson import open_edges
+        from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
 
         views = pictures.SideViews(surface.mesh)
         drawn = {}

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 
 FRAME_INDEX = "frame_index"
 """Camera metadata: which frame of the session a ray belongs to."""

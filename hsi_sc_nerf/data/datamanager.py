@@ -15,7 +15,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler, spread_over
 
 
 @dataclass

@@ -17,12 +17,12 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.data.cameras import pinhole_cameras
-from hsi_sc_nerf.data.packed import PackedDataset, is_packed, open_packed
-from hsi_sc_nerf.data.process import ProcessConfig, process_session
-from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.data.session import is_session
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.dataset import PackedDataset, is_packed, open_packed
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 
 @dataclass

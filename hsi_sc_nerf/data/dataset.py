@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from hsi_sc_nerf.data.packed import PackedFrame
-from hsi_sc_nerf.data.packed_cube import unpack, unpack_unflagged
+from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
+from hsi_sc_nerf.packed.dataset import PackedFrame
 
 
 class SpectralDataset(InputDataset):

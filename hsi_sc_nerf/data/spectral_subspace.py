@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hsi_sc_nerf.data.calibration.uncertainty import ReflectanceUncertainty
-from hsi_sc_nerf.data.packed import PackedFrame
-from hsi_sc_nerf.data.packed_cube import REFLECTANCE_SCALE
-from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 FEWEST_SPECTRA = 64
 """Below this, neither noise nor rank can be told."""

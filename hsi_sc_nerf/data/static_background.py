@@ -17,11 +17,11 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame
-from hsi_sc_nerf.data.packed_cube import FLAGGED, REFLECTANCE_SCALE
-from hsi_sc_nerf.data.pixels import PixelReader
-from hsi_sc_nerf.data.regions import dilate
-from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+from hsi_sc_nerf.packed.pixels import PixelReader
 
 _MEDIAN_VARIANCE = np.pi / 2.0
 """Variance of the median of many normal values, as a multiple of their mean's."""

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.evaluation.similarity import Similarity
+from hsi_sc_nerf.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     import open3d

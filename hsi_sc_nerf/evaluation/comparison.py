@@ -19,7 +19,6 @@ from hsi_sc_nerf.evaluation.registration import (
     align_by_features,
     refine,
 )
-from hsi_sc_nerf.evaluation.similarity import Similarity
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.evaluation.threshold_curves import (
@@ -28,6 +27,7 @@ from hsi_sc_nerf.evaluation.threshold_curves import (
     best_threshold_m,
     threshold_curves,
 )
+from hsi_sc_nerf.geometry.similarity import Similarity
 
 Alignment = Literal["features", "icp", "none"]
 DistanceKind = Literal["surface", "points"]
@@ -186,7 +186,7 @@ def _true_surface(
     session_dir: Path, config: CompareConfig, track: Track
 ) -> tuple[Shape, Bool[np.ndarray, "n"] | None]:
     """The true mesh of a simulated session, and which of its points some view sees; None if all are to count."""
-    from hsi_sc_nerf.evaluation.seen_surface import seen_points
+    from hsi_sc_nerf.simulate.scores.visible_surface import seen_points
     from hsi_sc_nerf.simulate.truth import load_truth
 
     if config.reference_unit != "m":

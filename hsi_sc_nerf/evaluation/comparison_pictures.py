@@ -12,8 +12,8 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
-from hsi_sc_nerf.evaluation.pictures import _COLOURS, _STYLE, _figure, _save
 from hsi_sc_nerf.evaluation.threshold_curves import ThresholdCurves
+from hsi_sc_nerf.plotting.result_pictures import _COLOURS, _STYLE, _figure, _save
 
 _COLOUR_MAP = "viridis"
 _DRAWN_POINTS = 60_000

@@ -12,8 +12,7 @@ from plyfile import PlyData, PlyElement
 from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
-from hsi_sc_nerf.data.atomic import atomic_write, write_json
-from hsi_sc_nerf.evaluation.benchmark.report import markdown_table
+from hsi_sc_nerf.benchmark.results import markdown_table
 from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.comparison_pictures import (
     colour_limit_m,
@@ -22,6 +21,7 @@ from hsi_sc_nerf.evaluation.comparison_pictures import (
     draw_distances,
 )
 from hsi_sc_nerf.evaluation.threshold_curves import distance_statistics, score_at, threshold_for_m
+from hsi_sc_nerf.files import atomic_write, write_json
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _DISTANCE_TITLES = ["distance, mm", "mean", "median", "RMS", "95th percentile", "largest"]

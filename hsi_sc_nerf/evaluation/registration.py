@@ -22,7 +22,7 @@ from hsi_sc_nerf.evaluation.closest_points import (
     robust_radius,
     with_normals,
 )
-from hsi_sc_nerf.evaluation.similarity import Similarity
+from hsi_sc_nerf.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     import open3d

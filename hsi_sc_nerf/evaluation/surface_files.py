@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.mesh import ply_triangles
+from hsi_sc_nerf.meshes.mesh import ply_triangles
 
 FORMATS = (".ply", ".obj", ".stl")
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream
 from hsi_sc_nerf.export.optional import require
 from hsi_sc_nerf.export.ply import band_property_names
+from hsi_sc_nerf.files import atomic_write
 
 COORDINATE_STEP_M = 1e-6
 """LAS stores positions as whole steps."""

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.lib.recfunctions import structured_to_unstructured
 
-from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud, stream
+from hsi_sc_nerf.files import atomic_write
 
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")

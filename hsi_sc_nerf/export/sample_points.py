@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from hsi_sc_nerf.export.camera_views import MIN_OPACITY, render_object, surface_along
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
-from hsi_sc_nerf.export.trained_run import TrainedRun
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.models.spectral_model import SpectralModel
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, project
+from hsi_sc_nerf.models.trained_run import TrainedRun
+from hsi_sc_nerf.surface.depth_renders import MIN_OPACITY, render_object, surface_along
 
 POINTS_AT_A_TIME = 1 << 12
 

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from hsi_sc_nerf.data.atomic import atomic_write
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import band_property_names
-from hsi_sc_nerf.mesh import ply_triangles
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.meshes.mesh import ply_triangles
 
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
@@ -54,7 +54,7 @@ class PlyPoints:
 
             normals = np.array(trimesh.Trimesh(self.positions(), triangles, process=False).vertex_normals)
         else:
-            from hsi_sc_nerf.export.clean import estimate_normals
+            from hsi_sc_nerf.surface.outliers import estimate_normals
 
             normals = estimate_normals(self.positions(), facing=np.zeros((len(self), 3)))
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -16,20 +16,20 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.camera_views import SeenSurface, look_from_cameras
-from hsi_sc_nerf.export.clean import estimate_normals, statistical_inliers
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, INCIDENCE, CloudStream, SpectralCloud
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions
-from hsi_sc_nerf.export.point_cloud import SurfacePoints, render_points, spread_points
-from hsi_sc_nerf.export.progress import progress_bar
-from hsi_sc_nerf.export.regions import EVERYWHERE, Region, around_cylinder, chosen_bands, in_box, in_cylinder
-from hsi_sc_nerf.export.roi_masks import in_roi_masks, read_roi_masks
-from hsi_sc_nerf.export.silhouettes import silhouettes, within_silhouettes
-from hsi_sc_nerf.export.trained_run import TrainedRun, open_run
-from hsi_sc_nerf.export.view_spread import COLUMNS, MeasuredFrames, spread_over_views
+from hsi_sc_nerf.models.trained_run import TrainedRun, open_run
+from hsi_sc_nerf.progress import progress_bar
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.surface.depth_renders import SeenSurface, look_from_cameras
+from hsi_sc_nerf.surface.outliers import estimate_normals, statistical_inliers
+from hsi_sc_nerf.surface.point_cloud import SurfacePoints, render_points, spread_points
+from hsi_sc_nerf.surface.regions import EVERYWHERE, Region, around_cylinder, chosen_bands, in_box, in_cylinder
+from hsi_sc_nerf.surface.roi_masks import in_roi_masks, read_roi_masks
+from hsi_sc_nerf.surface.silhouettes import silhouettes, within_silhouettes
+from hsi_sc_nerf.surface.view_spread import COLUMNS, MeasuredFrames, spread_over_views
 
 if TYPE_CHECKING:
     from nerfstudio.scripts.exporter import ExportPointCloud

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from hsi_sc_nerf.data.atomic import TEMPORARY_PREFIX, atomic_write
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
 from hsi_sc_nerf.export.optional import require
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write
 
 _ATTRIBUTES = {"title": "spectral point cloud", "frame": "object: z along the turntable's axis, up; metres"}
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 
 CORRECTION_CELLS = 32
 """Cells of a learned correction along the picture's longer side. A step of Adam visits every value, hit by a ray or

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hsi_sc_nerf.data.packed import PackedDataset, PackedFrame
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, find_subspace, pixel_noise, sample_training_spectra
 from hsi_sc_nerf.data.static_background import estimate_static_background
 from hsi_sc_nerf.fields.grid_size import GridSize, grid_for_resolution
 from hsi_sc_nerf.models.band_weights import inverse_variance_weights
 from hsi_sc_nerf.models.camera_background import CameraBackground
 from hsi_sc_nerf.models.compositing import ChamberSpectrum
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 BackgroundKind = Literal["last-sample", "spectrum", "image", "learned-image"]
 

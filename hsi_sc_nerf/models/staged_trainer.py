@@ -15,8 +15,8 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
     find_checkpoint,

@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses import frame as object_frame
 from hsi_sc_nerf.poses.adjust import Problem, reproject
 from hsi_sc_nerf.poses.choose import LOSS_SIGMAS, Adjusted
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.initialise import Observations, Rejected
 from hsi_sc_nerf.poses.result import Outlier, TurntablePoses, Uncertainty
 from hsi_sc_nerf.poses.scale import Scale, apparent_sides, container_diameter, length_sigma, resized

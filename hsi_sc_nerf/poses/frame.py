@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, rotation_about_z
 from hsi_sc_nerf.poses.adjust import angle_slopes
-from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, rotation_about_z
 from hsi_sc_nerf.poses.initialise import Observations, Turntable, square_corners
 from hsi_sc_nerf.poses.loop_closure import chained_turn_deg
 

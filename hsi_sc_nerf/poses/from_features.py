@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hsi_sc_nerf.data.session_pictures import BAND_GROUPS_NM, GRAY, SessionPictures
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.frame import lie_on_disc
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.late_frames import with_late_frames
 from hsi_sc_nerf.poses.loop_closure import track_loop_closure_deg
 from hsi_sc_nerf.poses.markers import find_dictionary
@@ -20,6 +19,7 @@ from hsi_sc_nerf.poses.observe import observe
 from hsi_sc_nerf.poses.outliers import usable
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.scale import Scale, container_diameter
+from hsi_sc_nerf.poses.session_pictures import BAND_GROUPS_NM, GRAY, SessionPictures
 from hsi_sc_nerf.poses.static_background import StaticBackgroundConfig, moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import StructureFromMotionConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks, split_half_error_deg

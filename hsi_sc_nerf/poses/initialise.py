@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.geometry import rotation_about_z
+from hsi_sc_nerf.geometry.camera import rotation_about_z
 
 # Fields of view over the width that are tried: from a tele lens to a very wide one.
 _FOV_RANGE_DEG = (5.0, 90.0)

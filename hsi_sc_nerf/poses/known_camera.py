@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, turntable_camera_to_world
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hsi_sc_nerf.data.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 
 Detections: TypeAlias = dict[int, Float[np.ndarray, "4 2"]]
 """Marker id to its corners in pixels (corner origin), clockwise from the upper left one of the marker's pattern."""

@@ -19,12 +19,12 @@ from jaxtyping import Float, UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
-from hsi_sc_nerf.data.session_pictures import FramePictures, SessionPictures
 from hsi_sc_nerf.poses.adjust import reproject
 from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.frame import layout
 from hsi_sc_nerf.poses.initialise import Observations, Rejected, Turntable
 from hsi_sc_nerf.poses.markers import Detections, detect_markers
+from hsi_sc_nerf.poses.session_pictures import FramePictures, SessionPictures
 
 # Frames that are searched at the same time: OpenCV and NumPy let other threads work meanwhile.
 _WORKERS = 2

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hsi_sc_nerf.data.atomic import atomic_write
+from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX, describe_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 

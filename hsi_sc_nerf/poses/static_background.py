@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from hsi_sc_nerf.data.regions import dilate, ellipse_close_open, touching
+from hsi_sc_nerf.morphology import dilate, ellipse_close_open, touching
 
 # Brightness classes of equal size in which the noise is measured: photon noise grows with the light.
 _BRIGHTNESS_CLASSES = 16

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.geometry import OPENCV_TO_OPENGL, rotation_about_z
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, rotation_about_z
 
 
 @dataclass(frozen=True)

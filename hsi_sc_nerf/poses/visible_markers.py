@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.poses.initialise import Observations
 
 # A marker that is seen in fewer frames, or whose rays do not come from different sides, has no certain place.

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsi_sc_nerf.data.atomic import atomic_write
-from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
-from hsi_sc_nerf.export.progress import progress_bar
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.report.blocks import CloudViewer, KeyFigure, Section
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.comparison_section import comparison_key_figure, comparison_section
@@ -32,7 +32,7 @@ from hsi_sc_nerf.report.view_sections import (
 )
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.export.trained_run import TrainedRun
+    from hsi_sc_nerf.models.trained_run import TrainedRun
 
 CLOUD_POINTS = 50_000
 
@@ -118,7 +118,7 @@ def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path | N
 
 
 def _opened(folder: Path) -> TrainedRun:
-    from hsi_sc_nerf.export.trained_run import open_run
+    from hsi_sc_nerf.models.trained_run import open_run
 
     return open_run(folder / "config.yml")
 
@@ -162,7 +162,7 @@ def _settings(folder: Path) -> Section:
     import yaml
     from nerfstudio.configs.method_configs import all_methods
 
-    from hsi_sc_nerf.evaluation.benchmark.machine import describe_machine
+    from hsi_sc_nerf.benchmark.machine import describe_machine
 
     config = yaml.load((folder / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
     # A run may have a name of its own (--method-name); then every setting is shown.

@@ -13,10 +13,10 @@ from matplotlib import colormaps
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
+from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
-from hsi_sc_nerf.viewer.pictures import INDEX_COLOURS
 
 _INT16 = 32767
 _MISSING = 65535

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Int
 from markupsafe import Markup
 
-from hsi_sc_nerf.data.packed import PackedDataset
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.blocks import Block, Figure, Folded, Missing, Section, Table, Warnings
 from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
 from hsi_sc_nerf.report.embed import embedded_file

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hsi_sc_nerf.data.pixels import spread_over
+from hsi_sc_nerf.packed.pixels import spread_over
 
 
 @dataclass(frozen=True, eq=False)

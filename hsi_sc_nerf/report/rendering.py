@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from hsi_sc_nerf.data.pseudo_rgb import to_8_bit
 from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.report.places import PlaceSpectra, inner_places, place_spectra
 from hsi_sc_nerf.report.scores import ViewScores, score_view, spread_of_views
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.export.trained_run import TrainedRun
+    from hsi_sc_nerf.models.trained_run import TrainedRun
 
 PLACES = 4
 # Radius of a place, as a share of a view's width: 8 pixels of the SPECIM IQ's 512.

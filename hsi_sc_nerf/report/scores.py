@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.models.metrics import (
+from hsi_sc_nerf.evaluation.spectral_metrics import (
     PSNR_DELTA,
     per_band_mse,
     per_band_ssim,

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.mesh import Mesh
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, look_at
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
 from hsi_sc_nerf.simulate.effects import of_stage
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate.colours import Colour
 from hsi_sc_nerf.simulate.effects.stages import LensEffect, LightEffect, SurfaceLightEffect, ViewLightEffect
 from hsi_sc_nerf.simulate.render import Hits, Renderer

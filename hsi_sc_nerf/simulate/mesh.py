@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.meshes.mesh import Mesh
 
 
 def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate import assemble, sensor
 from hsi_sc_nerf.simulate.effects.stages import MotionEffect
 from hsi_sc_nerf.simulate.materials import endmembers

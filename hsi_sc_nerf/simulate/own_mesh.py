@@ -12,7 +12,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import snapped, subdivided, welded
 from hsi_sc_nerf.simulate.objects import OwnMesh
 from hsi_sc_nerf.simulate.texture import padded_shares, sampled

@@ -11,8 +11,8 @@ import open3d as o3d
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from hsi_sc_nerf.mesh import Mesh, ray_scene
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.effects.stages import LensEffect
 from hsi_sc_nerf.simulate.mesh import subdivided
 

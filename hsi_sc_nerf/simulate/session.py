@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsi_sc_nerf import __version__
-from hsi_sc_nerf.data.envi import write_cube
+from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
 from hsi_sc_nerf.simulate.effects.orientation import ImageRotation

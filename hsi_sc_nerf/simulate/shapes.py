@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from hsi_sc_nerf.mesh import Mesh
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import revolve
 
 SEGMENTS = 336

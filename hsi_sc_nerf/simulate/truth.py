@@ -15,8 +15,8 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.mesh import Mesh
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.frames import Frame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 Spectra = TypeVar("Spectra", np.ndarray, Tensor)
 """Reflectance, bands last: an array or a tensor on any device."""

@@ -24,15 +24,21 @@ from viser.transforms import SO3
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.models.metrics import spectral_angle_map
+from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
+from hsi_sc_nerf.plotting.false_colour import (
+    ANGLE_COLOURS,
+    ANGLE_DRAWN_RAD,
+    INDEX_COLOURS,
+    angle_to_measured,
+    coloured,
+)
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
 from hsi_sc_nerf.viewer.picking import PickedPoint, pick
-from hsi_sc_nerf.viewer.pictures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, angle_to_measured, coloured
 from hsi_sc_nerf.viewer.training_views import TrainingViews
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.data.dataset import SpectralDataset
-from hsi_sc_nerf.data.packed_cube import unpack
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
-from hsi_sc_nerf.viewer.pictures import frame_pixels
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.plotting.false_colour import frame_pixels
 
 SAME_PLACE = 1e-4
 """A camera this near to a view's (scene units, of which the scene box has two) sees what the view sees."""

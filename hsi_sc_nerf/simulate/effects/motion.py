@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.geometry import rotation_about_z
+from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, PlacementEffect
 from hsi_sc_nerf.simulate.reading import between
 

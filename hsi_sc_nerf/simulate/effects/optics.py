@@ -11,7 +11,7 @@ from scipy.ndimage import correlate1d
 from scipy.special import ive
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect
 from hsi_sc_nerf.simulate.reading import between
 

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.poses.geometry import PinholeIntrinsics, turntable_camera_to_world
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.simulate.lighting import HitLight, SurfaceLight

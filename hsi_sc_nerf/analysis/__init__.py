@@ -1,0 +1,1 @@
+"""Traits of a spectral cloud: sizes, classes, indices, regions."""

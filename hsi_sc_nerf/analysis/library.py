@@ -1,0 +1,167 @@
+"""Reference spectra by name: an ENVI spectral library or a CSV table, brought to the bands of a cloud."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from spectral.io import envi
+
+from hsi_sc_nerf.capture.envi_header import check_layout, mended_fields, number_in, wavelengths_of
+from hsi_sc_nerf.errors import InputError
+
+# Micrometres without a unit are told by their size: no band of a camera is below 100 nm.
+_SMALLEST_NM = 100.0
+# The USGS library has -1.23e34 where it has no reflectance ("deleted channels").
+_DELETED = -1e20
+
+
+@dataclass(frozen=True)
+class SpectralLibrary:
+    """Named reference spectra; those of equal name are references of one class.
+
+    Attributes:
+        names: of each spectrum.
+        wavelengths_nm: band centres.
+        spectra: reflectance; NaN where the library has none.
+    """
+
+    names: tuple[str, ...]
+    wavelengths_nm: Float[np.ndarray, "bands"]
+    spectra: Float[np.ndarray, "references bands"]
+
+    def at(self, wavelengths_nm: Float[np.ndarray, "other"]) -> SpectralLibrary:
+        """The library at a cloud's wavelengths, straight between its own.
+
+        Raises:
+            InputError: the library does not reach as far as the wavelengths (1 nm of grace), has no reflectance at
+                one, or there is only one, at which no spectrum differs from another by its angle.
+        """
+        if len(wavelengths_nm) < 2:
+            raise InputError("the cloud has one band, which tells no classes; give one with more, or no --library.")
+        low, high = self.wavelengths_nm.min(), self.wavelengths_nm.max()
+        if wavelengths_nm.min() < low - 1.0 or wavelengths_nm.max() > high + 1.0:
+            raise InputError(
+                f"the spectral library goes from {low:g} to {high:g} nm and the cloud from {wavelengths_nm.min():g} "
+                f"to {wavelengths_nm.max():g} nm; give a library that covers the cloud."
+            )
+        order = np.argsort(self.wavelengths_nm)
+        spectra = np.stack(
+            [np.interp(wavelengths_nm, self.wavelengths_nm[order], row[order]) for row in self.spectra]
+        )
+        missing = np.isnan(spectra)
+        if missing.any():
+            where = [
+                f"{name} at {wavelengths_nm[row.argmax()]:g} nm"
+                for name, row in zip(self.names, missing, strict=True)
+                if row.any()
+            ]
+            raise InputError(
+                f"the spectral library has no reflectance of {', '.join(where)}; leave such spectra out (--classes), "
+                "or export the cloud without these bands (--bands)."
+            )
+        return SpectralLibrary(self.names, wavelengths_nm, spectra)
+
+    def only(self, names: tuple[str, ...]) -> SpectralLibrary:
+        """The spectra of these names, in the library's order.
+
+        Raises:
+            InputError: a name is not in the library.
+        """
+        unknown = [name for name in names if name not in self.names]
+        if unknown:
+            known = ", ".join(dict.fromkeys(self.names))
+            raise InputError(f"the spectral library has no {', '.join(unknown)}; it has {known}.")
+        rows = [row for row, name in enumerate(self.names) if name in names]
+        return SpectralLibrary(tuple(self.names[row] for row in rows), self.wavelengths_nm, self.spectra[rows])
+
+
+def read_library(path: Path) -> SpectralLibrary:
+    """Read an ENVI spectral library (``.sli`` with its header, or the header) or a CSV table.
+
+    The table's first column is the wavelength in nm (in µm if its numbers are below 100), each other column a
+    spectrum with its name in the first line.
+
+    Raises:
+        InputError: the file is missing, is neither of the two, or holds numbers that cannot be read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give an ENVI spectral library (.sli) or a CSV table.")
+    names, wavelengths_nm, spectra = _read_table(path) if path.suffix.lower() == ".csv" else _read_envi(path)
+    if len(names) != len(spectra) or min(spectra.shape) == 0:
+        raise InputError(f"{path}: holds {len(spectra)} spectra and names {len(names)}; export the library again.")
+    return SpectralLibrary(tuple(names), wavelengths_nm, np.where(spectra < _DELETED, np.nan, spectra))
+
+
+def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header, *rows = [row for row in csv.reader(file) if row]
+        table = np.array(rows, float)
+        if table.ndim != 2 or table.shape[1] != len(header) or len(header) < 2:
+            raise ValueError("its lines do not have the same number of columns")
+        if not np.isfinite(table).all():
+            raise ValueError("it holds numbers that are not finite")
+    except (ValueError, OSError) as error:
+        raise InputError(
+            f"{path}: is no table of spectra ({error}); its first line names the columns, its first column is the "
+            "wavelength in nm, and each other column is a spectrum."
+        ) from error
+    wavelengths = table[:, 0]
+    nm_per_unit = 1000.0 if wavelengths.max() < _SMALLEST_NM else 1.0
+    return [name.strip() for name in header[1:]], wavelengths * nm_per_unit, table[:, 1:].T
+
+
+def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """A library is a header's image of one band: a line a spectrum, a sample a wavelength."""
+    header, data = _envi_pair(path)
+    fields = mended_fields(header)
+    if "library" not in str(fields.get("file type", "")).lower():
+        raise InputError(f"{header}: its file type is no spectral library; give a library's header or correct it.")
+    try:
+        shape = (int(fields["lines"]), int(fields["samples"]))
+        parameters = envi.gen_params(fields)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{header}: a field of this header cannot be read ({error}); correct it.") from error
+    dtype = np.dtype(parameters.dtype)
+    check_layout(header, {**fields, "file type": ""}, (*shape, 1), dtype, parameters.offset)
+    _, wavelengths_nm = wavelengths_of(header, fields, shape[1])
+    if wavelengths_nm is None:
+        raise InputError(f"{header}: lists no wavelengths; add them.")
+    scale, ignored = (number_in(header, fields, key) for key in ("reflectance scale factor", "data ignore value"))
+    try:
+        numbers = np.fromfile(data, dtype, math.prod(shape), offset=parameters.offset)
+    except OSError as error:
+        raise InputError(f"{data}: cannot be read ({error}); check the file.") from error
+    if numbers.size != math.prod(shape):
+        raise InputError(f"{data}: is smaller than its header {header.name} says; export the library again.")
+    spectra = numbers.reshape(shape).astype(float)
+    if ignored is not None:
+        spectra[np.isclose(spectra, ignored, rtol=1e-6, atol=0.0)] = np.nan
+    names = np.atleast_1d(fields.get("spectra names") or np.arange(1, shape[0] + 1).astype(str))
+    return names.tolist(), wavelengths_nm, spectra / (scale or 1.0)
+
+
+def _envi_pair(path: Path) -> tuple[Path, Path]:
+    """Header and data file of a library, either of which is given."""
+    if path.suffix.lower() == ".hdr":
+        base = path.with_suffix("")
+        data = next((one for one in (base, *_ending(base, ".sli")) if one.is_file()), None)
+        if data is None:
+            raise InputError(f"{path}: its library {base.name}.sli is missing; put it beside the header.")
+        return path, data
+    candidates = [*_ending(path.with_suffix(""), ".hdr"), *_ending(path, ".hdr")]
+    header = next((one for one in candidates if one.is_file()), None)
+    if header is None:
+        raise InputError(f"{path}: its header {candidates[0].name} is missing; put it beside the library.")
+    return header, path
+
+
+def _ending(base: Path, ending: str) -> list[Path]:
+    """``base`` with the ending in small and in capital letters."""
+    return [base.with_name(base.name + one) for one in (ending, ending.upper())]

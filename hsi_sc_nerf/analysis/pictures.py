@@ -1,0 +1,178 @@
+"""The mesh from four sides, in composites, indices and classes; spectra of regions. One PNG a function."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib import colormaps, rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.patches import Patch
+
+from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.analysis.traits import WHOLE, Traits
+from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
+from hsi_sc_nerf.plotting.result_pictures import _COLOURS, _STYLE, _figure, _save, _show
+from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
+from hsi_sc_nerf.spectra.indices import INDICES, index_values
+
+SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
+_HEIGHT_PX = 420
+_LABEL_IN = 1.4
+"""What the label beside a row needs."""
+_GREY = 0.85
+"""What was not seen."""
+_NEAR_WHITE = 0.97
+"""What is in no class."""
+
+
+class SideViews:
+    """Parallel projections of a mesh, seen from the sides; each pixel knows its triangle.
+
+    What is flat stands in the middle of pictures that are twice as wide as high.
+    """
+
+    def __init__(self, mesh: Mesh, height_px: int = _HEIGHT_PX) -> None:
+        self._mesh = mesh
+        scene = ray_scene(mesh.vertices, mesh.triangles)
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        middle = (low + high) / 2.0
+        reach_m = float(np.linalg.norm(mesh.vertices[:, :2] - middle[:2], axis=1).max())
+        step_m = 1.04 * max(high[2] - low[2], reach_m) / height_px
+        columns = int(np.ceil(2.08 * reach_m / step_m))
+        across = (np.arange(columns) + 0.5 - columns / 2) * step_m
+        up = (height_px / 2 - np.arange(height_px) - 0.5) * step_m
+        self.sides = []
+        for azimuth in np.deg2rad(list(SIDES_DEG.values())):
+            towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+            start = middle + 2.0 * reach_m * towards + across[None, :, None] * right + up[:, None, None] * [0, 0, 1.0]
+            rays = np.concatenate([start, np.broadcast_to(-towards, start.shape)], axis=-1).astype(np.float32)
+            hits = scene.cast_rays(rays)
+            u, v = np.moveaxis(hits["primitive_uvs"].numpy(), -1, 0)
+            hit = np.isfinite(hits["t_hit"].numpy())
+            triangle = np.where(hit, hits["primitive_ids"].numpy(), 0).astype(np.int64)
+            self.sides.append((hit, triangle, np.stack([1.0 - u - v, u, v], axis=-1)))
+
+    def of(self, values: Float[np.ndarray, "v *channels"]) -> list[Float[np.ndarray, "h w *channels"]]:
+        """Values at vertices as pictures, a side each, mixed linearly within triangles; NaN beside the object."""
+        pictures = []
+        for hit, triangle, share in self.sides:
+            corners = values[self._mesh.triangles[triangle]]
+            mixed = np.einsum("hwc,hwc...->hw...", share, corners)
+            mixed[~hit] = np.nan
+            pictures.append(mixed)
+        return pictures
+
+
+@rc_context(_STYLE)
+def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
+    """The named composites in rows, the sides in columns; what was not seen is grey.
+
+    Args:
+        path: the PNG file.
+        surface: the mesh.
+        views: of the mesh.
+        traits: say which composites the bands can show.
+    """
+    rows = {}
+    for name in traits.composites[WHOLE]:
+        one = COMPOSITES[name]
+        values = composite(surface.spectra, surface.wavelengths_nm, one.wavelengths_nm, name).astype(float)
+        # Bands of dark tissue would be hard to make out; the brightest percent may be cut.
+        values = np.clip(values / np.percentile(values[surface.seen], 99.0), 0.0, 1.0)
+        values[~surface.seen] = _GREY
+        label = f"{name}\n{', '.join(f'{nm:g}' for nm in one.wavelengths_nm)} nm"
+        rows[label] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(values)]
+    _draw_rows(path, rows)
+
+
+@rc_context(_STYLE)
+def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
+    """The named indices as colour maps, in rows, the sides in columns; what was not seen is grey.
+
+    The scale of each goes from its 1st to its 99th percentile on this surface.
+    """
+    rows, scales = {}, []
+    for name in traits.indices[WHOLE]:
+        values = index_values(INDICES[name], surface.spectra, surface.wavelengths_nm).astype(float)
+        known = values[surface.seen & np.isfinite(values)]
+        low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
+        coloured = colormaps["viridis"](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
+        coloured[~surface.seen | ~np.isfinite(values)] = _GREY
+        expression = INDICES[name].expression.replace(" / (", " /\n(")
+        rows[f"{name}\n{expression}"] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(coloured)]
+        scales.append((low, high))
+    _draw_rows(path, rows, scales)
+
+
+def _draw_rows(
+    path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float]] = ()
+) -> None:
+    first = next(iter(rows.values()))[0]
+    width_in = 1.75
+    row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
+    figure = _figure(width_in * len(SIDES_DEG) + 1.0, row_in * len(rows) + 0.35)
+    grid = figure.subplots(len(rows), len(SIDES_DEG), squeeze=False)
+    for line, (label, pictures) in zip(grid, rows.items(), strict=True):
+        for axes, picture in zip(line, pictures, strict=True):
+            _show(axes, picture)
+        line[0].set_ylabel(label)
+    for axes, title in zip(grid[0], SIDES_DEG, strict=True):
+        axes.set_title(title)
+    for line, scale in zip(grid, scales, strict=False):
+        colours = ScalarMappable(Normalize(*scale), "viridis")
+        figure.colorbar(colours, ax=line.tolist(), extend="both", fraction=0.04, aspect=18, pad=0.02)
+    _save(figure, path)
+
+
+@rc_context(_STYLE)
+def draw_classes(
+    path: Path, names: Sequence[str], labels: Int[np.ndarray, "v"], surface: SpectralMesh, views: SideViews
+) -> None:
+    """The classes on the surface, with their areas; white is in no class, grey was not seen."""
+    colours = np.array([to_rgb(_COLOURS[index % len(_COLOURS)]) for index in range(len(names))])
+    painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
+    painted[~surface.seen] = _GREY
+    pictures = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(painted)]
+    height, width = pictures[0].shape[:2]
+    figure = _figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
+    for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
+        _show(axes, picture)
+        axes.set_title(title)
+    areas_cm2 = 1e4 * class_areas_m2(labels, surface.areas_m2, surface.seen, len(names))
+    patches = [
+        Patch(color=colours[index], label=f"{name}: {area:.2f} cm²")
+        for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
+        if area > 0
+    ]
+    rest = f"in no class: {areas_cm2[-1]:.2f} cm²"
+    patches += [
+        Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest),
+        Patch(color=str(_GREY), label="not seen"),
+    ]
+    figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
+    _save(figure, path)
+
+
+@rc_context(_STYLE)
+def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
+    """Mean spectrum of each region with a band of one standard deviation over its surface."""
+    figure = _figure(9.0, 4.0)
+    axes = figure.subplots()
+    order = np.argsort(wavelengths_nm)
+    nm = wavelengths_nm[order]
+    for index, region in enumerate(traits.spectra):
+        colour = "0.35" if index == 0 else _COLOURS[(index - 1) % len(_COLOURS)]
+        mean, sd = region.mean[order], region.sd[order]
+        axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
+        label = f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)"
+        axes.plot(nm, mean, color=colour, linewidth=1.5, marker="o" if len(nm) == 1 else None, label=label)
+    axes.margins(x=0.0)
+    axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", ylim=(0, None))
+    figure.legend(loc="outside right upper", fontsize=8)
+    _save(figure, path)

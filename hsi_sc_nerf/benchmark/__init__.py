@@ -1,0 +1,1 @@
+"""Configurations trained and timed alike: accuracy against training time."""

@@ -1,0 +1,231 @@
+"""One configuration trained and timed, in a process of its own: ``python -m ... JOB.json RESULT.json``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hsi_sc_nerf.benchmark.configurations import training_config
+from hsi_sc_nerf.benchmark.machine import peak_memory_mib
+from hsi_sc_nerf.benchmark.timing import (
+    Clock,
+    TrainingClock,
+    checkpoint_iterations,
+    mean_iteration_seconds,
+)
+from hsi_sc_nerf.files import write_json
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
+    from nerfstudio.data.utils.dataloaders import EvalDataloader
+
+    from hsi_sc_nerf.models.staged_trainer import StagedTrainer
+
+_REHEARSAL_ITERATIONS = 20
+_REHEARSAL_SHARE = 0.05
+_RENDERING_SPEEDS = ("num_rays_per_sec", "fps")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one process has to do.
+
+    Attributes:
+        method: nerfstudio method of this package.
+        words: as after ``ns-train METHOD``.
+        data: the packed dataset.
+        output_dir: where the training run is kept.
+        iterations: length of the run; None: find out how many fit into ``train_seconds``, and train nothing.
+        train_seconds: time to fill; None where ``iterations`` is given.
+        clock: what ``train_seconds`` are of.
+        checkpoints: shares of the run at which it is evaluated, beside the stages' ends.
+        threads: CPU threads.
+        held_out_views: how many held-out views are evaluated, evenly spread; None for all.
+    """
+
+    method: str
+    words: tuple[str, ...]
+    data: str
+    output_dir: str
+    iterations: int | None
+    train_seconds: float | None
+    clock: Clock
+    checkpoints: tuple[float, ...]
+    threads: int
+    held_out_views: int | None
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """How a run did at one of its steps.
+
+    Attributes:
+        iteration: iterations done.
+        stage: name of the stage that the last of them belongs to.
+        ends_stage: whether it was that stage's last.
+        train_seconds: wall time of training so far, without evaluations and without setting up.
+        cpu_seconds: the processor's, likewise, over all threads.
+        evaluation_seconds: wall time of this evaluation.
+        peak_memory_mib: most memory that the process has held so far, earlier evaluations included.
+        gpu_memory_mib: most memory that tensors have held on the GPU so far; 0 without one.
+        metrics: mean over the held-out views of the model's own metrics, and ``_std``, their spread.
+    """
+
+    iteration: int
+    stage: str
+    ends_stage: bool
+    train_seconds: float
+    cpu_seconds: float
+    evaluation_seconds: float
+    peak_memory_mib: float
+    gpu_memory_mib: float
+    metrics: dict[str, float]
+
+
+def build_trainer(config: Any, job: Job, iterations: int, output_dir: Path) -> StagedTrainer:
+    """The trainer that ``ns-train`` would make of ``config``, without evaluations of its own on the way."""
+    import torch
+
+    config.pipeline.datamanager.data = Path(job.data)
+    config.max_num_iterations = iterations
+    config.output_dir, config.experiment_name, config.timestamp = output_dir, "benchmark", "run"
+    config.vis = "tensorboard"
+    config.steps_per_save = config.steps_per_eval_batch = 0
+    config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.evaluate_stages = False
+    torch.manual_seed(config.machine.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    config.save_config()
+    return trainer
+
+
+class HeldOutViews:
+    """Some of the held-out views, evenly spread, each read when its turn comes.
+
+    nerfstudio's own loader of chosen views says that it is as long as the whole dataset.
+
+    Args:
+        loader: of all held-out views.
+        count: how many to take; None for all.
+    """
+
+    def __init__(self, loader: EvalDataloader, count: int | None) -> None:
+        total = len(loader)
+        count = min(count or total, total)
+        self.loader, self.indices = loader, [i * total // count for i in range(count)]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
+        return map(self.loader.get_camera, self.indices)
+
+
+def train(job: Job) -> dict[str, Any]:
+    """Train and evaluate; gives ``setup_seconds`` and ``checkpoints``.
+
+    The trainer draws each step's random numbers anew, so that evaluations do not change the training.
+    """
+    import torch
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+    assert job.iterations is not None
+    config = training_config(job.method, job.words)
+    started = time.perf_counter()
+    trainer = build_trainer(config, job, job.iterations, Path(job.output_dir))
+    setup_seconds = time.perf_counter() - started
+
+    manager: Any = trainer.pipeline.datamanager
+    views = HeldOutViews(manager.fixed_indices_eval_dataloader, job.held_out_views)
+    on_gpu = trainer.pipeline.device.type == "cuda"
+    ends = {stage.end for stage in trainer.plan.stages}
+    found: list[Checkpoint] = []
+
+    def evaluate(step: int) -> None:
+        with clock.paused() as (wall, cpu):
+            peak = peak_memory_mib()
+            before = time.perf_counter()
+            metrics = trainer.pipeline.get_average_image_metrics(views, "eval", step, get_std=True)
+            found.append(
+                Checkpoint(
+                    iteration=step + 1,
+                    stage=trainer.plan.at(step).config.name,
+                    ends_stage=step + 1 in ends,
+                    train_seconds=wall,
+                    cpu_seconds=cpu,
+                    evaluation_seconds=time.perf_counter() - before,
+                    peak_memory_mib=peak,
+                    gpu_memory_mib=torch.cuda.max_memory_allocated() / 2**20 if on_gpu else 0.0,
+                    metrics={k: v for k, v in metrics.items() if k.removesuffix("_std") not in _RENDERING_SPEEDS},
+                )
+            )
+
+    stops = checkpoint_iterations(job.checkpoints, sorted(ends))
+    trainer.callbacks.append(
+        TrainingCallback(
+            [TrainingCallbackLocation.AFTER_TRAIN_ITERATION], evaluate, iters=tuple(stop - 1 for stop in stops)
+        )
+    )
+    clock = TrainingClock(torch.cuda.synchronize) if on_gpu else TrainingClock()
+    trainer.train()
+    return {"setup_seconds": setup_seconds, "checkpoints": [asdict(checkpoint) for checkpoint in found]}
+
+
+def rehearse(job: Job) -> dict[str, Any]:
+    """How many iterations fill ``train_seconds``: gives ``iterations`` and ``iteration_seconds``.
+
+    A whole run of 20 iterations tells how many fit into a twentieth of the time; a whole run of so many, stages and
+    all, tells how long an iteration takes in the mean.
+    """
+    assert job.train_seconds is not None
+    seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS)
+    longer = int(_REHEARSAL_SHARE * job.train_seconds / seconds)
+    if longer > _REHEARSAL_ITERATIONS:
+        seconds = _rehearsed_seconds(job, longer)
+    return {"iterations": max(1, round(job.train_seconds / seconds)), "iteration_seconds": seconds}
+
+
+def _rehearsed_seconds(job: Job, iterations: int) -> float:
+    import torch
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+    config = training_config(job.method, job.words)
+    trainer = build_trainer(config, job, iterations, Path(job.output_dir))
+
+    def record(step: int) -> None:
+        if trainer.pipeline.device.type == "cuda":
+            torch.cuda.synchronize()
+        times.append(clock())
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], record))
+    clock = time.perf_counter if job.clock == "wall" else time.process_time
+    times = [clock()]
+    trainer.train()
+    return mean_iteration_seconds(times, [stage.end for stage in trainer.plan.stages])
+
+
+def main(job_path: Path, result_path: Path) -> None:
+    """Do the job; the result appears whole or not at all."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    job = Job(**json.loads(job_path.read_text(encoding="utf-8")))
+    torch.set_num_threads(job.threads)
+    with threadpool_limits(job.threads):
+        write_json(result_path, rehearse(job) if job.iterations is None else train(job))
+
+
+if __name__ == "__main__":
+    try:
+        main(Path(sys.argv[1]), Path(sys.argv[2]))
+    except (Exception, SystemExit):
+        # To the log, which stdout goes to.
+        traceback.print_exc(file=sys.stdout)
+        sys.exit(1)

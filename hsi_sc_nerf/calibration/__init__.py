@@ -1,0 +1,1 @@
+"""Raw counts to reflectance: white and dark references, detector defects, noise, lamp drift."""

@@ -1,0 +1,141 @@
+"""How the light falls off over the image, from the white tarp: a smooth surface that all bands share."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Num
+
+from hsi_sc_nerf.calibration.config import CalibrationConfig
+from hsi_sc_nerf.calibration.dark import dark_columns
+from hsi_sc_nerf.calibration.defects import Defects
+from hsi_sc_nerf.calibration.white_reference import WhiteReference
+from hsi_sc_nerf.calibration.white_steps import mean_over_columns
+from hsi_sc_nerf.capture.session import Capture
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.morphology import dilate, largest_component
+
+EDGE_FRACTION = 32
+"""The tarp's outermost part, its shorter side over this, is left out: it is blurred, frayed or curls up."""
+REACH = 1.25
+"""The surface is followed beyond the tarp up to so many of its half widths from its middle, and level from there."""
+VALUE_REACH = 0.5
+"""Beyond the tarp it rises and falls by no more than this share of its range on the tarp."""
+MAX_PIXELS = 20_000
+"""So many of the tarp's pixels, evenly spread, are enough for the 15 numbers of a surface of order 4."""
+
+
+def flat_field(
+    tarp: Capture,
+    white: WhiteReference,
+    frame_shape: tuple[int, int],
+    config: CalibrationConfig,
+    defects: Defects | None = None,
+) -> Float[np.ndarray, "lines samples"]:
+    """Illumination of each pixel over that of the white spectrum.
+
+    The same in all bands, and positive; on average 1 over the region that the white spectrum was taken from, but for
+    dirt and folds in it, which lower the spectrum and not the illumination. It is for frames taken with the camera,
+    and under lamps, that stand as they did for the tarp; reflectance over it is what a tarp before the whole image
+    would have given.
+
+    Args:
+        tarp: the capture of the white tarp.
+        white: its spectrum.
+        frame_shape: lines and samples of the frames.
+        config: its ``flat_field_order`` and ``roi_brightness``.
+        defects: of the detector, found before.
+
+    Raises:
+        InputError: the tarp's image has another size than the frames, or the tarp is too small in it to tell.
+    """
+    header = tarp.cube.header_path
+    if tarp.cube.shape[:2] != frame_shape:
+        raise InputError(
+            f"{header}: its {tarp.cube.shape[:2]} lines and samples differ from the {tuple(frame_shape)} of the "
+            "frames, so that it cannot serve as their flat field; leave out --calibration.flat-field."
+        )
+    counts = tarp.cube.memmap()
+    samples, bands = counts.shape[1:]
+    use = np.broadcast_to(~white.bad_bands, (samples, bands))
+    if defects is not None:
+        use = use & ~defects.dead
+    dark = dark_columns(None if tarp.dark is None else tarp.dark.read(), samples, bands)
+    brightness = relative_brightness(counts, dark, np.nan_to_num(mean_over_columns(white.measured)), use)
+    region = np.zeros(brightness.shape, bool)
+    x0, y0, x1, y1 = white.roi
+    region[y0:y1, x0:x1] = brightness[y0:y1, x0:x1] > config.roi_brightness
+    edge_px = 2 * max(1, min(y1 - y0, x1 - x0) // EDGE_FRACTION) + 1
+    region = ~dilate(~largest_component(region), edge_px)
+    terms = (config.flat_field_order + 1) * (config.flat_field_order + 2) // 2
+    if np.count_nonzero(region) < 10 * terms:
+        raise InputError(
+            f"{header}: the tarp is too small in its image to tell how the light falls off; leave out "
+            "--calibration.flat-field."
+        )
+    return fit_surface(brightness, region, config.flat_field_order).astype(np.float32)
+
+
+def relative_brightness(
+    counts: Num[np.ndarray, "lines samples bands"],
+    dark: Float[np.ndarray, "columns bands"],
+    spectrum: Float[np.ndarray, "bands"],
+    use: Bool[np.ndarray, "samples bands"],
+) -> Float[np.ndarray, "lines samples"]:
+    """Counts above dark over the white spectrum, both summed over the bands of the elements in ``use``."""
+    used = use.astype(np.float64)
+    dark_sum, white_sum = (used * dark).sum(axis=1), used @ spectrum
+    light = np.stack([np.einsum("xb,xb->x", np.asarray(line, np.float64), used) for line in counts])
+    # A sample without any element in use says nothing; its neighbours' surface serves it.
+    return np.where(white_sum > 0.0, (light - dark_sum) / np.where(white_sum > 0.0, white_sum, 1.0), 0.0)
+
+
+def fit_surface(
+    brightness: Float[np.ndarray, "lines samples"], region: Bool[np.ndarray, "lines samples"], order: int
+) -> Float[np.ndarray, "lines samples"]:
+    """A polynomial of two variables, fitted to the region without its dirt and folds, over the whole image.
+
+    Least absolute deviations first, which dirt on less than half of the region does not move, then Tukey's biweight
+    (Huber & Ronchetti, "Robust Statistics", 2nd ed., section 7), which does not weigh it at all. Outside the region
+    it is held within ``REACH`` and ``VALUE_REACH``.
+    """
+    lines, samples = brightness.shape
+    y, x = np.nonzero(region)
+    middle, half = [], []
+    for positions in (y, x):
+        middle.append((positions.min() + positions.max()) / 2.0)
+        half.append(max((positions.max() - positions.min()) / 2.0, 1.0))
+    every = -(-len(y) // MAX_PIXELS)
+    chosen = np.random.default_rng(0).permutation(len(y))[:: max(every, 1)]
+    y, x = y[chosen], x[chosen]
+    terms = _terms((y - middle[0]) / half[0], (x - middle[1]) / half[1], order)
+    coefficients = _robust_fit(terms, brightness[y, x])
+    on_region = terms @ coefficients
+    beyond = VALUE_REACH * np.ptp(on_region)
+    rows = np.clip((np.arange(lines) - middle[0]) / half[0], -REACH, REACH)
+    columns = np.clip((np.arange(samples) - middle[1]) / half[1], -REACH, REACH)
+    surface = np.stack([_terms(np.full(samples, row), columns, order) @ coefficients for row in rows])
+    darkest = on_region.min()
+    return np.clip(surface, max(darkest - beyond, 0.5 * darkest), on_region.max() + beyond)
+
+
+def _terms(y: Float[np.ndarray, "n"], x: Float[np.ndarray, "n"], order: int) -> Float[np.ndarray, "n terms"]:
+    """Products of Legendre polynomials of y and x up to a total order."""
+    of_y, of_x = np.polynomial.legendre.legvander(y, order), np.polynomial.legendre.legvander(x, order)
+    pairs = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+    return np.stack([of_y[:, i] * of_x[:, j] for i, j in pairs], axis=-1)
+
+
+def _robust_fit(terms: Float[np.ndarray, "n terms"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "terms"]:
+    """Coefficients by least absolute deviations, then by Tukey's biweight, each by reweighted least squares."""
+    weights = np.ones(len(values))
+    scale = 0.0
+    for step in range(30):
+        root = np.sqrt(weights)
+        coefficients = np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0]
+        distance = np.abs(values - terms @ coefficients)
+        scale = max(1.4826 * float(np.median(distance)), 1e-6 * float(np.abs(values).max()))
+        if step < 15:
+            weights = 1.0 / np.maximum(distance, 0.1 * scale)
+        else:
+            weights = np.clip(1.0 - (distance / (4.685 * scale)) ** 2, 0.0, None) ** 2
+    return coefficients

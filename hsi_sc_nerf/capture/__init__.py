@@ -1,0 +1,1 @@
+"""What the instrument leaves on disk: ENVI cubes, captures, sessions."""

@@ -1,0 +1,1 @@
+"""Cameras, rays and similarity transformations; pure functions on arrays."""

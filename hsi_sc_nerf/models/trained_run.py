@@ -1,0 +1,102 @@
+"""A trained run opened for export: its model, its frames, and the way between metres and the scene's units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.eval_utils import eval_setup
+
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.checkpoints import find_checkpoint
+from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.packed.dataset import PackedDataset
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedRun:
+    """A model in evaluation mode with the data that it was trained on.
+
+    Attributes:
+        model: with the weights of the latest checkpoint.
+        manager: its data manager, with training and held-out frames.
+    """
+
+    model: SpectralModel
+    manager: SpectralDataManager
+
+    @property
+    def dataset(self) -> PackedDataset:
+        """The packed dataset."""
+        return self.manager.train_dataparser_outputs.metadata["dataset"]
+
+    @property
+    def scale(self) -> float:
+        """Scene units in a metre."""
+        return self.manager.train_dataparser_outputs.dataparser_scale
+
+    @property
+    def centre_m(self) -> Float[np.ndarray, "3"]:
+        """Where the scene's origin is in the object frame."""
+        return -self.manager.train_dataparser_outputs.dataparser_transform[:, 3].numpy().astype(float)
+
+    def to_scene(self, points_m: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Places of the object frame (metres) in scene units."""
+        return (points_m - self.centre_m) * self.scale
+
+    def to_metres(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Places in scene units in the object frame (metres)."""
+        return points / self.scale + self.centre_m
+
+    @torch.no_grad()
+    def refined_poses_m(self) -> Float[np.ndarray, "frames 4 4"]:
+        """Refined camera-to-world of every frame, held-out ones included (object frame, metres)."""
+        poses = self.dataset.camera_to_worlds
+        poses[:, :3, 3] = self.to_scene(poses[:, :3, 3])
+        device = self.model.device
+        measured = torch.from_numpy(poses).float().to(device)
+        refined = self.model.camera_optimizer.corrected(torch.arange(len(poses), device=device), measured)
+        result = refined.cpu().numpy().astype(float)
+        result[:, :3, 3] = self.to_metres(result[:, :3, 3])
+        return result
+
+
+def open_run(load_config: Path) -> TrainedRun:
+    """Open a run of hsi-sc-nerf by its ``config.yml``, with its latest checkpoint.
+
+    Raises:
+        InputError: there is no such file, it is no run of hsi-sc-nerf, or no checkpoint lies beside it.
+    """
+    if not load_config.is_file():
+        raise InputError(f"{load_config}: there is no such file; give the config.yml of a trained run.")
+    try:
+        config = yaml.load(load_config.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{load_config}: cannot be read; give the config.yml of a trained run.") from error
+    if not (isinstance(config, TrainerConfig) and isinstance(config.pipeline.model, SpectralModelConfig)):
+        raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
+    find_checkpoint(_where_it_lies(config, load_config).get_checkpoint_dir())
+    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _where_it_lies(c, load_config))
+    return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
+
+
+def _where_it_lies(config: TrainerConfig, load_config: Path) -> TrainerConfig:
+    """Settings that look for checkpoints beside their file, for a run may be moved, or given from another folder.
+
+    A dataset that was given relative to the folder of training is sought from the run's own folder upwards.
+    """
+    config.output_dir = load_config.parent
+    config.experiment_name = config.method_name = config.timestamp = "."
+    manager = config.pipeline.datamanager
+    if manager.data is not None and not manager.data.exists():
+        above = (folder / manager.data for folder in load_config.resolve().parents)
+        manager.data = next((data for data in above if data.exists()), manager.data)
+    return config

@@ -1,0 +1,1 @@
+"""The packed dataset on disk: its format, its cubes, reading them pixel by pixel."""

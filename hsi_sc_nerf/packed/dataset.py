@@ -1,0 +1,284 @@
+"""The packed dataset on disk (docs/architecture.md): calibrated frames that training reads pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+
+TRANSFORMS_NAME = "transforms.json"
+
+
+@dataclass(frozen=True)
+class Container:
+    """The upright cylinder that the object stands on, metres."""
+
+    diameter_m: float
+    height_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class PackedFrame:
+    """One frame: paths and pose; pixels are read on request.
+
+    Attributes:
+        capture: name of the capture it was made from.
+        image_path: pseudo-RGB picture.
+        mask_path: foreground mask.
+        cube_path: header of the reflectance cube.
+        flags_path: picture of the pixels' flags.
+        angle_deg: the turntable's angle relative to the first frame, counter-clockwise seen from above.
+        reprojection_error_px: root mean square of the markers or features in this frame; None for poses as given.
+        camera_to_world: pose in the object frame, OpenGL axes, metres.
+    """
+
+    capture: str
+    image_path: Path
+    mask_path: Path
+    cube_path: Path
+    flags_path: Path
+    angle_deg: float
+    reprojection_error_px: float | None
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+    def cube(self) -> UInt16[np.memmap, "lines samples bands"]:
+        """Memory map of reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none (`unpack`).
+
+        Raises:
+            InputError: the file is no packed cube.
+        """
+        counts = open_cube(self.cube_path).memmap()
+        if not (isinstance(counts, np.memmap) and counts.flags.c_contiguous and counts.dtype.str[1:] == "u2"):
+            raise InputError(f"{self.cube_path}: is no BIP cube of 16-bit numbers; process the session again.")
+        return counts
+
+    def mask(self) -> Bool[np.ndarray, "lines samples"]:
+        """True on the object."""
+        mask = cv2.imread(str(self.mask_path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise InputError(f"{self.mask_path}: is no readable mask; process the session again.")
+        return mask > 127
+
+    def flags(self) -> UInt8[np.ndarray, "lines samples"]:
+        """`PixelFlag`s of each pixel."""
+        flags = cv2.imread(str(self.flags_path), cv2.IMREAD_GRAYSCALE)
+        if flags is None:
+            raise InputError(f"{self.flags_path}: is no readable picture of flags; process the session again.")
+        return flags.astype(np.uint8)
+
+    def pseudo_rgb(self) -> UInt8[np.ndarray, "lines samples 3"]:
+        """The pseudo-RGB picture."""
+        image = cv2.imread(str(self.image_path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise InputError(f"{self.image_path}: is no readable picture; process the session again.")
+        return image[..., ::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class PackedDataset:
+    """What ``transforms.json`` says.
+
+    Attributes:
+        root: the dataset's folder.
+        intrinsics: of the one camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        wavelengths_nm: band centres.
+        pseudo_rgb_nm: the three bands of the pictures.
+        object_name: what was on the turntable.
+        scene_box_m: minimum and maximum of everything that turns, object frame.
+        object_box_m: minimum and maximum of the object alone, object frame.
+        background_reflectance: median spectrum of the chamber behind the object.
+        container: what the object stands on, if its size is known.
+        frames: in capture order.
+        flagged_values: how many values of all cubes are ``FLAGGED``.
+        bad_bands_nm: centres of the file's bands that were left out because they measure nothing.
+        fwhm_nm: full widths at half maximum of the bands; None where the session does not tell.
+        uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
+        typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
+        fingerprint: of the session and the settings that this was made from.
+    """
+
+    root: Path
+    intrinsics: PinholeIntrinsics
+    distortion: Float[np.ndarray, "4"]
+    wavelengths_nm: Float[np.ndarray, "bands"]
+    pseudo_rgb_nm: Float[np.ndarray, "3"]
+    object_name: str
+    scene_box_m: Float[np.ndarray, "2 3"]
+    object_box_m: Float[np.ndarray, "2 3"]
+    background_reflectance: Float[np.ndarray, "bands"]
+    container: Container | None
+    frames: tuple[PackedFrame, ...]
+    flagged_values: int = 0
+    bad_bands_nm: Float[np.ndarray, "bad"] = field(default_factory=lambda: np.zeros(0))
+    fwhm_nm: Float[np.ndarray, "bands"] | None = None
+    uncertainty: ReflectanceUncertainty | None = None
+    typical_uncertainty: Float[np.ndarray, "bands"] | None = None
+    fingerprint: str | None = None
+
+    @property
+    def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
+        """All poses, in frame order."""
+        return np.stack([frame.camera_to_world for frame in self.frames])
+
+
+def transforms_path(path: Path) -> Path:
+    """The ``transforms.json`` of a dataset that is given by its folder or by that file."""
+    path = Path(path)
+    return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
+
+
+def is_packed(path: Path) -> bool:
+    """Whether ``path`` is the folder (or the ``transforms.json``) of a packed hyperspectral dataset."""
+    try:
+        return "wavelengths_nm" in json.loads(transforms_path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def open_packed(path: Path) -> PackedDataset:
+    """Open a packed dataset by its folder or its ``transforms.json``.
+
+    Raises:
+        InputError: there is no ``transforms.json``, it is no JSON, a key is missing or unreadable, no frame is
+            listed, or a frame's file is missing.
+    """
+    path = transforms_path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no packed dataset here; make one with `hsi-sc-nerf process`.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        dataset = _parse_transforms(path.parent, content)
+    except KeyError as error:
+        raise InputError(f"{path}: lacks the key {error}; process the session again.") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); process the session again.") from error
+    if not dataset.frames:
+        raise InputError(f"{path}: lists no frames; process the session again.")
+    for frame in dataset.frames:
+        for file in (frame.image_path, frame.mask_path, frame.cube_path, frame.flags_path):
+            if not file.is_file():
+                raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
+    return dataset
+
+
+def write_transforms(dataset: PackedDataset) -> Path:
+    """Write ``transforms.json`` into the dataset's folder, whole or not at all, and return its path.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+
+    def relative(path: Path) -> str:
+        return path.relative_to(dataset.root).as_posix()
+
+    k1, k2, p1, p2 = (float(c) for c in dataset.distortion)
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        **asdict(dataset.intrinsics),
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "object": dataset.object_name,
+        "pseudo_rgb_nm": dataset.pseudo_rgb_nm.tolist(),
+        "scene_box_m": dataset.scene_box_m.tolist(),
+        "object_box_m": dataset.object_box_m.tolist(),
+        "container": None if dataset.container is None else asdict(dataset.container),
+        "fingerprint": dataset.fingerprint,
+        "wavelengths_nm": dataset.wavelengths_nm.tolist(),
+        "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
+        "background_reflectance": dataset.background_reflectance.tolist(),
+        "bad_bands_nm": dataset.bad_bands_nm.tolist(),
+        "flagged_values": dataset.flagged_values,
+        "uncertainty": None
+        if dataset.uncertainty is None
+        else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
+        "typical_uncertainty": None if dataset.typical_uncertainty is None else dataset.typical_uncertainty.tolist(),
+        "frames": [
+            {
+                "file_path": relative(frame.image_path),
+                "mask_path": relative(frame.mask_path),
+                "cube_path": relative(frame.cube_path),
+                "flags_path": relative(frame.flags_path),
+                "capture": frame.capture,
+                "angle_deg": float(frame.angle_deg),
+                "reprojection_error_px": frame.reprojection_error_px,
+                "transform_matrix": frame.camera_to_world.tolist(),
+            }
+            for frame in dataset.frames
+        ],
+    }
+    path = transforms_path(dataset.root)
+    write_json(path, content)
+    return path
+
+
+def _float_or_none(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
+    """The numbers under ``key``, in ``shape`` (-1: however many there are)."""
+    try:
+        return np.array(content[key], dtype=float).reshape(shape)
+    except (TypeError, ValueError) as error:
+        wanted = " x ".join(str(size) for size in shape if size >= 0)
+        raise ValueError(f"{key} is no list of {wanted} numbers".replace("  ", " ")) from error
+
+
+def _numbers_or_none(content: dict[str, Any], key: str, *shape: int) -> np.ndarray | None:
+    return None if content[key] is None else _numbers(content, key, *shape)
+
+
+def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
+    intrinsics = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
+    container, uncertainty = content["container"], content["uncertainty"]
+    wavelengths_nm = _numbers(content, "wavelengths_nm", -1)
+    bands = len(wavelengths_nm)
+    return PackedDataset(
+        root=root,
+        intrinsics=PinholeIntrinsics(**intrinsics),
+        distortion=np.array([content[key] for key in ("k1", "k2", "p1", "p2")], dtype=float),
+        wavelengths_nm=wavelengths_nm,
+        pseudo_rgb_nm=_numbers(content, "pseudo_rgb_nm", 3),
+        object_name=str(content["object"]),
+        scene_box_m=_numbers(content, "scene_box_m", 2, 3),
+        object_box_m=_numbers(content, "object_box_m", 2, 3),
+        background_reflectance=_numbers(content, "background_reflectance", bands),
+        container=None if container is None else Container(container["diameter_m"], container["height_m"]),
+        flagged_values=int(content["flagged_values"]),
+        bad_bands_nm=_numbers(content, "bad_bands_nm", -1),
+        fwhm_nm=_numbers_or_none(content, "fwhm_nm", bands),
+        uncertainty=None
+        if uncertainty is None
+        else ReflectanceUncertainty(
+            **{field.name: _numbers(uncertainty, field.name, bands) for field in fields(ReflectanceUncertainty)}
+        ),
+        typical_uncertainty=_numbers_or_none(content, "typical_uncertainty", bands),
+        frames=tuple(
+            PackedFrame(
+                capture=str(frame["capture"]),
+                image_path=root / frame["file_path"],
+                mask_path=root / frame["mask_path"],
+                cube_path=root / frame["cube_path"],
+                flags_path=root / frame["flags_path"],
+                angle_deg=float(frame["angle_deg"]),
+                reprojection_error_px=_float_or_none(frame["reprojection_error_px"]),
+                camera_to_world=_numbers(frame, "transform_matrix", 4, 4),
+            )
+            for frame in content["frames"]
+        ),
+        fingerprint=content.get("fingerprint"),
+    )

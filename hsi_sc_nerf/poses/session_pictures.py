@@ -1,0 +1,301 @@
+"""The pictures that poses are measured on: of each frame the means of several groups of bands, the best first.
+
+No group of bands is best in every session: noise, saturation and the lens's blur differ along the spectrum, and many
+inks are transparent beyond 700 nm.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
+
+GRAY = "gray"
+"""The mean over the range in which markers are printed to be seen; it is there always."""
+BAND_GROUPS_NM: Mapping[str, tuple[float, float]] = {
+    "blue": (450.0, 500.0),
+    "green": (500.0, 600.0),
+    "red": (600.0, 680.0),
+    "red edge": (680.0, 750.0),
+    "near infrared": (750.0, 900.0),
+}
+"""The other groups in which markers are looked for, nm."""
+
+# The broad mean stays unless another picture is better by this factor: many bands quiet what the score does not see.
+_CLEARLY_BETTER = 1.25
+# A pixel with more than this share of its group's values flagged is not exposed well.
+_MOST_FLAGGED = 0.1
+# A group is scored by so many of its bands, evenly spread: they do to rank pictures, at a fraction of the cost.
+_BANDS_TO_SCORE = 8
+# Reflectance at which a pixel is as good as black, and as good as clipped.
+_BLACK, _WHITE = 0.004, 0.996
+# The strongest edges of a picture, as a share of its pixels.
+_EDGE_SHARE = 0.02
+# No pixel of a picture of 8 bits is known better than this.
+_ROUNDING = 1.0 / (255.0 * np.sqrt(12.0))
+# J. Immerkær, "Fast noise variance estimation" (1996): it sees neither steps nor slopes, and lifts noise by 6.
+_NOISE_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+_NOISE_GAIN, _MEDIAN_OF_NORMAL = 6.0, 0.6745
+# Lines of a cube that are worked on at a time, and frames that are read at the same time.
+_BLOCK_LINES = 32
+_WORKERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class FramePictures:
+    """Pictures of one frame by their names, all of one size, linear in reflectance.
+
+    Attributes:
+        pictures: by name.
+        scores: by the names of those in which markers are looked for, best first (``edge_precision``).
+        flagged: pixels with so many flagged values that the best picture does not measure them well; None if all are.
+    """
+
+    pictures: Mapping[str, UInt8[np.ndarray, "h w"]]
+    scores: Mapping[str, float]
+    flagged: Bool[np.ndarray, "h w"] | None = None
+
+    @property
+    def ranking(self) -> tuple[str, ...]:
+        """Names of the pictures in which markers are looked for, best first."""
+        return tuple(self.scores)
+
+    @property
+    def ill_exposed(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels of the best picture that are black, clipped or flagged."""
+        best = self.pictures[self.ranking[0]]
+        clipped = (best == 0) | (best == 255)
+        return clipped if self.flagged is None else clipped | self.flagged
+
+
+class MadeWhenAsked(Mapping[str, UInt8[np.ndarray, "h w"]]):
+    """Pictures that are made, once, when somebody asks for them; from several threads too."""
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        make: Callable[[str], UInt8[np.ndarray, "h w"]],
+        made: Mapping[str, UInt8[np.ndarray, "h w"]],
+    ) -> None:
+        """Args:
+        names: of all pictures.
+        make: makes the picture of a name.
+        made: pictures that are there already.
+        """
+        self._names = tuple(names)
+        self._make = make
+        self._made = dict(made)
+        self._lock = threading.Lock()
+
+    def __getitem__(self, name: str) -> UInt8[np.ndarray, "h w"]:
+        with self._lock:
+            if name not in self._made:
+                if name not in self._names:
+                    raise KeyError(name)
+                self._made[name] = self._make(name)
+            return self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
+    """All frames' pictures; as a sequence, of each frame the one in which its edges stand out best."""
+
+    def __init__(self, frames: Sequence[FramePictures], features: str = GRAY) -> None:
+        """Args:
+        frames: in order.
+        features: name of the pictures on which features are measured.
+        """
+        self.frames = tuple(frames)
+        self.features = features
+
+    @classmethod
+    def of(cls, images: Sequence[UInt8[np.ndarray, "h w"]]) -> SessionPictures:
+        """Session pictures as they are; plain images as sessions that show one picture a frame."""
+        if isinstance(images, SessionPictures):
+            return images
+        return cls([FramePictures({GRAY: image}, {GRAY: 1.0}) for image in images])
+
+    def named(self, name: str) -> SessionPictures:
+        """The picture of that name of every frame, as the only one in which it is shown."""
+        alone = [FramePictures(frame.pictures, {name: frame.scores.get(name, 1.0)}) for frame in self.frames]
+        return SessionPictures(alone, name)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @overload
+    def __getitem__(self, at: int) -> UInt8[np.ndarray, "h w"]: ...
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[UInt8[np.ndarray, "h w"]]: ...
+    def __getitem__(self, at):
+        if isinstance(at, slice):
+            return SessionPictures(self.frames[at], self.features)
+        frame = self.frames[at]
+        return frame.pictures[frame.ranking[0]]
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w"]]:
+        return (self[i] for i in range(len(self)))
+
+
+def frame_pictures(
+    cube_path: Path,
+    flags_path: Path,
+    gray: UInt8[np.ndarray, "h w"],
+    gray_nm: tuple[float, float],
+    extra_nm: Mapping[str, float],
+) -> FramePictures:
+    """Pictures of a packed frame: scored from a few bands of each group, and made from all of them when asked for.
+
+    Args:
+        cube_path: header of the packed cube; it must stay while pictures are asked for.
+        flags_path: its pixels' flags (docs/architecture.md).
+        gray: the mean over ``gray_nm``, made when the frame was packed.
+        gray_nm: its range.
+        extra_nm: single bands that are wanted too, by name; they are not looked at for markers.
+    """
+    cube = open_cube(cube_path)
+    wavelengths_nm = cube.wavelengths_nm
+    members = {
+        name: (wavelengths_nm >= low) & (wavelengths_nm <= high)
+        for name, (low, high) in {GRAY: gray_nm, **BAND_GROUPS_NM}.items()
+    }
+    # The instrument may have no band there; of its broad mean the same is taken as when it was made: all bands.
+    members[GRAY] = members[GRAY] if members[GRAY].any() else np.ones(len(wavelengths_nm), bool)
+    members = {name: inside for name, inside in members.items() if inside.any()}
+    few = {name: _evenly_spread(inside) for name, inside in members.items()}
+    means, flagged_share = group_means(cube.memmap(), np.stack(list(few.values())))
+    well = dict(zip(members, flagged_share <= _MOST_FLAGGED, strict=True))
+    scores = {
+        name: edge_precision(mean, well[name], bands=members[name].sum() / few[name].sum())
+        for name, mean in zip(members, means, strict=True)
+    }
+    best_first = sorted(scores, key=lambda name: -scores[name] * (_CLEARLY_BETTER if name == GRAY else 1.0))
+    for name, nm in extra_nm.items():
+        members[name] = np.arange(len(wavelengths_nm)) == nearest_bands(wavelengths_nm, [nm])[0]
+    pictures = MadeWhenAsked(
+        tuple(members), lambda name: _picture(cube.memmap(), flags_path, members[name]), {GRAY: gray}
+    )
+    best_well = well[best_first[0]]
+    return FramePictures(
+        pictures, {name: scores[name] for name in best_first}, None if best_well.all() else ~best_well
+    )
+
+
+def _evenly_spread(inside: Bool[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands"]:
+    """A few of the bands that are inside, evenly spread; all if they are few."""
+    bands = np.flatnonzero(inside)
+    few = np.zeros_like(inside)
+    few[bands[np.linspace(0, len(bands) - 1, min(len(bands), _BANDS_TO_SCORE)).round().astype(int)]] = True
+    return few
+
+
+def _picture(
+    packed: UInt16[np.ndarray, "lines samples bands"], flags_path: Path, inside: Bool[np.ndarray, "bands"]
+) -> UInt8[np.ndarray, "lines samples"]:
+    """The mean of the bands inside; where nothing was measured, white if it is saturated and black else."""
+    (mean,), (flagged_share,) = group_means(packed, inside[None])
+    if (flagged_share == 1.0).any():
+        flags = np.asarray(cv2.imread(str(flags_path), cv2.IMREAD_UNCHANGED))
+        saturated = (flags & np.uint8(PixelFlag.SATURATED)) > 0
+        mean = np.where(flagged_share == 1.0, saturated, mean)
+    return to_8_bit(mean)
+
+
+def read_frames(
+    cube_paths: Sequence[Path],
+    flags_paths: Sequence[Path],
+    grays: Sequence[UInt8[np.ndarray, "h w"]],
+    gray_nm: tuple[float, float],
+    extra_nm: Mapping[str, float],
+) -> list[FramePictures]:
+    """``frame_pictures`` of all frames, some at the same time."""
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        one = partial(frame_pictures, gray_nm=gray_nm, extra_nm=extra_nm)
+        return list(pool.map(one, cube_paths, flags_paths, grays))
+
+
+def group_means(
+    packed: UInt16[np.ndarray, "lines samples bands"], members: Bool[np.ndarray, "groups bands"]
+) -> tuple[Float[np.ndarray, "groups lines samples"], Float[np.ndarray, "groups lines samples"]]:
+    """Mean reflectance of each group of bands over what was measured (nan where nothing was), and the flagged share.
+
+    Args:
+        packed: reflectance as 16-bit numbers (``packed_cube``); read a few lines at a time.
+        members: which bands belong to each group, one at least; bands that belong to none are not converted.
+    """
+    lines, samples, bands = packed.shape
+    columns = np.flatnonzero(members.any(axis=0))
+    weights = np.ascontiguousarray(members.T[columns], np.float32)
+    size = weights.sum(axis=0)
+    means = np.empty((len(members), lines, samples), np.float32)
+    flagged_share = np.zeros_like(means)
+    for start in range(0, lines, _BLOCK_LINES):
+        stop = min(start + _BLOCK_LINES, lines)
+        block = np.take(np.asarray(packed[start:stop]).reshape(-1, bands), columns, axis=1)
+        values = block.astype(np.float32)
+        flagged = block == FLAGGED
+        measured: Float[np.ndarray, "*pixels groups"] = size
+        if flagged.any():
+            values[flagged] = 0.0
+            measured = size - flagged.astype(np.float32) @ weights
+            flagged_share[:, start:stop] = (1.0 - measured / size).T.reshape(-1, stop - start, samples)
+        with np.errstate(invalid="ignore"):
+            block_means = values @ weights / (measured * REFLECTANCE_SCALE)
+        means[:, start:stop] = block_means.T.reshape(-1, stop - start, samples)
+    return means, flagged_share
+
+
+def edge_precision(
+    reflectance: Float[np.ndarray, "h w"], measured: Bool[np.ndarray, "h w"] | None = None, bands: float = 1.0
+) -> float:
+    """How well a picture tells where its strongest edges are: their mean slope over the noise, 1/px.
+
+    Noise of standard deviation s moves an edge of slope g by s/g pixels, so this is one over that error. Blur and
+    ink that is hardly visible flatten the slope. An edge does not count where a pixel at it is black, clipped or not
+    ``measured``, for its place is lost there. Noise is that of the brighter half of the pixels, where markers' paper
+    is (J. Immerkær, "Fast noise variance estimation", 1996, with the median), and at least that of 8 bits.
+
+    Args:
+        reflectance: the picture.
+        measured: which pixels are well measured; all if not given.
+        bands: the picture that is judged has so many times the bands of ``reflectance``; noise falls with their root.
+
+    Returns:
+        0 where no pixel is exposed well.
+    """
+    exposed = (reflectance > _BLACK) & (reflectance < _WHITE)
+    if measured is not None:
+        exposed &= measured
+    whole = cv2.erode(exposed.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    if not whole.any():
+        return 0.0
+    picture = np.asarray(reflectance, np.float32)
+    across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
+    slope = np.where(whole, cv2.magnitude(across, down), 0.0)
+    strongest = max(1, round(_EDGE_SHARE * slope.size))
+    # Of the negative slopes the first: the many zeros at the other end make partition slow.
+    edges = -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())
+    bright = whole & (picture >= np.median(picture[whole]))
+    curvature = np.abs(cv2.filter2D(picture, cv2.CV_32F, _NOISE_MASK)[bright])
+    noise = float(np.median(curvature)) / (_NOISE_GAIN * _MEDIAN_OF_NORMAL * np.sqrt(bands))
+    return edges / float(np.hypot(noise, _ROUNDING))

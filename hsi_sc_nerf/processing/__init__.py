@@ -1,0 +1,1 @@
+"""From a capture session to a packed dataset: masks, boxes, packing."""

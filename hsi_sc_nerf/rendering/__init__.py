@@ -1,0 +1,1 @@
+"""Views of a trained field as cubes, pictures and videos."""

@@ -1,0 +1,91 @@
+"""Which views to render: frames of the session, an orbit, or a camera path from nerfstudio's viewer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from nerfstudio.cameras.camera_paths import get_path_from_json
+from nerfstudio.cameras.cameras import Cameras
+
+from hsi_sc_nerf.data.cameras import pinhole_cameras
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
+from hsi_sc_nerf.models.trained_run import TrainedRun
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Cameras to render from, in scene units.
+
+    Attributes:
+        kind: what they are, in a word.
+        cameras: the cameras.
+        names: a file name for each.
+        measured: the frames that were taken there, in the same order; None where none were.
+    """
+
+    kind: str
+    cameras: Cameras
+    names: Sequence[str]
+    measured: SpectralDataset | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[tuple[str, Cameras]]:
+        return ((name, self.cameras[i : i + 1]) for i, name in enumerate(self.names))
+
+
+def views_of_frames(run: TrainedRun, split: Literal["held-out", "training"]) -> Views:
+    """The frames of a split, with what they measured."""
+    manager = run.manager
+    dataset = manager.eval_dataset if split == "held-out" else manager.train_dataset
+    return Views(split, dataset.cameras, [frame.capture for frame in dataset.frames], dataset)
+
+
+def orbit_poses(first_camera_to_world: Float[np.ndarray, "4 4"], count: int) -> Float[np.ndarray, "count 4 4"]:
+    """Poses of a camera before an object that makes one even, counter-clockwise turn, beginning with the first."""
+    angles_deg = np.arange(count) * 360.0 / count
+    return np.stack([turntable_camera_to_world(first_camera_to_world, float(angle)) for angle in angles_deg])
+
+
+def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
+    """The session's camera before the object that makes one even turn, and the chamber standing still behind it.
+
+    Args:
+        run: the trained run.
+        count: views in the turn.
+        size: of the images, as a factor on the camera's.
+    """
+    poses = orbit_poses(run.refined_poses_m()[0], count)
+    poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
+    dataset = run.dataset
+    cameras = pinhole_cameras(poses, dataset.intrinsics, dataset.distortion)
+    if size != 1.0:
+        cameras.rescale_output_resolution(size)
+    return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
+
+
+def views_of_path(path: Path) -> Views:
+    """The cameras of a path that nerfstudio's viewer exported (its Render tab).
+
+    Behind them is the chamber's median spectrum: none of them stands before the turntable as the camera did.
+
+    Raises:
+        InputError: the file is missing or is no camera path.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; export a camera path from ns-viewer.")
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        cameras = get_path_from_json(content)
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: is no camera path ({error!r}); export one from ns-viewer.") from error
+    return Views("path", cameras, [f"path_{i:03d}" for i in range(len(cameras))])

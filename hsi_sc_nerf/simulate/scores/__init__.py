@@ -1,0 +1,1 @@
+"""How well a simulated session was processed, against its known truth."""

@@ -1,0 +1,113 @@
+"""Traits against the truth of a simulated object: ideal clouds of it, and what its surface really holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+from plyfile import PlyData
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
+from hsi_sc_nerf.simulate.truth import Truth
+from hsi_sc_nerf.spectra.composites import composite
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
+
+# A surface point is seen where a camera's ray ends at it, to within this.
+_OCCLUSION_M = 0.0001
+
+
+@dataclass(frozen=True)
+class TrueSurface:
+    """A closed mesh with known materials.
+
+    Attributes:
+        materials: names.
+        mesh: metres, object frame.
+        weights: share of each material at each vertex.
+        endmembers: reflectance of each material.
+        wavelengths_nm: band centres.
+    """
+
+    materials: tuple[str, ...]
+    mesh: Mesh
+    weights: Float[np.ndarray, "v materials"]
+    endmembers: Float[np.ndarray, "materials bands"]
+    wavelengths_nm: Float[np.ndarray, "bands"]
+
+    @classmethod
+    def of(cls, truth: Truth) -> TrueSurface:
+        """That of a simulated session."""
+        vertex = PlyData.read(str(truth.mesh_path))["vertex"]
+        columns = {p.name.removeprefix("weight_"): vertex[p.name] for p in vertex.properties if "weight_" in p.name}
+        endmembers = truth.endmembers[[truth.materials.index(name) for name in columns]]
+        return cls(
+            tuple(columns), truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm
+        )
+
+    def reflectance(self, chosen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "n bands"]:
+        """True spectra of the chosen vertices."""
+        return (self.weights[chosen] @ self.endmembers).astype(np.float32)
+
+    def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the surface's nearest place to each point: unit normal, shares of materials, and distance (m)."""
+        found = self._scene().compute_closest_points(np.asarray(points_m, np.float32))
+        triangle, uv = found["primitive_ids"].numpy().astype(np.int64), found["primitive_uvs"].numpy()
+        share = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+        weights = np.einsum("nc,ncm->nm", share, self.weights[self.mesh.triangles[triangle]])
+        normals = found["primitive_normals"].numpy().astype(float)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return normals, weights, np.linalg.norm(found["points"].numpy() - points_m, axis=1)
+
+    def seen(
+        self, points_m: Float[np.ndarray, "n 3"], eyes_m: Float[np.ndarray, "cameras 3"]
+    ) -> Bool[np.ndarray, "n"]:
+        """Which points of the surface some camera sees, hidden by nothing but the object itself."""
+        scene, seen = self._scene(), np.zeros(len(points_m), bool)
+        for eye in eyes_m:
+            along = points_m - eye
+            distance_m = np.linalg.norm(along, axis=1)
+            rays = np.concatenate([np.broadcast_to(eye, along.shape), along / distance_m[:, None]], axis=1)
+            hit_m = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy()
+            seen |= hit_m > distance_m - _OCCLUSION_M
+        return seen
+
+    def cloud(
+        self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0
+    ) -> SpectralCloud:
+        """A cloud as an ideal reconstruction would give it: even, of what the cameras see, with true spectra.
+
+        Args:
+            count: of points on the whole surface; those that no camera sees are missing.
+            eyes_m: places of the cameras.
+            noise_m: standard deviation of each point's place in each direction; normals scatter by 0.3 rad with any.
+            seed: of places and noise.
+        """
+        rng = np.random.default_rng(seed)
+        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count, seed)
+        points = points[self.seen(points, eyes_m)]
+        normals, weights, _ = self.nearest(points)
+        spectra = (weights @ self.endmembers).astype(np.float32)
+        colours = to_8_bit(composite(spectra, self.wavelengths_nm, paper.PSEUDO_RGB_NM))
+        if noise_m > 0.0:
+            points = points + noise_m * rng.standard_normal(points.shape)
+            normals = normals + 0.3 * rng.standard_normal(points.shape)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return SpectralCloud(
+            points.astype(np.float32), normals.astype(np.float32), colours, spectra, self.wavelengths_nm
+        )
+
+    def _scene(self) -> RaycastingScene:
+        return ray_scene(self.mesh.vertices, self.mesh.triangles)
+
+
+def relative_rms(measured: Float[np.ndarray, "bands"], true: Float[np.ndarray, "bands"]) -> float:
+    """Root mean square of a spectrum's error as a share of the root mean square of the true spectrum."""
+    return float(np.sqrt(np.mean(np.square(measured - true)) / np.mean(np.square(true))))

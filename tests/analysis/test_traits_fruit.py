@@ -1,0 +1,179 @@
+"""Traits of a simulated apple with a bruise, whose truth is known; and the whole command."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh, open_edges
+from hsi_sc_nerf.analysis.regions import PickedRegion, region_spectrum
+from hsi_sc_nerf.analysis.size import size_of
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
+from hsi_sc_nerf.analysis.traits import classified
+from hsi_sc_nerf.cli.traits import TraitsCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate.materials import endmembers
+from hsi_sc_nerf.simulate.mesh import cylinder
+from hsi_sc_nerf.simulate.objects import Fruit
+from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.shapes import apple
+from hsi_sc_nerf.simulate.texture import FRUIT_MATERIALS, fruit_weights
+
+NM = np.linspace(400.0, 1000.0, 25)
+STAND_M = 0.07
+NOISE_M = 0.0003
+
+
+def eyes_around(count=8):
+    """Cameras half a metre away, 22 degrees above the horizon."""
+    azimuth = 2.0 * np.pi * np.arange(count) / count
+    return np.stack([0.42 * np.cos(azimuth), 0.42 * np.sin(azimuth), np.full(count, 0.28)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def true_apple():
+    rng = np.random.default_rng(3)
+    fruit = Fruit("apple", height_m=0.075, bruise_diameter_m=0.026)
+    shape = apple(fruit.height_m, rng)
+    mesh = shape.mesh.moved(np.array([0.0, 0.0, STAND_M]))
+    materials = FRUIT_MATERIALS["apple"]
+    return TrueSurface(materials, mesh, fruit_weights(shape, fruit, rng), endmembers(materials, NM), NM)
+
+
+@pytest.fixture(scope="module")
+def measured_apple(true_apple):
+    cloud = true_apple.cloud(50_000, eyes_around(), NOISE_M)
+    mesh = closed_mesh(cloud.points, cloud.normals, MeshConfig(octree_depth=7, base_height_m=STAND_M))
+    return with_spectra(mesh, cloud, MeshConfig().smoothing_radius_m)
+
+
+@pytest.fixture(scope="module")
+def ideal_apple(true_apple):
+    everything = np.ones(len(true_apple.mesh.vertices), bool)
+    seen = true_apple.seen(true_apple.mesh.vertices, eyes_around())
+    return SpectralMesh(true_apple.mesh, true_apple.reflectance(everything), NM, seen)
+
+
+def test_area_is_within_three_and_volume_within_two_percent(true_apple, measured_apple):
+    measured, true = size_of(measured_apple.mesh), size_of(true_apple.mesh)
+    assert open_edges(measured_apple.mesh) == 0
+    assert measured.area_m2 == pytest.approx(true.area_m2, rel=0.03)
+    assert measured.volume_l == pytest.approx(true.volume_l, rel=0.02)
+    assert measured.height_m == pytest.approx(true.height_m, rel=0.01)
+    assert measured.largest_diameter_m == pytest.approx(true.largest_diameter_m, rel=0.01)
+    assert measured.smallest_diameter_m == pytest.approx(true.smallest_diameter_m, rel=0.01)
+
+
+def test_only_the_base_was_not_seen(measured_apple):
+    hidden = measured_apple.mesh.vertices[~measured_apple.seen]
+    assert 0.02 < (~measured_apple.seen).mean() < 0.2
+    assert (hidden[:, 2] < STAND_M + 0.006).all()
+
+
+def test_spectra_of_spots_are_within_two_percent(ideal_apple, measured_apple):
+    high = np.flatnonzero(ideal_apple.seen & (ideal_apple.mesh.vertices[:, 2] > STAND_M + 0.01))
+    for vertex in np.random.default_rng(0).choice(high, 8):
+        spot = PickedRegion("spot", tuple(ideal_apple.mesh.vertices[vertex].tolist()), 0.005)
+        measured, true = (region_spectrum("spot", one, spot.of(one)) for one in (measured_apple, ideal_apple))
+        assert relative_rms(measured.mean, true.mean) < 0.02
+
+
+def test_bruise_area_is_within_ten_percent_of_the_true_surface_classified_alike(
+    ideal_apple, measured_apple, true_apple
+):
+    names = ("apple_skin", "bruise")
+    spectra = true_apple.endmembers[[true_apple.materials.index(name) for name in names]]
+    library = SpectralLibrary(names, NM, spectra)
+    measured, true = (classified(one, library, 0.1, 1e-5) for one in (measured_apple, ideal_apple))
+    assert measured.areas_m2[1] == pytest.approx(true.areas_m2[1], rel=0.1)
+    assert [region.label for region in measured.regions].count(1) >= 1
+
+
+def test_bruise_area_by_mixture_is_within_three_percent_of_where_it_has_most(ideal_apple, measured_apple, true_apple):
+    spectra = SpectralLibrary(true_apple.materials, NM, true_apple.endmembers)
+    measured = classified(measured_apple, spectra, 0.1, 1e-5)
+    bruise = true_apple.materials.index("bruise")
+    most = ideal_apple.seen & (true_apple.weights[:, bruise] > 0.5)
+    assert measured.mixture_areas_m2[bruise] == pytest.approx(ideal_apple.areas_m2[most].sum(), rel=0.03)
+
+
+def small_cloud(path):
+    """A green and brown cylinder as the command's input."""
+    mesh: Mesh = cylinder(0.04, 0.05, segments=96, step_m=0.001).moved(np.array([0.0, 0.0, STAND_M]))
+    weights = np.eye(2)[(mesh.vertices[:, 1] > 0.0).astype(int)]
+    true = TrueSurface(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
+    cloud = true.cloud(6000, eyes_around(), 0.0)
+    write_spectral_ply(path, cloud.points, cloud.normals, cloud.colours, cloud.spectra, NM)
+    return true
+
+
+@pytest.mark.slow
+def test_command_writes_all_results(tmp_path, capsys):
+    true = small_cloud(tmp_path / "cloud.ply")
+    rows = [f"{nm},{skin},{bruise}" for nm, skin, bruise in zip(NM, *true.endmembers, strict=True)]
+    (tmp_path / "library.csv").write_text("\n".join(["wavelength_nm,skin,bruise", *rows]))
+    # Brackets would be taken for colours of the terminal.
+    output = tmp_path / "out[bold]"
+    TraitsCommand(
+        tmp_path / "cloud.ply",
+        output,
+        mesh=MeshConfig(octree_depth=6, base_height_m=STAND_M),
+        splits=1,
+        library=tmp_path / "library.csv",
+        roi=(("spot", 0.0, 0.02, STAND_M + 0.025, 0.006),),
+    ).main()
+    assert str(output / "traits.md") in capsys.readouterr().err
+    written = {path.name for path in output.iterdir()}
+    assert written == {
+        *("traits.md", "traits.json", "spectra.csv", "mesh.ply"),
+        *("composites.png", "indices.png", "classes.png", "classes_by_mixture.png", "region_spectra.png"),
+    }
+    content = json.loads((output / "traits.json").read_text())
+    assert content["watertight"]
+    assert content["size"]["area_m2"] == pytest.approx(true.mesh.area_m2(), rel=0.03)
+    assert content["size"]["volume_l"] == pytest.approx(1000.0 * true.mesh.volume_m3(), rel=0.03)
+    assert content["size_sd"]["volume_l"] > 0.0
+    side_m2 = (content["seen_area_m2"]) / 2.0
+    for area in ("areas_m2", "mixture_areas_m2"):
+        assert content["classes"][area] == pytest.approx({"skin": side_m2, "bruise": side_m2}, rel=0.1)
+    assert content["regions"]["spot"]["area_m2"] == pytest.approx(np.pi * 0.006**2, rel=0.15)
+    table = np.loadtxt(output / "spectra.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(table[:, 0], NM, rtol=1e-5)
+    np.testing.assert_allclose(table[:, -2], true.endmembers[1], atol=0.002)
+    assert len(read_spectral_ply(output / "mesh.ply").points) > 1000
+    page = (output / "traits.md").read_text()
+    assert "watertight" in page
+    assert all(f"({name})" in page for name in written if name.endswith(".png"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"splits": -1}, "--splits is -1"),
+        ({"classes": ("bruise",)}, "give it with --library"),
+        ({"mesh": MeshConfig(octree_depth=20)}, "octree-depth is 20"),
+        ({"mesh": MeshConfig(smoothing_radius_m=0.0)}, "smoothing-radius-m is 0.0"),
+        ({"angle_rad": 0.0}, "--angle-rad is 0.0"),
+        ({"angle_rad": 10.0}, "--angle-rad is 10.0"),
+        ({"roi_file": "none.yaml"}, "no such file"),
+        ({}, "no such file"),
+    ],
+)
+def test_command_refuses_what_it_cannot_use(tmp_path, settings, says):
+    with pytest.raises(InputError, match=says):
+        TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", **settings).main()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("bands", "says"), [(slice(None), "covers the cloud"), (slice(3, 4), "has one band")])
+def test_a_library_that_does_not_fit_is_refused_before_the_work(tmp_path, monkeypatch, bands, says):
+    monkeypatch.setattr("hsi_sc_nerf.analysis.poisson.closed_mesh", None)
+    nothing = np.zeros((2, 3))
+    spectra = np.ones((2, len(NM[bands])))
+    write_spectral_ply(tmp_path / "cloud.ply", nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    (tmp_path / "library.csv").write_text("nm,a\n450,0.1\n900,0.2\n")
+    with pytest.raises(InputError, match=says):
+        TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", library=tmp_path / "library.csv").main()

@@ -1,0 +1,206 @@
+"""Closed meshes and their sizes, against spheres and cylinders whose sizes are known."""
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
+from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh, open_edges, solid_pieces
+from hsi_sc_nerf.analysis.size import feret_diameters, size_of, size_spread
+from hsi_sc_nerf.analysis.smoothing import smoothed, thinned
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate.mesh import cylinder
+
+RADIUS_M = 0.03
+STAND_M = 0.07
+SPECK = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+"""A tetrahedron."""
+
+
+def sphere_points(count, seed=0, noise_m=0.0, above=-1.0):
+    """Even on a sphere that stands at z = 0.07; its lower part, below a share of the radius, is not seen."""
+    rng = np.random.default_rng(seed)
+    normals = rng.standard_normal((count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] > above]
+    points = RADIUS_M * normals + [0.0, 0.0, STAND_M + RADIUS_M]
+    return points + noise_m * rng.standard_normal(points.shape), normals
+
+
+def test_thinning_leaves_one_mean_a_cell():
+    points = np.array([[0.0, 0.0, 0.0], [0.002, 0.0, 0.0], [0.015, 0.0, 0.0]])
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    places, sides = thinned(points, normals, 0.01)
+    np.testing.assert_allclose(places, [[0.001, 0.0, 0.0], [0.015, 0.0, 0.0]])
+    np.testing.assert_allclose(sides, [[0.0, 0.5, 0.5], [1.0, 0.0, 0.0]])
+
+
+def test_smoothing_takes_noise_away_and_keeps_a_curved_surface():
+    points, normals = sphere_points(8000, noise_m=0.0003)
+    noisy = normals + np.random.default_rng(1).standard_normal(normals.shape)
+    places, outward = smoothed(points, noisy, 0.004)
+    offset = places - [0.0, 0.0, STAND_M + RADIUS_M]
+    radius = np.linalg.norm(offset, axis=1)
+    assert radius.std() < 0.00012
+    assert radius.mean() == pytest.approx(RADIUS_M, abs=3e-5)
+    assert ((outward * offset).sum(axis=1) / radius).min() > 0.95
+
+
+def test_smoothing_keeps_a_quadric_exactly():
+    x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.01, 0.01, 41)] * 2))
+    points = np.stack([x, y, 8.0 * x**2 - 5.0 * x * y + 2.0 * y**2], axis=-1)
+    middle = np.flatnonzero(np.hypot(x, y) < 1e-9)
+    places, outward = smoothed(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 0.002)
+    np.testing.assert_allclose(places[middle], 0.0, atol=1e-7)
+    np.testing.assert_allclose(outward[middle], [[0.0, 0.0, 1.0]], atol=1e-5)
+
+
+def test_base_of_a_cone_goes_straight_on_to_where_it_stands():
+    rng = np.random.default_rng(0)
+    azimuth, z = rng.uniform(0.0, 2.0 * np.pi, 20000), rng.uniform(0.08, 0.12, 20000)
+    radius = 0.01 + 0.5 * (z - 0.07)
+    points = np.stack([0.002 + radius * np.cos(azimuth), -0.001 + radius * np.sin(azimuth), z], axis=-1)
+    normals = np.stack([np.cos(azimuth), np.sin(azimuth), np.full_like(z, -0.5)], axis=-1) / np.sqrt(1.25)
+    base = find_base(points, normals, STAND_M)
+    np.testing.assert_allclose(base.centre_m, [0.002, -0.001], atol=3e-4)
+    np.testing.assert_allclose(base.foot_radius_m, 0.01, atol=1e-3)
+    closing, outward = base.points(0.0005)
+    assert closing[:, 2].min() == pytest.approx(STAND_M)
+    on_floor = closing[:, 2] == closing[:, 2].min()
+    np.testing.assert_allclose(outward[on_floor], np.tile([0.0, 0.0, -1.0], (on_floor.sum(), 1)))
+    floor_m2 = on_floor.sum() * 0.0005**2
+    assert floor_m2 == pytest.approx(np.pi * base.foot_radius_m.mean() ** 2, rel=0.02)
+    assert (outward[~on_floor, 2] < 0.0).all()
+
+
+def test_base_without_a_height_is_where_the_cloud_ends():
+    points, normals = sphere_points(20000, above=-0.6)
+    assert lowest_edge_m(points) == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=5e-4)
+    mesh = closed_mesh(points, normals, MeshConfig(octree_depth=6))
+    assert mesh.vertices[:, 2].min() == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=1e-3)
+
+
+def test_a_rim_that_hangs_down_does_not_widen_the_base():
+    points, normals = sphere_points(40000, above=-0.8)
+    edge_m = STAND_M + 0.2 * RADIUS_M
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
+    out = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=-1)
+    hanging = 0.6 * RADIUS_M * out
+    hanging[:, 2] = edge_m - np.random.default_rng(1).uniform(0.0, 0.001, len(hanging))
+    config = MeshConfig(octree_depth=6, base_height_m=STAND_M)
+    clean = closed_mesh(points, normals, config)
+    with_rim = closed_mesh(np.concatenate([points, hanging]), np.concatenate([normals, out]), config)
+    rim = lower_rim(np.concatenate([points, hanging]), 0.001)
+    assert rim[len(points) :].mean() > 0.98
+    assert rim[: len(points)].mean() < 0.02
+    assert with_rim.area_m2() == pytest.approx(clean.area_m2(), rel=0.005)
+    foot_m = find_base(points[~rim[: len(points)]], normals[~rim[: len(points)]], STAND_M).foot_radius_m
+    assert foot_m.max() < 0.55 * RADIUS_M
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0003])
+def test_closed_sphere_has_its_area_and_volume(noise_m):
+    points, normals = sphere_points(20000, noise_m=noise_m, above=-0.93)
+    mesh = closed_mesh(points, normals, MeshConfig(octree_depth=6, base_height_m=STAND_M))
+    size = size_of(mesh)
+    assert open_edges(mesh) == 0
+    assert size.area_m2 == pytest.approx(4.0 * np.pi * RADIUS_M**2, rel=0.01)
+    assert size.volume_l == pytest.approx(4000.0 / 3.0 * np.pi * RADIUS_M**3, rel=0.01)
+    assert size.height_m == pytest.approx(2.0 * RADIUS_M, rel=0.01)
+    for diameter_m in (size.largest_diameter_m, size.smallest_diameter_m, size.equivalent_diameter_m):
+        assert diameter_m == pytest.approx(2.0 * RADIUS_M, rel=0.015)
+
+
+def joined(*meshes):
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    triangles = [mesh.triangles + start for mesh, start in zip(meshes, first, strict=True)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles))
+
+
+def test_a_loose_stem_stays_and_specks_and_bubbles_go():
+    fruit = cylinder(0.06, 0.06, segments=64, step_m=0.002)
+    stem = cylinder(0.004, 0.01, segments=16).moved(np.array([0.0, 0.0, 0.07]))
+    speck = Mesh(np.array([[0.1, 0, 0], [0.11, 0, 0], [0.1, 0.01, 0], [0.1, 0, 0.01]]), SPECK)
+    bubble = cylinder(0.02, 0.02, segments=64).moved(np.array([0.0, 0.0, 0.02]))
+    inside_out = Mesh(bubble.vertices, bubble.triangles[:, ::-1])
+    kept = solid_pieces(joined(speck, stem, inside_out, fruit))
+    assert len(kept.vertices) == len(fruit.vertices) + len(stem.vertices)
+    assert kept.volume_m3() == pytest.approx(fruit.volume_m3() + stem.volume_m3())
+    assert kept.is_watertight()
+
+
+def test_open_edges_are_those_of_a_hole():
+    mesh = cylinder(0.02, 0.03, segments=16)
+    assert open_edges(mesh) == 0
+    assert open_edges(Mesh(mesh.vertices, mesh.triangles[1:])) == 3
+    # Two wedges that touch along an edge: four triangles meet there.
+    other = Mesh(np.array([[1.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 2.0]]), SPECK)
+    mirrored = Mesh(2.0 - other.vertices + [0.0, 0.0, 1.0], SPECK[:, ::-1])
+    pinched = joined(other, mirrored)
+    shared = pinched.triangles.copy()
+    shared[shared == 4 + 3], shared[shared == 4] = 0, 3
+    assert open_edges(Mesh(pinched.vertices, shared)) == 0
+    assert not Mesh(pinched.vertices, shared).is_watertight()
+
+
+def test_sizes_of_a_cylinder():
+    size = size_of(cylinder(0.04, 0.05, segments=256))
+    assert size.area_m2 == pytest.approx(np.pi * 0.04 * (0.02 + 0.05), rel=1e-3)
+    assert size.volume_l == pytest.approx(1000.0 * np.pi * 0.02**2 * 0.05, rel=1e-3)
+    assert size.height_m == pytest.approx(0.05)
+    assert size.equivalent_diameter_m == pytest.approx((6.0 * 0.02**2 * 0.05) ** (1.0 / 3.0), rel=1e-3)
+
+
+def test_feret_diameters_of_a_turned_rectangle():
+    corners = np.array([[0.0, 0.0], [0.04, 0.0], [0.04, 0.03], [0.0, 0.03], [0.02, 0.01]])
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    largest, smallest = feret_diameters(corners @ turn.T)
+    assert largest == pytest.approx(0.05)
+    assert smallest == pytest.approx(0.03)
+
+
+def test_spread_from_halves_is_that_of_independent_clouds():
+    config = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
+    clouds = [sphere_points(3000, seed, 0.0005, above=-0.93) for seed in range(11)]
+    volumes = [size_of(closed_mesh(*cloud, config)).volume_l for cloud in clouds[1:]]
+    told = []
+    spread = size_spread(*clouds[0], config, splits=5, done=told.append)
+    assert told == list(range(1, 6))
+    # The ratio of a spread from five differences to one of ten clouds is 0.4 to 1.9 nineteen times in twenty.
+    assert 0.35 < spread.volume_l / np.std(volumes, ddof=1) < 2.2
+
+
+def test_too_few_or_flat_points_are_refused():
+    points, normals = sphere_points(10)
+    with pytest.raises(InputError, match="export more points"):
+        closed_mesh(points, normals, MeshConfig())
+    points, normals = sphere_points(1000)
+    with pytest.raises(InputError, match="export more points"):
+        closed_mesh(points * [1.0, 1.0, 0.0], normals, MeshConfig())
+    with pytest.raises(InputError, match="it is in metres"):
+        closed_mesh(points * 1e-3, normals, MeshConfig())
+
+
+@pytest.mark.parametrize(
+    ("scale", "side", "base_height_m", "says"),
+    [
+        (100.0, 1.0, None, "is it in metres"),
+        (1e8, 1.0, None, "is it in metres"),
+        (1.0, -1.0, STAND_M, "normals do not point out"),
+        (1.0, 0.0, None, "normals do not point out"),
+        (1.0, 1.0, 1000.0 * STAND_M, "below the base at 70 m"),
+        (1.0, 1.0, STAND_M + 0.02, "below the base at 0.09 m"),
+    ],
+)
+def test_clouds_in_other_units_inside_out_or_below_their_base_are_refused(scale, side, base_height_m, says):
+    points, normals = sphere_points(3000, above=-0.93)
+    with pytest.raises(InputError, match=says):
+        closed_mesh(scale * points, side * normals, MeshConfig(base_height_m=base_height_m))
+
+
+def test_a_base_a_little_above_the_edge_needs_no_wall():
+    points, normals = sphere_points(20000, above=-0.5)
+    edge_m = STAND_M + 0.5 * RADIUS_M
+    closing, outward = find_base(points, normals, edge_m + 0.002).points(0.0005)
+    np.testing.assert_allclose(closing[:, 2], edge_m + 0.002)
+    np.testing.assert_allclose(outward, np.tile([0.0, 0.0, -1.0], (len(outward), 1)))

@@ -1,0 +1,219 @@
+"""Spectra on a mesh: classes and their areas, regions, pictures, the PLY file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.classes import (
+    UNCLASSIFIED,
+    classify,
+    connected_regions,
+    spectral_angles,
+    vertex_areas_m2,
+)
+from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.pictures import SideViews
+from hsi_sc_nerf.analysis.regions import PickedRegion, picked_region, read_regions, weighted_mean_and_sd
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, vertex_normals, with_spectra, write_mesh
+from hsi_sc_nerf.analysis.traits import WHOLE, analyse, classified
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.simulate.mesh import cylinder, quads
+from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
+
+NM = np.linspace(400.0, 1000.0, 31)
+GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
+LIBRARY = SpectralLibrary(("green", "brown"), NM, np.stack([GREEN, BROWN]))
+
+
+def two_halves(seen=True):
+    """A cylinder, 4 cm wide and high: green at y > 0, brown below."""
+    mesh = cylinder(0.04, 0.04, segments=128, step_m=0.001)
+    spectra = np.where(mesh.vertices[:, 1:2] > 0.0, GREEN, BROWN).astype(np.float32)
+    return SpectralMesh(mesh, spectra, NM, np.full(len(spectra), seen))
+
+
+def test_angles_and_classes_do_not_depend_on_brightness():
+    spectra = np.stack([0.2 * GREEN, BROWN, GREEN[::-1], 3.0 * BROWN + 0.001])
+    angles = spectral_angles(spectra, LIBRARY.spectra)
+    cosine = (GREEN @ BROWN) / np.linalg.norm(GREEN) / np.linalg.norm(BROWN)
+    assert angles[1, 0] == pytest.approx(np.arccos(cosine), abs=1e-5)
+    assert classify(spectra, LIBRARY.spectra, 0.1).tolist() == [0, 1, UNCLASSIFIED, 1]
+
+
+def test_areas_of_vertices_add_up():
+    mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
+    assert vertex_areas_m2(mesh).sum() == pytest.approx(mesh.area_m2())
+
+
+def test_normals_point_outwards():
+    mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
+    middle = mesh.vertices - [0.0, 0.0, 0.02]
+    assert ((vertex_normals(mesh) * middle).sum(axis=1) > 0.0).all()
+
+
+def test_class_areas_and_regions_of_two_halves():
+    surface = two_halves()
+    classes = classified(surface, LIBRARY, 0.1, smallest_region_m2=1e-6)
+    half_m2 = surface.mesh.area_m2() / 2.0
+    np.testing.assert_allclose(classes.areas_m2, half_m2, rtol=0.04)
+    assert classes.areas_m2.sum() + classes.unclassified_m2 == pytest.approx(surface.mesh.area_m2())
+    assert {region.label for region in classes.regions} == {0, 1}
+    assert len(classes.regions) == 2
+    assert [np.sign(region.centre_m[1]) for region in sorted(classes.regions, key=lambda r: r.label)] == [1, -1]
+
+
+def test_references_of_one_name_are_one_class():
+    surface = two_halves()
+    names = ("green", "brown", "green")
+    library = SpectralLibrary(names, NM, np.stack([GREEN[::-1], BROWN, GREEN]))
+    classes = classified(surface, library, 0.1, smallest_region_m2=1e-6)
+    assert classes.names == ("green", "brown")
+    np.testing.assert_allclose(classes.areas_m2, surface.mesh.area_m2() / 2.0, rtol=0.04)
+    assert library.only(("green",)).names == ("green", "green")
+
+
+def test_regions_that_do_not_touch_are_two_and_small_ones_are_not_listed():
+    far = np.array(
+        [[[x, 0.0, 0.0], [x + s, 0.0, 0.0], [x + s, s, 0.0], [x, s, 0.0]] for x, s in ((0, 1), (3, 2), (9, 0.1))]
+    )
+    mesh = quads(far)
+    labels = np.zeros(len(mesh.vertices), int)
+    regions = connected_regions(mesh, labels, vertex_areas_m2(mesh), smallest_m2=0.5)
+    assert [region.area_m2 for region in regions] == pytest.approx([4.0, 1.0])
+    assert regions[0].centre_m == pytest.approx((4.0, 1.0, 0.0), abs=0.2)
+    assert connected_regions(mesh, np.full(len(labels), UNCLASSIFIED), vertex_areas_m2(mesh), 0.0) == []
+
+
+def test_what_was_not_seen_is_in_no_class_and_no_mean():
+    surface = two_halves()
+    hidden = SpectralMesh(surface.mesh, surface.spectra, NM, surface.mesh.vertices[:, 1] > 0.0)
+    classes = classified(hidden, LIBRARY, 0.1, 1e-6)
+    assert classes.areas_m2[1] == 0.0
+    traits = analyse(hidden, classes=classes)
+    assert [region.name for region in traits.spectra] == [WHOLE, "green"]
+    np.testing.assert_allclose(traits.spectra[0].mean, GREEN, rtol=1e-5)
+    np.testing.assert_allclose(traits.spectra[0].sd, 0.0, atol=1e-6)
+    assert traits.seen_m2 == pytest.approx(classes.areas_m2[0])
+
+
+def test_indices_and_composites_of_regions():
+    traits = analyse(two_halves(), [PickedRegion("spot", (0.0, 0.02, 0.02), 0.005)])
+    at = {nm: GREEN[np.abs(NM - nm).argmin()] for nm in (670.0, 800.0)}
+    ndvi = traits.indices["spot"]["NDVI"]
+    assert ndvi.mean == pytest.approx((at[800.0] - at[670.0]) / (at[800.0] + at[670.0]), rel=1e-5)
+    assert ndvi.sd == pytest.approx(0.0, abs=1e-6)
+    assert traits.composites["spot"]["CIR"].mean[:2] == pytest.approx([at[800.0], at[670.0]], rel=1e-5)
+    assert traits.indices[WHOLE]["NDVI"].sd > 0.05
+    assert traits.spectra[1].area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
+
+
+def test_means_are_weighted_by_area():
+    sides = ((0.0, 1.0), (3.0, 2.0))
+    corners = [[[x, 0.0, 0.0], [x + s, 0.0, 0.0], [x + s, s, 0.0], [x, s, 0.0]] for x, s in sides]
+    spectra = np.repeat(np.stack([GREEN, BROWN]), 4, axis=0).astype(np.float32)
+    whole = analyse(SpectralMesh(quads(np.array(corners)), spectra, NM, np.ones(8, bool))).spectra[0]
+    np.testing.assert_allclose(whole.mean, (GREEN + 4.0 * BROWN) / 5.0, rtol=1e-5)
+    np.testing.assert_allclose(whole.sd, 0.4 * np.abs(GREEN - BROWN), atol=1e-6)
+    assert whole.area_m2 == pytest.approx(5.0)
+
+
+def test_weighted_mean_and_sd_against_repeated_values():
+    values = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]])
+    mean, sd = weighted_mean_and_sd(values, np.array([1.0, 2.0, 1.0]))
+    np.testing.assert_allclose(mean, [np.mean([1, 3, 3, 5]), 3.0])
+    np.testing.assert_allclose(sd, [np.std([1, 3, 3, 5]), 1.0])
+    nothing, _ = weighted_mean_and_sd(np.array([np.nan]), np.array([1.0]))
+    assert np.isnan(nothing)
+
+
+def test_vertices_take_the_spectra_of_points_near_them():
+    surface = two_halves()
+    chosen = surface.mesh.vertices[:, 2] > 0.005
+    points = surface.mesh.vertices[chosen]
+    cloud = SpectralCloud(points, points, np.zeros((len(points), 3), np.uint8), surface.spectra[chosen], NM)
+    found = with_spectra(surface.mesh, cloud, seen_within_m=0.001)
+    assert (found.seen[chosen]).all()
+    assert not found.seen[surface.mesh.vertices[:, 2] < 0.003].any()
+    inside = chosen & (np.abs(surface.mesh.vertices[:, 1]) > 0.005) & (surface.mesh.vertices[:, 2] < 0.039)
+    np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("spectrum", "incidence_deg"), [(9.0, 71.0), (np.nan, 0.0)])
+def test_points_seen_too_obliquely_or_without_a_spectrum_give_none(spectrum, incidence_deg):
+    surface = two_halves()
+    points = surface.mesh.vertices
+    left = points[:, 1] < 0.0
+    spectra = np.where(left[:, None], spectrum, surface.spectra).astype(np.float32)
+    colours = np.zeros((len(points), 3), np.uint8)
+    cloud = SpectralCloud(points, points, colours, spectra, NM, {INCIDENCE: np.where(left, incidence_deg, 69.0)})
+    found = with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=70.0)
+    assert found.spectra.max() <= 1.0
+    assert not found.seen[points[:, 1] < -0.002].any()
+    assert found.seen[~left].all()
+    assert with_spectra(surface.mesh, cloud, 0.001).seen.all() == np.isfinite(spectrum)
+    with pytest.raises(InputError, match="no point of the cloud is seen at 60 degrees or less"):
+        with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=60.0)
+    with pytest.raises(InputError, match="no point of the cloud has a spectrum"):
+        with_spectra(surface.mesh, replace(cloud, spectra=np.full_like(spectra, np.nan)), 0.001)
+
+
+@pytest.mark.parametrize("bands", [slice(None), slice(25, 26)])
+def test_mesh_is_a_cloud_with_triangles(tmp_path, bands):
+    import open3d as o3d
+
+    surface = two_halves()
+    surface = replace(surface, spectra=surface.spectra[:, bands], wavelengths_nm=NM[bands])
+    write_mesh(tmp_path / "mesh.ply", surface, {"class": np.ones(len(surface.seen))})
+    read = read_spectral_ply(tmp_path / "mesh.ply")
+    np.testing.assert_allclose(read.spectra, surface.spectra)
+    assert sorted(read.extra) == ["class", "seen"]
+    triangles = o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    np.testing.assert_array_equal(np.asarray(triangles.triangles), surface.mesh.triangles)
+    assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
+
+
+@pytest.mark.parametrize(("width_m", "height_m", "columns"), [(0.02, 0.05, 168), (0.1, 0.005, 840)])
+def test_pictures_hold_tall_and_flat_objects(width_m, height_m, columns):
+    for hit, *_ in SideViews(cylinder(width_m, height_m, segments=64)).sides:
+        assert hit.shape == pytest.approx((420, columns), abs=1)
+        assert np.ptp(np.flatnonzero(hit.any(axis=0))) == pytest.approx(columns / 1.04, rel=0.01)
+        assert hit.any(axis=1).mean() == pytest.approx(height_m / width_m * columns / 420 / 1.04, rel=0.05)
+
+
+def test_regions_from_yaml(tmp_path):
+    path = tmp_path / "regions.yaml"
+    path.write_text("bruise: {centre_m: [0.03, 0, 0.1], radius_m: 0.004}\n")
+    assert read_regions(path) == [PickedRegion("bruise", (0.03, 0.0, 0.1), 0.004)]
+    path.write_text("bruise: {centre_m: [0.03, 0], radius_m: 0.004}\n")
+    with pytest.raises(InputError, match=r"regions\.yaml"):
+        read_regions(path)
+    with pytest.raises(InputError, match="radius above 0"):
+        picked_region("spot", 0.0, 0.0, 0.0, 0.0)
+
+
+def test_regions_off_the_surface_or_of_one_name_are_refused():
+    surface = two_halves()
+    with pytest.raises(InputError, match="no seen surface within"):
+        analyse(surface, [PickedRegion("spot", (0.1, 0.0, 0.0), 0.005)])
+    spot = PickedRegion("spot", (0.0, 0.02, 0.02), 0.005)
+    with pytest.raises(InputError, match="two regions are named spot"):
+        analyse(surface, [spot, spot])
+    with pytest.raises(InputError, match="raise the smoothing radius"):
+        analyse(two_halves(seen=False))
+
+
+def test_ideal_cloud_holds_what_cameras_see():
+    surface = two_halves()
+    weights = (surface.mesh.vertices[:, 1:2] > 0.0) * [1.0, -1.0] + [0.0, 1.0]
+    true = TrueSurface(("green", "brown"), surface.mesh, weights, LIBRARY.spectra, NM)
+    cloud = true.cloud(5000, np.array([[0.5, 0.0, 0.2]]), noise_m=0.0)
+    # Of the base, nothing but its rim.
+    assert ((cloud.points[:, 2] > 1e-4) | (np.hypot(*cloud.points[:, :2].T) > 0.0195)).all()
+    assert ((cloud.points[:, 0] > -1e-3) | (cloud.points[:, 2] > 0.0399)).all()
+    away = np.abs(cloud.points[:, 1]) > 0.002
+    expected = np.where(cloud.points[away, 1:2] > 0.0, GREEN, BROWN)
+    np.testing.assert_allclose(cloud.spectra[away], expected, atol=1e-4)
+    assert relative_rms(1.02 * GREEN, GREEN) == pytest.approx(0.02)

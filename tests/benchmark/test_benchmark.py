@@ -1,0 +1,324 @@
+"""The benchmark: when it evaluates, what its clock counts, which runs it repeats, and what it writes."""
+
+import csv
+import json
+import math
+import shutil
+from dataclasses import asdict, replace
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import pytest
+import torch
+from nerfstudio.engine.trainer import writer
+
+from hsi_sc_nerf.benchmark import plot, run
+from hsi_sc_nerf.benchmark.configurations import (
+    CONFIGURATIONS,
+    named_configuration,
+    own_configuration,
+    training_config,
+)
+from hsi_sc_nerf.benchmark.results import TrainedRun, table, write_csv
+from hsi_sc_nerf.benchmark.run import Checkpoint, HeldOutViews
+from hsi_sc_nerf.benchmark.timing import TrainingClock, checkpoint_iterations, mean_iteration_seconds
+from hsi_sc_nerf.cli import benchmark
+from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
+from hsi_sc_nerf.errors import InputError
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+TINY = " ".join(
+    (
+        "--pipeline.datamanager.train-num-rays-per-batch 64",
+        "--pipeline.model.match-resolution False --pipeline.model.num-levels 4",
+        "--pipeline.model.log2-hashmap-size 10 --pipeline.model.max-res 32",
+        "--pipeline.model.num-proposal-samples-per-ray 16 8 --pipeline.model.num-nerf-samples-per-ray 8",
+        "--machine.device-type {device}",
+    )
+)
+
+
+def test_a_run_is_evaluated_at_its_shares_and_at_the_end_of_every_stage():
+    assert checkpoint_iterations((0.1, 0.5, 1.0), (40, 100)) == (10, 40, 50, 100)
+    assert checkpoint_iterations((), (40, 100)) == (40, 100)
+    assert checkpoint_iterations((0.001, 0.5), (5, 10)) == (1, 5, 10)
+
+
+def test_mean_time_leaves_out_what_each_stage_does_once():
+    first = [9.0, 9.0] + [1.0] * 8
+    second = [7.0, 7.0] + [3.0] * 28
+    times = [0.0]
+    for seconds in first + second:
+        times.append(times[-1] + seconds)
+    assert math.isclose(mean_iteration_seconds(times, (10, 40)), (10 * 1.0 + 30 * 3.0) / 40)
+
+
+def test_mean_time_of_a_stage_of_one_step_is_that_step():
+    assert mean_iteration_seconds([0.0, 2.0, 6.0], (1, 2)) == 3.0
+
+
+def test_clock_does_not_count_pauses():
+    now = {"wall": 100.0, "cpu": 50.0}
+    waits = []
+    clock = TrainingClock(lambda: waits.append(1), lambda: now["wall"], lambda: now["cpu"])
+    now.update(wall=110.0, cpu=65.0)
+    with clock.paused() as seconds:
+        now.update(wall=1000.0, cpu=900.0)
+    assert seconds == (10.0, 15.0)
+    now.update(wall=1002.0, cpu=903.0)
+    assert clock.read() == (12.0, 18.0)
+    assert len(waits) == 3
+
+
+def test_chosen_views_are_spread_evenly_and_counted():
+    class Loader:
+        def __len__(self):
+            return 6
+
+        def get_camera(self, index):
+            return index
+
+    assert list(HeldOutViews(Loader(), 3)) == [0, 2, 4]
+    assert list(HeldOutViews(Loader(), None)) == list(range(6))
+    assert len(HeldOutViews(Loader(), 1)) == 1
+    assert len(HeldOutViews(Loader(), 99)) == 6
+
+
+def test_configurations_of_the_users_own():
+    fine = own_configuration("fine=paper --pipeline.model.max-res 1024")
+    assert (fine.name, fine.method) == ("fine", named_configuration("paper").method)
+    assert fine.words == ("--pipeline.model.max-res", "1024")
+    assert own_configuration("x=--vis 'a b'").words == ("--vis", "a b")
+    assert own_configuration("same=ours").words == named_configuration("ours").words
+
+
+@pytest.mark.parametrize("text", ["no-equals", "=--x 1", "../up=--x 1", "a=nowhere --x 1", "a=--x 'open"])
+def test_bad_configurations_are_refused_in_one_sentence(text):
+    with pytest.raises(InputError, match=r"^[^\n]+\.$"):
+        own_configuration(text)
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_every_known_configuration_is_one_that_its_method_takes(name):
+    known = named_configuration(name)
+    assert training_config(known.method, known.words).method_name == known.method
+
+
+def test_words_change_the_method_and_nothing_else():
+    config = training_config("hsi-sc-nerf", ("--pipeline.model.predict-normals", "False", "--masked.lr-end", "0.5"))
+    assert config.pipeline.model.predict_normals is False
+    assert config.masked.lr_end == 0.5
+    assert training_config("hsi-sc-nerf", ()).masked.lr_end != 0.5
+
+
+@pytest.mark.parametrize(
+    ("method", "words", "reason"),
+    [
+        ("nerfacto", (), "no method is named 'nerfacto'"),
+        ("hsi-sc-nerf", ("--pipeline.model.max-ress", "3"), "nrecognized options: --pipeline.model.max-ress"),
+        ("hsi-sc-nerf", ("--pipeline.model.max-res", "x"), "(Error parsing"),
+        ("hsi-sc-nerf", ("--help",), "only ask for help"),
+    ],
+)
+def test_bad_words_are_refused_in_one_sentence(method, words, reason, capsys):
+    with pytest.raises(InputError, match=r"^[^\n]+\.$") as error:
+        training_config(method, words)
+    assert reason in str(error.value)
+    assert capsys.readouterr() == ("", "")
+
+
+def made_up_run(name, gpu_memory_mib=0.0):
+    checkpoints = [
+        Checkpoint(
+            iteration=10 * i,
+            stage="full-frame" if i == 1 else "masked",
+            ends_stage=i != 2,
+            train_seconds=float(i),
+            cpu_seconds=2.0 * i,
+            evaluation_seconds=1.0,
+            peak_memory_mib=100.0,
+            gpu_memory_mib=gpu_memory_mib,
+            metrics={
+                f"{region}{metric}{end}": 0.5 / i
+                for region in ("", "full_")
+                for metric in ("sam", "rmse", "ssim", "psnr")
+                for end in ("", "_std")
+            },
+        )
+        for i in (1, 2, 3)
+    ]
+    return TrainedRun(name, "hsi-sc-nerf", ("--vis", "viewer"), 0.1, tuple(checkpoints))
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Runs in this process, which has nerfstudio imported."""
+
+    def run_step(name, argv, log):
+        writer.EVENT_WRITERS.clear()  # those of earlier runs, whose folders may be gone
+        run.main(Path(argv[-2]), Path(argv[-1]))
+
+    monkeypatch.setattr(benchmark, "run_step", run_step)
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """No run is trained; gives the names of those that were asked for. What is in ``fails`` fails."""
+    ran = SimpleNamespace(names=[], fails=())
+
+    def run_step(name, argv, log):
+        ran.names.append(name)
+        if name in ran.fails:
+            raise InputError(f"the step '{name}' failed with status 1; what it said is above and in {log}.")
+        if name.startswith("rehearsal"):
+            found = {"iterations": 30, "iteration_seconds": 0.1}
+            Path(json.loads(Path(argv[-2]).read_text())["output_dir"]).mkdir()
+        else:
+            found = {"setup_seconds": 0.1, "checkpoints": [asdict(c) for c in made_up_run("a").checkpoints]}
+        Path(argv[-1]).write_text(json.dumps(found))
+
+    monkeypatch.setattr(benchmark, "run_step", run_step)
+    monkeypatch.setattr(plot, "draw_accuracy_and_time", lambda path, runs, clock: None)
+    return ran
+
+
+def command(tiny_dataset, folder, device="cpu", **changes):
+    made = BenchmarkCommand(
+        data=tiny_dataset[0],
+        output_dir=folder,
+        configurations=("ours",),
+        sets=("no-normals=--pipeline.model.predict-normals False",),
+        common=TINY.format(device=device),
+        iterations=6,
+        checkpoints=(0.34, 1.0),
+        held_out_views=1,
+        threads=torch.get_num_threads(),
+    )
+    return replace(made, **changes)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_path, in_this_process, device):
+    command(tiny_dataset, tmp_path, device).main()
+    with (tmp_path / "benchmark.csv").open(encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["configuration"], line["iteration"], line["ends_stage"]) for line in lines] == [
+        (name, *rest) for name in ("ours", "no-normals") for rest in (("2", "False"), ("3", "True"), ("6", "True"))
+    ]
+    assert [line["stage"] for line in lines[:3]] == ["full-frame", "full-frame", "masked"]
+    for line in lines:
+        assert all(math.isfinite(float(line[key])) for key in ("sam", "sam_std", "rmse", "ssim", "psnr", "full_psnr"))
+        assert float(line["peak_memory_mib"]) > 10
+        assert (float(line["gpu_memory_mib"]) > 0) == (device == "cuda")
+    for clock in ("train_seconds", "cpu_seconds"):
+        first, second, third = (float(line[clock]) for line in lines[:3])
+        assert 0 < first < second < third
+    content = json.loads((tmp_path / "benchmark.json").read_text())
+    assert content["machine"]["torch"] == version("torch")
+    assert "predict-normals" in (tmp_path / "benchmark.md").read_text()
+    assert cv2.imread(str(tmp_path / "benchmark.png")).std() > 5
+
+
+def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
+    job = benchmark._job(named_configuration("ours"), command(tiny_dataset, tmp_path), tiny_dataset[0])
+    ends = []
+    for checkpoints in ((1.0,), (0.17, 0.67, 1.0)):
+        writer.EVENT_WRITERS.clear()
+        ends.append(run.train(replace(job, checkpoints=checkpoints))["checkpoints"][-1]["metrics"])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-4)
+
+
+@pytest.mark.parametrize("clock", ["wall", "cpu"])
+def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, clock):
+    writer.EVENT_WRITERS.clear()
+    asked = command(tiny_dataset, tmp_path, iterations=None, train_seconds=0.3, clock=clock)
+    found = run.rehearse(benchmark._job(named_configuration("ours"), asked, tiny_dataset[0]))
+    assert found["iterations"] == max(1, round(0.3 / found["iteration_seconds"]))
+
+
+def test_finished_runs_are_not_repeated(tiny_dataset, tmp_path, made_up):
+    asked = command(tiny_dataset, tmp_path)
+    asked.main()
+    assert made_up.names == ["result of ours", "result of no-normals"]
+    asked.main()
+    assert len(made_up.names) == 2
+    (tmp_path / "ours" / "result.json").unlink()
+    asked.main()
+    assert made_up.names[2:] == ["result of ours"]
+    assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == [
+        "ours",
+        "no-normals",
+    ]
+    replace(asked, configurations=(), iterations=4).main()
+    assert made_up.names[3:] == ["result of no-normals"]
+
+
+def test_a_run_on_another_dataset_is_another_run(tiny_dataset, tmp_path, made_up):
+    data = tmp_path / "data"
+    shutil.copytree(tiny_dataset[0], data)
+    asked = command((data,), tmp_path / "out", sets=())
+    asked.main()
+    (data / "transforms.json").write_text((data / "transforms.json").read_text() + "\n")
+    asked.main()
+    assert made_up.names == ["result of ours"] * 2
+
+
+def test_a_rehearsal_comes_before_a_run_of_given_time_and_is_kept(tiny_dataset, tmp_path, made_up):
+    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=3.0)
+    made_up.fails = ("result of ours",)
+    with pytest.raises(InputError, match="result of ours"):
+        asked.main()
+    made_up.fails = ()
+    asked.main()
+    assert made_up.names == ["rehearsal of ours", "result of ours", "result of ours"]
+    assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["rehearsal.json", "result.json"]
+
+
+def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):
+    made_up.fails = ("result of ours",)
+    with pytest.raises(InputError, match=r"1 of 2 configurations failed.*result of ours"):
+        command(tiny_dataset, tmp_path).main()
+    assert list((tmp_path / "ours").iterdir()) == []
+    assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"configurations": ("theirs",)},
+        {"sets": ("ours=--vis tensorboard",)},
+        {"configurations": (), "sets": ()},
+        {"common": "--no-such-word 1"},
+        {"iterations": 0},
+        {"train_seconds": -1.0},
+        {"checkpoints": (0.5, 2.0)},
+        {"held_out_views": 0},
+        {"threads": 0},
+        {"data": Path("nowhere")},
+    ],
+)
+def test_bad_settings_are_one_sentence_before_anything_is_trained(tiny_dataset, tmp_path, made_up, changes):
+    with pytest.raises(InputError, match=r"^[^\n]+\.$"):
+        command(tiny_dataset, tmp_path / "out", **changes).main()
+    assert made_up.names == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_table_has_a_row_for_each_stage():
+    titles, rows = table([made_up_run("a"), made_up_run("b")])
+    assert [row[:5] for row in rows] == [
+        [n, *r] for n in "ab" for r in (["full-frame", "10", "0", "1"], ["masked", "30", "0", "3"])
+    ]
+    assert all(len(row) == len(titles) for row in rows)
+    assert "GPU memory, MiB" not in titles
+    assert "GPU memory, MiB" in table([made_up_run("a", 5.0)])[0]
+
+
+def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
+    runs = [made_up_run(f"run-{i}") for i in range(9)]
+    write_csv(tmp_path / "runs.csv", runs)
+    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 27
+    plot.draw_accuracy_and_time(tmp_path / "runs.png", runs, "cpu")
+    assert cv2.imread(str(tmp_path / "runs.png")).std() > 5

@@ -1,0 +1,302 @@
+"""Drift of the lamps, against simulated sessions whose drift is known and against its closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hsi_sc_nerf.calibration.config import LampDriftConfig
+from hsi_sc_nerf.calibration.lamp_drift import (
+    LampDrift,
+    NotMeasurable,
+    chance_of,
+    correction,
+    fit_over_wavelength,
+    measure_lamp_drift,
+    smooth_basis,
+    survey_count,
+    survey_lines,
+)
+from hsi_sc_nerf.calibration.noise import NoiseModel
+from hsi_sc_nerf.calibration.pictures import lamp_drift_picture
+from hsi_sc_nerf.calibration.static_pixels import static_pixels
+from hsi_sc_nerf.simulate.effects import read_effects
+from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.scene import load_scene, override
+
+CONFIG = LampDriftConfig()
+NOISE = ("photon_noise", "read_noise", "dark_pattern")
+DRIFT = {"lamp_drift": {"percent": -7.0, "temperature_change_k": -100.0}}
+
+
+def simulated(*effects, name="pear", bands=40, frames=8, **camera):
+    """Whether the drift of a simulated session can be measured, what it is, and what it should be."""
+    scene = override(load_scene(name), size_px=128, bands=bands, frames=frames)
+    scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, supersampling=2, **camera))
+    scene = dataclasses.replace(scene, effects=read_effects(effects, "test"))
+    simulation = Simulation(scene)
+    captures = [simulation.frame(number) for number in range(frames)]
+    slope = 4095 / scene.sensor.full_well_electrons if NOISE[0] in effects else 0.0
+    read = 40.0 * 4095 / scene.sensor.full_well_electrons if NOISE[1] in effects else 0.0
+    noise = NoiseModel(np.full(bands, np.sqrt(read**2 + 1 / 12)), slope, True, True)
+    lines = survey_lines(128, survey_count(128, CONFIG))
+    drift = measure_lamp_drift(
+        lambda number: captures[number].counts[lines],
+        frames,
+        [capture.dark.mean(axis=0) for capture in captures],
+        noise,
+        simulation.wavelengths_nm,
+        CONFIG,
+        saturation_counts=4095,
+    )
+    lamps = [effect for effect in scene.effects if effect.name == "lamp_drift"]
+    true = np.ones((frames, bands))
+    for lamp in lamps:
+        kelvin = scene.sensor.lamp_temperature_k
+        factors = [lamp.factor(128, simulation.wavelengths_nm, kelvin, t) for t in simulation.plan.elapsed]
+        true = np.stack(factors)[:, 0, 0]
+    return drift, true / true[0], np.stack([capture.coverage for capture in captures])[:, lines]
+
+
+@pytest.mark.parametrize(
+    ("effects", "name"),
+    [
+        ((), "pear"),
+        (("textured_background", "optical_blur", "drying", "off_centre"), "apple"),
+        (("bad_pixels", "illumination_falloff", "spectral_smile", "image_rotation", "lamp"), "maize"),
+    ],
+)
+def test_drift_of_a_noisy_session_within_a_third_of_a_percent(effects, name):
+    drift, true, coverage = simulated(*NOISE, *effects, DRIFT, name=name)
+    assert isinstance(drift, LampDrift)
+    assert drift.significant
+    assert np.sqrt(np.mean((drift.factor / true - 1.0) ** 2)) < 0.003
+    assert true.min() < 0.8
+    # The errors are as large as they are said to be.
+    off = (drift.factor - true)[1:] / drift.standard_error[1:]
+    assert np.sqrt((off**2).mean()) < 2.5
+    assert np.nanstd((drift.measured - true)[-1]) > np.std((drift.factor - true)[-1])
+    # The object stands on few of the pixels, and only where it looks the same from all sides.
+    assert (drift.static & (coverage.max(axis=0) > 0.5)).sum() < 0.1 * drift.static.sum()
+    assert drift.static_share > 0.5
+    np.testing.assert_array_equal(correction(drift, CONFIG), drift.factor)
+
+
+@pytest.mark.parametrize("effects", [(), NOISE, (*NOISE, "textured_background", "wobble", "drying")])
+def test_session_without_drift_stays_as_it_is(effects):
+    drift, _, _ = simulated(*effects)
+    assert isinstance(drift, LampDrift)
+    assert not drift.significant
+    assert np.abs(drift.factor - 1.0).max() < 0.004
+    assert correction(drift, CONFIG) is None
+
+
+def test_inter_reflection_makes_no_drift():
+    drift, _, _ = simulated(
+        {"inter_reflection": {"directions": 24}}, {"chamber_shading": {"directions": 24}}, bands=20, frames=4
+    )
+    assert np.abs(drift.factor - 1.0).max() < 2e-4
+    assert not drift.significant
+
+
+def test_noise_free_drift_before_an_even_background():
+    drift, true, _ = simulated(DRIFT)
+    assert drift.significant
+    assert np.sqrt(np.mean((drift.factor / true - 1.0) ** 2)) < 0.002
+
+
+@pytest.mark.parametrize(("effects", "name"), [((), "pear"), ((*NOISE, DRIFT), "maize"), ((*NOISE, "lamp"), "apple")])
+def test_not_measurable_where_the_object_fills_the_frame(effects, name):
+    drift, _, _ = simulated(*effects, name=name, bands=20, frames=5, field_of_view_deg=4.0, aim_height_m=0.11)
+    assert isinstance(drift, NotMeasurable)
+    assert "% of the surveyed pixels" in drift.reason
+    assert correction(drift, dataclasses.replace(CONFIG, correct="always")) is None
+
+
+# Drawn sessions: a still background beside a moving thing.
+
+FRAMES, LINES, SAMPLES, BANDS = 6, 10, 64, 24
+WAVELENGTHS_NM = np.linspace(400.0, 1000.0, BANDS)
+TRUE = 1.0 - 0.06 * np.linspace(0.0, 1.0, FRAMES)[:, None] * (1.0 + 0.3 * (700.0 / WAVELENGTHS_NM - 1.0))
+QUIET = NoiseModel(np.full(BANDS, 2.0), 0.1, True, True)
+
+
+def drawn(true=TRUE, moving=0.4):
+    rng = np.random.default_rng(11)
+    wall = rng.uniform(500.0, 2500.0, (LINES, SAMPLES, BANDS))
+    scene = np.repeat(wall[None], FRAMES, axis=0)
+    across = int(moving * SAMPLES)
+    scene[:, :, :across] = rng.uniform(500.0, 2500.0, (FRAMES, LINES, across, BANDS))
+    light = scene * true[:, None, None]
+    noisy = light + np.sqrt(QUIET.variance(light)) * rng.standard_normal(light.shape)
+    return np.rint(noisy + 100.0).astype(np.uint16)
+
+
+def measure(counts, dark=100.0, config=CONFIG, **masks):
+    level = [np.full((1, BANDS), dark)] if np.isscalar(dark) else dark
+    return measure_lamp_drift(counts.__getitem__, FRAMES, level, QUIET, WAVELENGTHS_NM, config, **masks)
+
+
+def test_static_pixels_are_found_and_their_sum_is_the_drift():
+    counts = drawn()
+    drift = measure(counts)
+    assert not drift.static[:, : int(0.4 * SAMPLES)].any()
+    assert drift.static[:, int(0.4 * SAMPLES) :].mean() > 0.98
+    np.testing.assert_allclose(drift.factor, TRUE, atol=1e-3)
+    light = counts[:, drift.static].sum(axis=1) - 100.0 * drift.static.sum()
+    np.testing.assert_allclose(drift.measured, light / light[0], rtol=1e-5)
+    np.testing.assert_array_equal(drift.factor[0], 1.0)
+    np.testing.assert_array_equal(drift.standard_error[0], 0.0)
+
+
+def test_order_in_the_file_does_not_matter():
+    counts = drawn()
+    expected = measure(counts)
+    for axes in ((0, 1, 3, 2), (0, 3, 1, 2)):
+        back = np.argsort(axes)
+        lying = np.ascontiguousarray(counts.transpose(axes)).transpose(back)
+        np.testing.assert_allclose(measure(lying).factor, expected.factor, rtol=1e-6)
+
+
+def test_dark_of_each_frame():
+    level = np.random.default_rng(3).uniform(0.0, 300.0, (FRAMES, SAMPLES, BANDS)).round()
+    counts = (drawn() + level[:, None] - 100.0).astype(np.uint16)
+    np.testing.assert_allclose(measure(counts, list(level)).factor, measure(drawn()).factor, atol=1e-6)
+    assert isinstance(measure(counts), NotMeasurable)
+
+
+def test_saturated_and_dead_elements_and_no_data_are_left_out():
+    counts, dead = drawn(), np.zeros((SAMPLES, BANDS), bool)
+    dead[::5, ::3] = True
+    counts[:, :, dead] = np.random.default_rng(2).choice([100, 4095], (FRAMES, LINES, dead.sum()))
+    drift = measure(counts, saturation_counts=4095, dead=dead)
+    assert drift.static[:, int(0.4 * SAMPLES) :].mean() > 0.98
+    np.testing.assert_allclose(drift.factor, TRUE, atol=1e-3)
+    limit = 1900
+    drift = measure(counts.clip(max=limit), saturation_counts=limit, dead=dead)
+    np.testing.assert_allclose(drift.factor, TRUE, atol=2e-3)
+    gaps = np.random.default_rng(5).random(counts.shape) < 1e-3
+    drift = measure(np.where(gaps, np.nan, drawn()), saturation_counts=4095)
+    np.testing.assert_allclose(drift.factor, TRUE, atol=1e-3)
+    assert np.isfinite(drift.measured).all()
+    # Unknown ones take their samples out of what stands still.
+    assert not measure(counts).static[:, ::5].any()
+
+
+def test_what_cannot_be_measured_says_why():
+    moving = measure(drawn(moving=1.0))
+    assert isinstance(moving, NotMeasurable)
+    assert "stand still" in moving.reason
+    darkness = measure(np.full((FRAMES, LINES, SAMPLES, BANDS), 100, np.uint16))
+    assert isinstance(darkness, NotMeasurable)
+    few = measure_lamp_drift(
+        drawn()[..., :2].__getitem__, FRAMES, [np.zeros((1, 2))], QUIET, WAVELENGTHS_NM[:2], CONFIG
+    )
+    assert few == NotMeasurable("2 bands are too few for its curve over the wavelength")
+    single = measure_lamp_drift(drawn().__getitem__, 1, [np.zeros((1, BANDS))], QUIET, WAVELENGTHS_NM, CONFIG)
+    assert single == NotMeasurable("there is a single frame")
+
+
+def test_correction_is_the_users_choice():
+    drifting, steady = measure(drawn()), measure(drawn(np.ones_like(TRUE)))
+    assert drifting.significant
+    assert not steady.significant
+    for correct, of_drifting, of_steady in (("auto", True, False), ("always", True, True), ("never", False, False)):
+        config = LampDriftConfig(correct=correct)
+        assert (correction(drifting, config) is not None) == of_drifting
+        assert (correction(steady, config) is not None) == of_steady
+
+
+@pytest.mark.parametrize(("percent", "significant"), [(0.05, False), (1.0, True)])
+def test_a_change_within_the_floor_is_no_drift(percent, significant):
+    true = np.broadcast_to(1.0 - 0.01 * percent * np.linspace(0.0, 1.0, FRAMES)[:, None], TRUE.shape)
+    assert measure(drawn(true)).significant == significant
+
+
+def test_false_alarms_are_as_rare_as_said():
+    rng, frames, terms = np.random.default_rng(9), 12, 3
+    covariance, floor = np.diag([1.0, 2.0, 4.0]) * 1e-8, 1e-3
+    spread = np.sqrt(np.diag(covariance) + floor**2 / terms)
+    p_values = []
+    for _ in range(2000):
+        coefficients = spread * rng.standard_normal((frames, terms))
+        p_values.append(chance_of(coefficients - coefficients.mean(axis=0), covariance, floor))
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-3
+
+
+def test_basis_and_fit():
+    lit = np.ones(BANDS, bool)
+    lit[:2] = False
+    basis = smooth_basis(WAVELENGTHS_NM, lit, 2)
+    np.testing.assert_allclose(basis[lit].T @ basis[lit] / lit.sum(), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(basis[:, 0], 1.0)
+    # Wien's law: a change of colour temperature is in the basis.
+    planck = -14_388_000.0 / WAVELENGTHS_NM * (1 / 2900 - 1 / 3000)
+    rng = np.random.default_rng(4)
+    variance = np.linspace(1e-6, 1e-4, lit.sum())
+    repeats = np.array(
+        [
+            fit_over_wavelength(
+                np.outer([0.0, 1.0], planck[lit]) + np.sqrt(variance) * rng.standard_normal((2, lit.sum())),
+                variance,
+                basis[lit],
+            )[0]
+            for _ in range(800)
+        ]
+    )
+    change = repeats[:, 1] - repeats[:, 0]
+    np.testing.assert_allclose((basis @ change.T).mean(axis=1), planck, atol=1e-3)
+    _, covariance = fit_over_wavelength(np.zeros((2, lit.sum())), variance, basis[lit])
+    np.testing.assert_allclose(np.var(change, axis=0), 2.0 * np.diag(covariance), rtol=0.2)
+
+
+def test_scatter_beyond_the_noise_makes_the_errors_larger():
+    variance, basis = np.full(BANDS, 1e-6), smooth_basis(WAVELENGTHS_NM, np.ones(BANDS, bool), 2)
+    scatter = 3e-3 * np.random.default_rng(7).standard_normal((20, BANDS))
+    calm = fit_over_wavelength(np.zeros((20, BANDS)), variance, basis)[1]
+    assert fit_over_wavelength(scatter, variance, basis)[1] / calm == pytest.approx(np.full((3, 3), 9.0), rel=0.2)
+
+
+@pytest.mark.parametrize(("lines", "count"), [(512, 31), (128, 8), (10, 8), (8, 20), (2, 8), (1, 8)])
+def test_survey_lines(lines, count):
+    chosen = survey_lines(lines, count)
+    assert chosen[0] == 0
+    assert chosen[-1] == lines - 1
+    assert (np.diff(chosen) > 0).all()
+    assert len(chosen) <= count
+    np.testing.assert_allclose(chosen, (lines - 1 - chosen)[::-1], atol=1.0)
+    if lines > 4 * count:
+        steps = np.diff(chosen)
+        assert len(chosen) == count
+        assert steps[0] < steps[count // 2]
+
+
+def test_static_pixels_of_counts_that_cannot_be_used():
+    counts = np.full((200, 4, 3), 1000.0, np.float32)
+    assert static_pixels(counts.copy(), np.full((200, 3), 4.0)).all()
+    variance = np.full((200, 3), 4.0)
+    variance[:50] = np.inf
+    counts[50:100, 2] = 0.0
+    static = static_pixels(counts.copy(), variance)
+    assert not static[:100].any()
+    assert static[100:].all()
+    assert not static_pixels(counts.copy(), np.full((200, 3), np.inf)).any()
+
+
+def test_a_course_that_is_off_by_little_in_each_frame_but_in_all_of_them():
+    frames, spread = 40, 5.0
+    counts = 1000.0 + spread * np.random.default_rng(1).standard_normal((400, frames, 3))
+    # Two standard deviations, tolerance included, up and down in turn.
+    counts[:50] += 2.0 * np.hypot(spread, 2.0) * (-1.0) ** np.arange(frames)[:, None]
+    static = static_pixels(counts.astype(np.float32), np.full((400, 3), spread**2))
+    assert not static[:50].any()
+    assert static[50:].mean() > 0.99
+
+
+def test_picture(tmp_path):
+    drift = measure(drawn())
+    lamp_drift_picture(tmp_path / "drift.png", drift, WAVELENGTHS_NM, corrected=True)
+    assert (tmp_path / "drift.png").stat().st_size > 10_000

@@ -1,0 +1,234 @@
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spectral.io import envi as spy
+
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
+from hsi_sc_nerf.capture.envi_header import read_header
+from hsi_sc_nerf.errors import InputError
+
+MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
+WAVELENGTHS_NM = np.array([450.25, 550.5, 650.75, 851.0])
+
+
+def some_cube(dtype="uint16", shape=(3, 5, 4)) -> np.ndarray:
+    return (np.arange(np.prod(shape)) % 251).reshape(shape).astype(dtype)
+
+
+@pytest.fixture
+def header(tmp_path) -> Path:
+    path = tmp_path / "cube.hdr"
+    write_cube(path, some_cube(), wavelengths_nm=WAVELENGTHS_NM)
+    return path
+
+
+def add(header: Path, *fields: str) -> None:
+    header.write_text("\n".join([header.read_text(), *fields, ""]))
+
+
+def list_wavelengths(header: Path, wavelengths: np.ndarray) -> None:
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")] + f"wavelength = {{{', '.join(map(str, wavelengths))}}}\n")
+
+
+def edit(header: Path, old: str, new: str) -> None:
+    text = header.read_text()
+    assert old in text
+    header.write_text(text.replace(old, new))
+
+
+def test_spy_reads_what_we_write_and_the_map_loads_nothing(header):
+    np.testing.assert_array_equal(np.asarray(spy.open(str(header)).load(dtype=np.uint16)), some_cube())
+    assert isinstance(open_cube(header).memmap(), np.memmap)
+    assert not open_cube(header).memmap().flags.writeable
+
+
+def test_reflectance_scale_and_ignored_value(tmp_path):
+    path = tmp_path / "r.hdr"
+    header = {"reflectance scale factor": 200, "data ignore value": 7}
+    write_cube(path, some_cube(), wavelengths_nm=WAVELENGTHS_NM, extra_header=header)
+    opened = open_cube(path)
+    assert (opened.reflectance_scale, opened.ignore_value) == (200.0, 7.0)
+
+
+def test_bands_that_are_bad_and_how_wide_they_are(header):
+    add(header, "bbl = {1, 1.0, 0, 1,}", "fwhm = { 2, 2.5, 3, 3.5 }", "tint = 12.500000")
+    cube = open_cube(header)
+    assert cube.good_bands.tolist() == [True, True, False, True]
+    assert cube.fwhm_nm.tolist() == [2.0, 2.5, 3.0, 3.5]
+    assert cube.integration_time_ms == 12.5
+
+
+def test_fwhm_is_in_the_wavelengths_unit(header):
+    edit(header, "wavelength units = nm", "wavelength units = Micrometers\nfwhm = {0.002, 0.002, 0.002, 0.003}")
+    list_wavelengths(header, WAVELENGTHS_NM / 1000.0)
+    np.testing.assert_allclose(open_cube(header).fwhm_nm, [2.0, 2.0, 2.0, 3.0])
+
+
+def test_a_bare_header_tells_nothing(header):
+    cube = open_cube(header)
+    assert cube.good_bands.all()
+    assert (cube.fwhm_nm, cube.ignore_value, cube.integration_time_ms) == (None, None, None)
+
+
+@pytest.mark.parametrize("empty", ["tint = ", "tint = 0", "bbl = {}", "fwhm = { }", "data ignore value ="])
+def test_empty_fields_are_missing_fields(header, empty):
+    add(header, empty)
+    cube = open_cube(header)
+    assert cube.good_bands.all()
+    assert (cube.fwhm_nm, cube.ignore_value, cube.integration_time_ms) == (None, None, None)
+
+
+@pytest.mark.parametrize("listed", [None, "wavelength = {}", "wavelength units = Index\nwavelength = {1, 2, 3, 4}"])
+def test_wavelengths_from_elsewhere(header, listed):
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")] + (listed or ""))
+    assert read_header(header).wavelengths_nm is None
+    np.testing.assert_array_equal(open_cube(header, WAVELENGTHS_NM).wavelengths_nm, WAVELENGTHS_NM)
+    with pytest.raises(InputError, match=r"cube\.hdr: gives no wavelengths; .*band_centres"):
+        open_cube(header)
+    with pytest.raises(InputError, match=r"no wavelengths, and the list of 3 band centres .* its 4 bands"):
+        open_cube(header, WAVELENGTHS_NM[:3])
+
+
+def test_the_headers_wavelengths_go_before_those_from_elsewhere(header):
+    np.testing.assert_array_equal(open_cube(header, WAVELENGTHS_NM + 1.0).wavelengths_nm, WAVELENGTHS_NM)
+
+
+def test_of_two_data_files_the_one_that_fits(header):
+    header.with_suffix("").write_bytes(b"a note")
+    assert open_cube(header).data_path == header.with_suffix(".raw")
+
+
+def test_a_letter_that_only_latin_1_has(header):
+    header.write_bytes(header.read_text().replace("ENVI\n", "ENVI\nremark = Wei\xdfreferenz\n").encode("latin-1"))
+    np.testing.assert_array_equal(open_cube(header).read(), some_cube())
+
+
+@pytest.mark.parametrize("unit", ["micrometers", "um", "\N{GREEK SMALL LETTER MU}m", "", "Unknown"])
+def test_micrometres_become_nm(header, unit):
+    edit(header, "wavelength units = nm", f"wavelength units = {unit}")
+    list_wavelengths(header, WAVELENGTHS_NM / 1000.0)
+    np.testing.assert_allclose(open_cube(header).wavelengths_nm, WAVELENGTHS_NM)
+
+
+@pytest.mark.parametrize("name", ["white_reference_crop", "dark_reference_crop"])
+def test_real_references_open(name):
+    assert open_cube(MAIZE / f"{name}.hdr").wavelengths_nm[[0, -1]].tolist() == [366.551, 1048.421]
+
+
+def test_real_maize_kernel_opens():
+    cube = open_cube(MAIZE / "4-22-22_right_same_B73_top_00.hdr")
+    assert cube.shape == (31, 43, 580)
+    assert cube.wavelengths_nm[[0, -1]].tolist() == [366.551, 1048.421]
+    assert cube.dtype == np.dtype("<u2")
+    stored = np.fromfile(cube.data_path, "<u2").reshape(31, 580, 43)
+    np.testing.assert_array_equal(cube.memmap()[7, 11], stored[7, :, 11])
+
+
+def test_header_without_data(header):
+    header.with_suffix(".raw").unlink()
+    with pytest.raises(InputError, match=r"cube\.hdr.*data file cube\.raw"):
+        open_cube(header)
+
+
+@pytest.mark.parametrize(("change", "word"), [(lambda b: b[:-1], "fewer"), (lambda b: b + b"x", "more")])
+def test_data_of_another_length(header, change, word):
+    data = header.with_suffix(".raw")
+    data.write_bytes(change(data.read_bytes()))
+    with pytest.raises(InputError, match=rf"cube\.raw.*{word}.*cube\.hdr"):
+        open_cube(header)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("wavelength = {", "not wavelength = {", "no wavelengths"),
+        ("wavelength = { 450.25 ,", "wavelength = {", "wavelength lists 3 numbers for 4 bands"),
+        ("450.25", "blue", "what is not a number"),
+        ("450.25", "-450.25", "negative"),
+        ("interleave = bil", "interleave = bix", "none of bil, bip, bsq"),
+        ("lines = 3\n", "", "does not give lines"),
+        ("lines = 3", "lines = three", "cannot be read"),
+        ("lines = 3", "lines = 0", "no spectral image"),
+        ("header offset = 0", "header offset = -8", "no spectral image"),
+        ("header offset = 0", "header offset = 0\nmajor frame offsets = {0, 4}", "major frame offsets"),
+        ("header offset = 0", "header offset = 0\nminor frame offsets = 2", "minor frame offsets"),
+        ("header offset = 0", "header offset = 0\nfile compression = 1", "file compression"),
+        ("header offset = 0", "header offset = 0\nreflectance scale factor = 0", "scale factor 0 is not positive"),
+        ("header offset = 0", "header offset = 0\nreflectance scale factor = many", "no number"),
+        ("header offset = 0", "header offset = 0\ndata ignore value = none", "data ignore value is no number"),
+        ("header offset = 0", "header offset = 0\ntint = long", "tint is no number"),
+        ("header offset = 0", "header offset = 0\nbbl = {1, 1, 0}", "bbl lists 3 numbers for 4 bands"),
+        ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, 2, 2}", "fwhm lists 5 numbers for 4 bands"),
+        ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, nan}", "fwhm .* not finite"),
+        ("}", "", "no readable ENVI header"),
+        ("byte order = 0", "byte order = 2", "byte order 2"),
+        ("file type = ENVI Standard", "file type = ENVI Spectral Library", "spectral library"),
+        ("units = nm", "units = Wavenumber", "wavenumber, not as wavelengths"),
+        ("units = nm", "units = Micrometers", "none of an imaging spectrometer"),
+        ("450.25", "0.45", "none of an imaging spectrometer"),
+        ("data type = 12", "data type = 77", "cannot be read"),
+        ("data type = 12", "data type = 6", "complex numbers"),
+        ("data type = 12\n", "data type =\n", "does not give data type"),
+        ("ENVI\n", "ENVY\n", "no readable ENVI header"),
+    ],
+)
+def test_headers_that_cannot_be_used(header, old, new, message):
+    edit(header, old, new)
+    with pytest.raises(InputError, match=rf"cube\.hdr.*{message}"):
+        open_cube(header)
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n", b"\x00\x01\xff" * 50, b"ENVI\x00\x00", bytes(range(256)) * 9])
+def test_a_header_that_is_none(header, content):
+    header.write_bytes(content)
+    with pytest.raises(InputError, match=r"cube\.hdr: is no readable ENVI header"):
+        open_cube(header)
+
+
+def test_a_header_without_fields(header):
+    header.write_text("ENVI\n")
+    with pytest.raises(InputError, match="does not give lines, samples, bands, data type, interleave"):
+        open_cube(header)
+
+
+def test_an_empty_data_file(header):
+    header.with_suffix(".raw").write_bytes(b"")
+    with pytest.raises(InputError, match=r"cube\.raw: has 0 bytes, fewer than the 120"):
+        open_cube(header)
+
+
+def test_a_header_with_another_band_count(header):
+    edit(header, "bands = 4", "bands = 3")
+    list_wavelengths(header, WAVELENGTHS_NM[:3])
+    with pytest.raises(InputError, match=r"cube\.raw: has 120 bytes, more than the 90"):
+        open_cube(header)
+
+
+def test_no_header(tmp_path):
+    with pytest.raises(InputError, match="no such ENVI header"):
+        open_cube(tmp_path / "absent.hdr")
+
+
+def test_full_disk_leaves_the_old_cube(header, monkeypatch):
+    def fill_the_disk(temporary_header, *_, **__):
+        Path(temporary_header).write_text("ENVI\n")
+        Path(temporary_header).with_suffix(".raw").write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = sorted(header.parent.iterdir())
+    monkeypatch.setattr(spy, "write_envi_header", fill_the_disk)
+    with pytest.raises(InputError, match=r"cube\.raw: cannot be written \(No space left on device\)"):
+        write_cube(header, some_cube() + 1, wavelengths_nm=WAVELENGTHS_NM)
+    assert sorted(header.parent.iterdir()) == before
+    np.testing.assert_array_equal(open_cube(header).read(), some_cube())
+
+
+def test_one_wavelength_a_band(tmp_path):
+    with pytest.raises(ValueError, match="4 wavelengths for 3 bands"):
+        write_cube(tmp_path / "c.hdr", some_cube(shape=(2, 2, 3)), wavelengths_nm=WAVELENGTHS_NM)

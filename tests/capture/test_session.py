@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_factory import BANDS, INFO, SIZE_PX, WAVELENGTHS_NM, write_capture, write_session
+from spectral.io import envi as spy
+
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import is_session, open_session
+from hsi_sc_nerf.capture.session_info import read_band_centres, read_session_info
+from hsi_sc_nerf.errors import InputError
+
+COUNTS = np.full((SIZE_PX, SIZE_PX, BANDS), 500, np.uint16)
+
+
+@pytest.mark.parametrize("specim", [True, False])
+def test_both_layouts(tmp_path, specim):
+    write_session(tmp_path, angles_deg=(0, 90), specim=specim)
+    write_capture(tmp_path, "ball_10", COUNTS, specim=specim)
+    (tmp_path / "truth" / "pixels").mkdir(parents=True)
+    (tmp_path / "notes").mkdir()
+    session = open_session(tmp_path)
+    assert [frame.name for frame in session.frames] == ["ball_1", "ball_2", "ball_10"]
+    assert session.white.name == "white_reference"
+    assert session.info.object == "ball"
+    np.testing.assert_array_equal(session.wavelengths_nm, WAVELENGTHS_NM)
+    for capture in (*session.frames, session.white):
+        assert capture.dark is not None
+        assert capture.dark.header_path.name == f"DARKREF_{capture.name}.hdr"
+    assert is_session(tmp_path)
+
+
+def test_plain_folder_with_one_dark_cube_and_a_named_white(tmp_path):
+    for name in ("a", "b", "tarp", "dark_reference", "WHITEREF_a"):
+        write_cube(tmp_path / f"{name}.hdr", COUNTS, wavelengths_nm=WAVELENGTHS_NM)
+    (tmp_path / "session.json").write_text(json.dumps({"white_reference": "tarp"}))
+    session = open_session(tmp_path)
+    assert [frame.name for frame in session.frames] == ["a", "b"]
+    assert session.white.name == "tarp"
+    assert {c.dark.header_path.name for c in (*session.frames, session.white) if c.dark} == {"dark_reference.hdr"}
+
+
+def test_without_dark_cubes_and_session_json(tmp_path):
+    for name in ("a", "b", "White_Reference"):
+        write_cube(tmp_path / f"{name}.hdr", COUNTS, wavelengths_nm=WAVELENGTHS_NM)
+    session = open_session(tmp_path)
+    assert session.white.name == "White_Reference"
+    assert [frame.dark for frame in session.frames] == [None, None]
+    assert session.info.marker_side_m is None
+
+
+def test_is_session(tmp_path):
+    assert not is_session(tmp_path)
+    assert not is_session(tmp_path / "absent")
+    (tmp_path / "x.hdr").write_text("ENVI\n")
+    assert is_session(tmp_path)
+
+
+def test_missing_and_empty_folders(tmp_path):
+    with pytest.raises(InputError, match="no such session folder"):
+        open_session(tmp_path / "absent")
+    with pytest.raises(InputError, match="holds no captures"):
+        open_session(tmp_path)
+
+
+def test_no_white_reference(tmp_path):
+    for name in ("a", "b"):
+        write_capture(tmp_path, name, COUNTS)
+    with pytest.raises(InputError, match="no capture called white_reference"):
+        open_session(tmp_path)
+
+
+@pytest.mark.parametrize(("frames", "words"), [(["a"], "a single frame"), ([], "no frames")])
+def test_too_few_frames(tmp_path, frames, words):
+    for name in (*frames, "white_reference"):
+        write_capture(tmp_path, name, COUNTS)
+    with pytest.raises(InputError, match=words):
+        open_session(tmp_path)
+
+
+def test_a_capture_folder_without_its_cube(tmp_path):
+    write_session(tmp_path)
+    (tmp_path / "ball_3" / "capture" / "ball_3.hdr").unlink()
+    with pytest.raises(InputError, match=r"ball_3: has no capture/ball_3\.hdr"):
+        open_session(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["ball_2", "white_reference"])
+def test_other_wavelengths(tmp_path, name):
+    write_session(tmp_path)
+    write_capture(tmp_path, name, COUNTS, wavelengths_nm=WAVELENGTHS_NM + 0.5)
+    with pytest.raises(InputError, match=rf"{name}\.hdr: its bands differ.*ball_1\.hdr"):
+        open_session(tmp_path)
+
+
+def test_other_band_count(tmp_path):
+    write_session(tmp_path)
+    write_capture(tmp_path, "ball_4", COUNTS[..., 1:], wavelengths_nm=WAVELENGTHS_NM[1:])
+    with pytest.raises(InputError, match=r"ball_4\.hdr: its bands differ"):
+        open_session(tmp_path)
+
+
+def test_other_size(tmp_path):
+    write_session(tmp_path)
+    write_capture(tmp_path, "ball_2", COUNTS[1:])
+    with pytest.raises(InputError, match=r"ball_2\.hdr: its \(47, 48\) lines and samples differ"):
+        open_session(tmp_path)
+
+
+def test_two_shared_dark_cubes(tmp_path):
+    for name in ("a", "b", "white_reference", "dark_1", "dark_2"):
+        write_cube(tmp_path / f"{name}.hdr", COUNTS, wavelengths_nm=WAVELENGTHS_NM)
+    with pytest.raises(InputError, match=r"dark_1\.hdr and dark_2\.hdr"):
+        open_session(tmp_path)
+
+
+def without_wavelengths(header: Path) -> None:
+    text = header.read_text()
+    header.write_text(text[: text.index("wavelength = {")])
+
+
+def test_wavelengths_of_another_cube(tmp_path):
+    write_session(tmp_path)
+    for name in ("ball_1", "DARKREF_ball_1", "ball_3"):
+        without_wavelengths(tmp_path / name.removeprefix("DARKREF_") / "capture" / f"{name}.hdr")
+    session = open_session(tmp_path)
+    for frame in session.frames:
+        np.testing.assert_array_equal(frame.cube.wavelengths_nm, WAVELENGTHS_NM)
+
+
+def test_wavelengths_of_a_list_beside_session_json(tmp_path):
+    write_session(tmp_path, info={**INFO, "band_centres": "bands.csv", "panel_reflectance": "panel.csv"})
+    (tmp_path / "bands.csv").write_text("wavelength_nm\n" + "".join(f"{w:.3f}\n" for w in WAVELENGTHS_NM))
+    (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.98\n")
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    session = open_session(tmp_path)
+    np.testing.assert_allclose(session.wavelengths_nm, WAVELENGTHS_NM, atol=1e-3)
+    assert session.panel_reflectance_path == tmp_path / "panel.csv"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("wavelength_nm\n400\n500\n", "the list of 2 band centres does not fit its 12 bands"),
+        ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
+        ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+        ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+    ],
+)
+def test_band_centres_that_cannot_be_used(tmp_path, content, message):
+    write_session(tmp_path, info={**INFO, "band_centres": "bands.csv"})
+    (tmp_path / "bands.csv").write_text(content)
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    with pytest.raises(InputError, match=message):
+        open_session(tmp_path)
+
+
+def test_the_instruments_own_list_of_band_centres():
+    path = resources.files("hsi_sc_nerf.simulate") / "specim_iq_band_centres_nm.csv"
+    centres_nm = read_band_centres(Path(str(path)))
+    assert (len(centres_nm), centres_nm[0], centres_nm[-1]) == (204, 397.32, 1003.58)
+
+
+def test_no_wavelengths_anywhere(tmp_path):
+    write_session(tmp_path)
+    for header in tmp_path.rglob("*.hdr"):
+        without_wavelengths(header)
+    with pytest.raises(InputError, match=r"\.hdr: gives no wavelengths; .*'band_centres' in session\.json"):
+        open_session(tmp_path)
+
+
+def test_opening_reads_each_header_once_and_no_data(tmp_path, monkeypatch):
+    write_session(tmp_path)
+    read = []
+    monkeypatch.setattr(
+        spy, "read_envi_header", lambda file, real=spy.read_envi_header: read.append(file) or real(file)
+    )
+    monkeypatch.setattr(np, "memmap", None)
+    open_session(tmp_path)
+    assert sorted(read) == sorted(str(path) for path in tmp_path.rglob("*.hdr"))
+
+
+def test_session_info_round_trip(tmp_path):
+    path = tmp_path / "session.json"
+    path.write_text(json.dumps({**INFO, "nominal_step_deg": 10, "direction": "cw", "marker_dictionary": None}))
+    info = read_session_info(path)
+    assert (info.nominal_step_deg, info.direction, info.marker_dictionary) == (10, "cw", None)
+    assert info.container_height_m == 0.07
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "no JSON"),
+        ("[]", "no JSON object"),
+        ('{"marker_size": 1}', "does not know the key marker_size"),
+        ('{"marker_side_m": "2 cm"}', "marker_side_m is '2 cm'"),
+        ('{"marker_side_m": 0}', "positive number"),
+        ('{"marker_side_m": true}', "positive number"),
+        ('{"direction": "left"}', "ccw or cw"),
+        ('{"object": 3}', "must be a text"),
+        ('{"image_rotation_deg": 45}', "0, 90, 180 or 270 degrees"),
+        ('{"image_rotation_deg": false}', "0, 90, 180 or 270 degrees"),
+        ('{"band_centres": "absent.csv"}', "band_centres is 'absent.csv', but must be the name of a CSV file beside"),
+        ('{"panel_reflectance": "."}', "panel_reflectance is '.', but must be the name of a CSV file beside"),
+        ('{"panel_reflectance": 0.98}', "panel_reflectance is 0.98, but must be the name of a CSV file beside"),
+        ('{"container_height_m": 0.07}', "one dimension of the container"),
+    ],
+)
+def test_bad_session_info(tmp_path, text, message):
+    path = tmp_path / "session.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"session\.json.*{message}"):
+        read_session_info(path)

@@ -1,0 +1,314 @@
+"""Whole SPECIM IQ captures: metadata, whites of their own, finished reflectance, images on their side."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
+
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.specim_iq import read_metadata
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.processing.fingerprint import capture_files, session_files, shared_files
+
+XML = """<?xml version="1.0" encoding="UTF-8"?>
+<properties><metadata>
+  <key field="integration_time">{time}</key><key field="WR_mode">{mode}</key>
+  <key field="datetime">01 Jun 2024 10:00:00 +0000</key>
+</metadata></properties>
+"""
+COUNTS = np.full((SIZE_PX, SIZE_PX, BANDS), 500, np.uint16)
+SLAB = np.full((1, SIZE_PX, BANDS), 900, np.uint16)
+REFLECTANCE = np.full((SIZE_PX, SIZE_PX, BANDS), 0.4, np.float32)
+
+
+def write(header: Path, cube: np.ndarray, tint: float | None = None, **fields) -> None:
+    suffix = ".dat" if cube.dtype == np.float32 else ".raw"
+    extra = fields if tint is None else {"tint": tint, **fields}
+    write_cube(header, cube, wavelengths_nm=WAVELENGTHS_NM, data_suffix=suffix, extra_header=extra)
+
+
+def write_capture(
+    session: Path,
+    name: str,
+    *,
+    counts: bool = True,
+    white: bool = True,
+    white_dark: bool = True,
+    product: bool = True,
+    tints: tuple[float | None, float | None] = (10.0, 4.0),
+    xml: str | None = None,
+) -> None:
+    """``tints``: of the capture and of its white."""
+    capture = session / name / "capture"
+    if counts:
+        write(capture / f"{name}.hdr", COUNTS, tints[0])
+        write(capture / f"DARKREF_{name}.hdr", SLAB, tints[0])
+    if white:
+        write(capture / f"WHITEREF_{name}.hdr", SLAB, tints[1])
+    if white_dark:
+        write(capture / f"WHITEDARKREF_{name}.hdr", SLAB, tints[1])
+    if product:
+        write(session / name / "results" / f"REFLECTANCE_{name}.hdr", REFLECTANCE)
+    if xml is not None:
+        (session / name / "metadata").mkdir()
+        (session / name / "metadata" / f"{name}.xml").write_text(xml)
+
+
+def two(session: Path, **options) -> Path:
+    for name in ("444", "445"):
+        write_capture(session, name, **options)
+    return session
+
+
+def name_of(cube) -> str | None:
+    return None if cube is None else cube.header_path.stem
+
+
+def test_a_whole_capture(tmp_path):
+    session = open_session(two(tmp_path, xml=XML.format(time=10, mode="Custom")))
+    assert session.white is None
+    assert (session.has_counts, session.has_own_whites, session.has_products) == (True, True, True)
+    first = session.frames[0]
+    cubes = (first.cube, first.dark, first.white, first.white_dark, first.product)
+    assert [name_of(cube) for cube in cubes] == [
+        "444", "DARKREF_444", "WHITEREF_444", "WHITEDARKREF_444", "REFLECTANCE_444",
+    ]  # fmt: skip
+    assert first.has_counts
+    assert first.product.data_path.suffix == ".dat"
+    assert (first.integration_time_ms, first.white_integration_time_ms) == (10.0, 4.0)
+    assert (session.image_rotation_deg, session.quarter_turns) == (90, 3)
+
+
+def test_finished_reflectance_alone(tmp_path):
+    session = open_session(two(tmp_path, counts=False, white=False, white_dark=False))
+    assert (session.has_counts, session.has_own_whites, session.has_products) == (False, False, True)
+    first = session.frames[0]
+    assert first.cube is first.product
+    assert not first.has_counts
+    assert first.cubes == (first.product,)
+    np.testing.assert_array_equal(first.cube.read(), REFLECTANCE)
+
+
+def test_a_tarp_beside_frames_that_have_everything(tmp_path):
+    write_capture(two(tmp_path), "white_reference", tints=(2.5, None))
+    session = open_session(tmp_path)
+    assert session.white.integration_time_ms == 2.5
+    assert [frame.name for frame in session.frames] == ["444", "445"]
+
+
+def test_a_tarp_without_counts_is_no_white(tmp_path):
+    write_capture(two(tmp_path), "white_reference", counts=False, white=False, white_dark=False)
+    session = open_session(tmp_path)
+    assert session.white is None
+    assert len(session.frames) == 2
+
+
+@pytest.mark.parametrize(
+    ("mode", "options", "expected"),
+    [
+        ("Custom", {}, "WHITEDARKREF_444"),
+        ("Simultaneous", {}, "DARKREF_444"),
+        (" simultaneous ", {"white_dark": False}, "DARKREF_444"),
+        ("Custom", {"white_dark": False}, None),  # exposed otherwise, 4 ms: no dark fits
+        ("Custom", {"white_dark": False, "tints": (10.0, 10.0)}, "DARKREF_444"),
+    ],
+)
+def test_dark_of_the_white(tmp_path, mode, options, expected):
+    session = open_session(two(tmp_path, xml=XML.format(time=10, mode=mode), **options))
+    assert name_of(session.frames[0].white_dark) == expected
+
+
+def test_without_metadata_the_whites_own_dark_is_taken(tmp_path):
+    session = open_session(two(tmp_path))
+    assert name_of(session.frames[0].white_dark) == "WHITEDARKREF_444"
+    assert session.frames[0].metadata is None
+    assert session.quarter_turns == 0
+
+
+def test_integration_time_from_the_metadata_where_headers_have_none(tmp_path):
+    session = open_session(two(tmp_path, tints=(None, None), xml=XML.format(time="12.5", mode="Simultaneous")))
+    assert session.frames[0].integration_time_ms == 12.5
+    assert session.frames[0].white_integration_time_ms == 12.5
+
+
+def test_a_white_of_another_time_does_not_take_the_captures_time(tmp_path):
+    session = open_session(two(tmp_path, tints=(None, None), xml=XML.format(time="12.5", mode="Custom")))
+    assert session.frames[0].white_integration_time_ms is None
+
+
+def test_the_header_goes_before_the_metadata(tmp_path):
+    session = open_session(two(tmp_path, xml=XML.format(time=99, mode="Custom")))
+    assert session.frames[0].integration_time_ms == 10.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<p xmlns="http://x"><d><key field="integration_time">8</key></d></p>',
+        '<a:p xmlns:a="http://x"><a:key field="Integration Time" unit="ms"> 8.0 </a:key></a:p>',
+        "<p><integrationTime>8 ms</integrationTime></p>",
+        '<p><key name="INTEGRATION-TIME">8e0</key></p>',
+        '<p><key field="tint">8</key></p>',
+    ],
+)
+def test_spellings_of_the_integration_time(tmp_path, text):
+    (tmp_path / "a.xml").write_text(text)
+    assert read_metadata(tmp_path / "a.xml").integration_time_ms == 8.0
+
+
+def test_metadata_that_tell_nothing(tmp_path):
+    (tmp_path / "a.xml").write_text('<p><key field="integration_time"></key></p>')
+    metadata = read_metadata(tmp_path / "a.xml")
+    assert (metadata.integration_time_ms, metadata.white_mode, metadata.is_specim_iq) == (None, None, False)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no readable XML"),
+        ('<p><key field="integration_time">', "no readable XML"),
+        ('<?xml version="1.0" encoding="klingon"?><p/>', "no readable XML"),
+        ('<p><key field="integration_time">long</key></p>', "'long' is not a positive number of ms"),
+        ('<p><key field="integration_time">0</key></p>', "'0' is not a positive"),
+        ('<p><key field="integration_time">1.2.3</key></p>', "'1.2.3' is not a positive"),
+    ],
+)
+def test_broken_metadata(tmp_path, text, message):
+    (tmp_path / "a.xml").write_text(text)
+    with pytest.raises(InputError, match=rf"a\.xml: .*{message}"):
+        read_metadata(tmp_path / "a.xml")
+
+
+def test_broken_metadata_matter_only_where_something_in_them_is_needed(tmp_path):
+    two(tmp_path, white=False, white_dark=False, xml="<broken")
+    with pytest.raises(InputError, match=r"444\.xml: is no readable XML"):
+        open_session(tmp_path)
+    (tmp_path / "session.json").write_text('{"image_rotation_deg": 90}')
+    assert open_session(tmp_path).quarter_turns == 3
+
+
+@pytest.mark.parametrize(
+    ("xml", "fields", "rotation_deg"),
+    [
+        ('<p><key field="camera">SPECIM IQ</key></p>', {}, 90),
+        ('<p><device type="Specim_IQ"/></p>', {}, 90),
+        ('<p><key field="WR_mode">Custom</key></p>', {}, 90),
+        ('<p><key field="datacube_angle">90</key></p>', {}, 90),
+        ('<p><key field="sensor">simulated SPECIM IQ</key></p>', {}, 0),
+        ('<p><key field="camera">FX10</key></p>', {}, 0),
+        (None, {"sensor type": "SPECIM IQ"}, 90),
+        (None, {"description": "{Specim IQ capture}"}, 90),
+        (None, {"sensor type": "simulated SPECIM IQ"}, 0),
+        (None, {}, 0),
+    ],
+)
+def test_a_real_instrument_lies_on_its_side(tmp_path, xml, fields, rotation_deg):
+    two(tmp_path, xml=xml)
+    write(tmp_path / "444" / "capture" / "444.hdr", COUNTS, 10.0, **fields)
+    session = open_session(tmp_path)
+    assert session.image_rotation_deg == rotation_deg
+
+
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+def test_quarter_turns_set_upright(tmp_path, rotation_deg):
+    two(tmp_path, xml=XML.format(time=10, mode="Custom"))
+    (tmp_path / "session.json").write_text(json.dumps({"image_rotation_deg": rotation_deg}))
+    session = open_session(tmp_path)
+    upright = np.arange(6).reshape(2, 3)
+    lying = np.rot90(upright, rotation_deg // 90)
+    np.testing.assert_array_equal(np.rot90(lying, session.quarter_turns), upright)
+    assert 0 <= session.quarter_turns < 4
+
+
+def test_a_renamed_folder(tmp_path):
+    two(tmp_path, xml=XML.format(time=10, mode="Custom"))
+    (tmp_path / "444").rename(tmp_path / "apple_left")
+    session = open_session(tmp_path)
+    assert [frame.name for frame in session.frames] == ["445", "apple_left"]
+    assert name_of(session.frames[1].white) == "WHITEREF_444"
+    assert session.frames[1].metadata.path.name == "444.xml"
+
+
+def test_plain_folder_with_the_same_prefixes(tmp_path):
+    for name in ("a", "b"):
+        write(tmp_path / f"{name}.raw.hdr", COUNTS, 10.0)
+        (tmp_path / f"{name}.raw.raw").rename(tmp_path / f"{name}.raw")
+        for prefix in ("DARKREF", "WHITEREF", "WHITEDARKREF"):
+            write(tmp_path / f"{prefix}_{name}.hdr", SLAB, 10.0)
+        write(tmp_path / f"REFLECTANCE_{name}.hdr", REFLECTANCE)
+    write(tmp_path / "REFLECTANCE_c.hdr", REFLECTANCE)
+    session = open_session(tmp_path)
+    assert [frame.name for frame in session.frames] == ["a", "b", "c"]
+    assert [name_of(cube) for cube in session.frames[1].cubes] == [
+        "b.raw", "DARKREF_b", "WHITEREF_b", "WHITEDARKREF_b", "REFLECTANCE_b",
+    ]  # fmt: skip
+    assert [frame.has_counts for frame in session.frames] == [True, True, False]
+    assert (session.has_own_whites, session.has_products) == (False, True)
+
+
+def test_nothing_to_calibrate_with(tmp_path):
+    two(tmp_path, white=False, product=False)
+    with pytest.raises(InputError, match=r"no capture called white_reference; .*WHITEREF_NAME or REFLECTANCE_NAME"):
+        open_session(tmp_path)
+
+
+def test_one_frame_without_its_white(tmp_path):
+    two(tmp_path, product=False)
+    write_capture(tmp_path, "446", white=False, product=False)
+    with pytest.raises(InputError, match="no capture called white_reference"):
+        open_session(tmp_path)
+
+
+def test_a_frame_that_no_white_can_serve(tmp_path):
+    for name in ("1", "2", "white_reference"):
+        write_capture(tmp_path, name, white=False, product=False)
+    write_capture(tmp_path, "3", counts=False, white=False)
+    with pytest.raises(InputError, match=r"REFLECTANCE_3\.hdr: there are no raw counts of this frame"):
+        open_session(tmp_path)
+
+
+def test_a_product_of_another_size(tmp_path):
+    two(tmp_path)
+    write(tmp_path / "445" / "results" / "REFLECTANCE_445.hdr", REFLECTANCE[:-2])
+    with pytest.raises(InputError, match=r"REFLECTANCE_445\.hdr: its \(46, 48\) lines and samples"):
+        open_session(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data.write_bytes(data.read_bytes()[:-100]), r"WHITEREF_445\.raw: has \d+ bytes, fewer"),
+        (lambda data: data.write_bytes(b""), r"WHITEREF_445\.raw: has 0 bytes"),
+        (lambda data: data.unlink(), r"WHITEREF_445\.hdr: its data file .* is not beside it"),
+        (lambda data: data.with_suffix(".hdr").write_bytes(b"\x00" * 99), r"WHITEREF_445\.hdr: is no readable"),
+    ],
+)
+def test_damage_to_any_cube_stops_the_session(tmp_path, change, message):
+    two(tmp_path)
+    change(tmp_path / "445" / "capture" / "WHITEREF_445.raw")
+    with pytest.raises(InputError, match=message):
+        open_session(tmp_path)
+
+
+def test_fingerprint_covers_every_file_that_matters(tmp_path):
+    two(tmp_path, xml=XML.format(time=10, mode="Custom"))
+    write_capture(tmp_path, "white_reference", white=False, white_dark=False, product=False)
+    (tmp_path / "bands.csv").write_text("wavelength_nm\n" + "".join(f"{w}\n" for w in WAVELENGTHS_NM))
+    (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.98\n1000,0.97\n")
+    (tmp_path / "session.json").write_text('{"band_centres": "bands.csv", "panel_reflectance": "panel.csv"}')
+    session = open_session(tmp_path)
+    assert sorted(name for name, _, _ in capture_files(session, session.frames[0])) == sorted(
+        [f"444/capture/{prefix}444{suffix}" for prefix in ("", "DARKREF_", "WHITEREF_", "WHITEDARKREF_")
+         for suffix in (".hdr", ".raw")]
+        + ["444/results/REFLECTANCE_444.hdr", "444/results/REFLECTANCE_444.dat", "444/metadata/444.xml"]
+    )  # fmt: skip
+    shared = {name for name, _, _ in shared_files(session)}
+    assert {"session.json", "bands.csv", "panel.csv", "white_reference/capture/white_reference.raw"} <= shared
+    before = session_files(session)
+    (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.98\n1000,0.975\n")
+    assert session_files(session) != before

@@ -1,0 +1,131 @@
+"""The whole job through the real commands: a small demo, then a look at everything that it left behind."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.simulate.scores.processing import score_processing
+from hsi_sc_nerf.simulate.truth import load_truth
+
+pytestmark = pytest.mark.slow
+
+ITERATIONS = 400
+
+
+def command(*words):
+    return subprocess.run([sys.executable, "-m", "hsi_sc_nerf.cli.main", *words], capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo") / "out"
+    run = command("demo", "--output-dir", str(out), "--iterations", str(ITERATIONS), "--points", "20000")
+    logs = "\n".join(log.read_text()[-2000:] for log in (out / "logs").glob("*.log"))
+    assert run.returncode == 0, run.stderr + logs
+    return out
+
+
+def test_processing_recovers_poses_and_reflectance(demo):
+    dataset, truth = open_packed(demo / "data"), load_truth(demo / "session")
+    assert [frame.capture for frame in dataset.frames] == list(truth.captures)
+    score = score_processing(dataset, truth)
+    assert score.rotation_deg < 0.5
+    assert score.position_m < 0.001
+    assert score.focal_length_percent < 0.5
+    assert score.reflectance_rmse < 0.02
+    assert score.mask_iou > 0.95
+
+
+def test_training_explains_held_out_views_far_better_than_the_mean_spectrum(demo):
+    """A model that learned nothing of place, or shows its views the wrong way round, cannot pass."""
+    dataset = open_packed(demo / "data")
+    pixels = np.concatenate([frame.cube()[frame.mask()] / REFLECTANCE_SCALE for frame in dataset.frames])
+    constant_rmse = np.sqrt(np.mean((pixels - pixels.mean(axis=0)) ** 2))
+    metrics = json.loads((demo / "summary.json").read_text())["metrics"]
+    assert metrics["rmse"] < 0.6 * constant_rmse
+    assert metrics["psnr"] > 24
+    assert metrics["f_score"] > 40
+
+
+def test_eval_reports_masked_and_full_frame_metrics(demo):
+    results = json.loads((demo / "eval.json").read_text())["results"]
+    for name in ("sam", "rmse", "ssim", "psnr"):
+        for key in (name, f"{name}_std", f"full_{name}", f"full_{name}_std"):
+            assert np.isfinite(results[key])
+    assert results["rmse_pixel_mean"] <= results["rmse"]
+
+
+def test_both_stages_ran_and_the_first_left_its_checkpoint(demo):
+    run = demo / "runs" / "demo" / "hsi-sc-nerf" / "demo"
+    assert [p.name for p in (run / "nerfstudio_models").iterdir()] == [f"step-{ITERATIONS - 1:09d}.ckpt"]
+    assert len(list((run / "stage-full-frame").glob("*.ckpt"))) == 1
+
+
+def test_cloud_is_metric_and_carries_every_band(demo):
+    dataset = open_packed(demo / "data")
+    cloud = read_spectral_ply(demo / "point_cloud.ply")
+    assert cloud.spectra.shape == (len(cloud.points), 204)
+    np.testing.assert_allclose(cloud.wavelengths_nm, dataset.wavelengths_nm, atol=0.01)
+    low, high = dataset.object_box_m
+    assert ((cloud.points >= low - 1e-4) & (cloud.points <= high + 1e-4)).all()
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-3)
+    header = (demo / "point_cloud.ply").read_bytes()[:20_000].split(b"end_header")[0].decode()
+    assert "property float scalar_397.32nm" in header
+
+
+def test_cloud_spectra_are_the_objects(demo):
+    """The mean spectrum of the cloud is the object's, within a tenth: no background mixed in, no band swapped."""
+    dataset = open_packed(demo / "data")
+    cloud = read_spectral_ply(demo / "point_cloud.ply")
+    measured = np.mean([(f.cube()[f.mask()] / REFLECTANCE_SCALE).mean(axis=0) for f in dataset.frames], axis=0)
+    assert np.linalg.norm(cloud.spectra.mean(axis=0) - measured) < 0.1 * np.linalg.norm(measured)
+
+
+def test_summary_and_pictures(demo):
+    summary = json.loads((demo / "summary.json").read_text())
+    for name in ("sam", "rmse", "ssim", "psnr", "f_score"):
+        assert {name, f"{name}_std"} <= set(summary["metrics"])
+    steps = {step["name"]: step for step in summary["steps"]}
+    assert list(steps) == ["simulate", "process", "train", "evaluate", "export", "compare"]
+    assert all(step["seconds"] > 0 and step["peak_memory_mib"] > 10 for step in steps.values())
+    for name in ("views", "spectra", "poses", "cloud"):
+        assert cv2.imread(str(demo / f"{name}.png")).std() > 5
+
+
+def test_processing_again_changes_nothing(demo):
+    before = (demo / "data" / "transforms.json").stat().st_mtime_ns
+    run = command("process", str(demo / "session"), "--output-dir", str(demo / "data"))
+    assert run.returncode == 0
+    assert (demo / "data" / "transforms.json").stat().st_mtime_ns == before
+
+
+def test_bad_input_is_one_sentence_and_status_2(tmp_path):
+    run = command("process", str(tmp_path / "nowhere"), "--output-dir", str(tmp_path / "data"))
+    assert run.returncode == 2
+    assert "nowhere" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert not (tmp_path / "data").exists()
+
+
+def test_ns_train_on_bad_data_ends_in_one_sentence(tmp_path):
+    words = [
+        "hsi-sc-nerf",
+        "--data",
+        str(tmp_path / "nowhere"),
+        "--output-dir",
+        str(tmp_path),
+        "--vis",
+        "tensorboard",
+    ]
+    script = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
+    run = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True)
+    assert run.returncode != 0
+    assert "nowhere" in run.stderr.splitlines()[-1]
+    assert "Traceback" not in run.stderr

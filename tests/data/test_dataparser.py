@@ -1,0 +1,63 @@
+"""How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
+from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
+
+
+@pytest.mark.parametrize("num_frames", [2, 3, 8, 10, 36, 60])
+def test_frames_are_trained_on_or_held_out(num_frames):
+    train, held_out = split_frames(num_frames, 0.9)
+    assert sorted([*train, *held_out]) == list(range(num_frames))
+    assert len(held_out) == max(1, num_frames // 10)
+
+
+def test_held_out_frames_are_spread_evenly():
+    gaps = np.diff(split_frames(60, 0.9)[1])
+    assert gaps.min() >= 9
+    assert gaps.max() <= 11
+
+
+@pytest.mark.parametrize(
+    ("frames", "fraction", "told"), [(10, 1.0, "is 1.0"), (10, -0.1, "is -0.1"), (1, 0.5, "leaves 0")]
+)
+def test_a_split_without_training_or_held_out_frames_is_refused(frames, fraction, told):
+    with pytest.raises(InputError, match=f"--train-split-fraction.* {told}"):
+        split_frames(frames, fraction)
+
+
+def test_the_scene_fills_the_models_cube():
+    box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.1]])
+    centre, scale = scene_scaling(box)
+    np.testing.assert_allclose((box - centre) * scale, [[-1, -1, -0.25], [1, 1, 0.25]])
+
+
+def held_out(data) -> SpectralDataset:
+    return SpectralDataset(SpectralDataParserConfig(data=data).setup().get_dataparser_outputs("test"))
+
+
+def test_a_held_out_view_holds_its_reflectance(tiny_dataset):
+    dataset = held_out(tiny_dataset[0])
+    item = dataset[0]
+    assert not dataset.has_flagged
+    assert "valid" not in item
+    counts = dataset.frames[0].cube()
+    torch.testing.assert_close(item["spectral"], torch.from_numpy(counts / np.float32(REFLECTANCE_SCALE)))
+    np.testing.assert_array_equal(item["mask"][..., 0], dataset.frames[0].mask())
+
+
+def test_a_held_out_view_tells_what_was_not_measured(flagged_dataset):
+    dataset = held_out(flagged_dataset)
+    item = dataset[0]
+    counts = np.asarray(dataset.frames[0].cube())
+    np.testing.assert_array_equal(item["valid"], counts != FLAGGED)
+    assert not item["valid"].all()
+    expected = np.where(counts == FLAGGED, 0, counts) / np.float32(REFLECTANCE_SCALE)
+    torch.testing.assert_close(item["spectral"], torch.from_numpy(expected))

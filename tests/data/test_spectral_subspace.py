@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.data.spectral_subspace import (
+    estimate_noise,
+    find_subspace,
+    pixel_noise,
+    sample_training_spectra,
+)
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import FLAGGED, pack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+
+BANDS = 60
+MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
+
+
+def noise_free(count: int, rank: int) -> np.ndarray:
+    """Shaded mixtures of ``rank`` smooth spectra."""
+    rng = np.random.default_rng(1)
+    x = np.linspace(0.0, 1.0, BANDS)
+    centres = np.linspace(0.1, 0.9, rank)[:, None]
+    shapes = 0.1 + np.exp(-0.5 * ((x - centres) / 0.12) ** 2)
+    return rng.dirichlet(np.ones(rank), count) * rng.uniform(0.2, 0.9, (count, 1)) @ shapes
+
+
+def uneven_noise(spectra: np.ndarray) -> np.ndarray:
+    """Photon noise, ten times larger in the outermost bands."""
+    x = np.linspace(0.0, 1.0, BANDS)
+    return 2e-3 * (1.0 + 9.0 * np.exp(-x / 0.05) + 9.0 * np.exp((x - 1.0) / 0.05)) * np.sqrt(0.05 + spectra)
+
+
+def noisy(count: int, rank: int, times: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spectra without and with noise, and its standard deviation."""
+    true = noise_free(count, rank)
+    deviation = times * uneven_noise(true)
+    return true, true + deviation * np.random.default_rng(2).standard_normal(true.shape), deviation
+
+
+@pytest.mark.parametrize("rank", [1, 3, 6])
+@pytest.mark.parametrize("known", [True, False])
+def test_the_rank_is_found_in_noise(rank, known):
+    true, spectra, deviation = noisy(1500, rank)
+    subspace = find_subspace(spectra, deviation if known else None)
+    # The estimate is one a band, and bright spectra, noisier than dark ones, may seem to have a direction more.
+    assert rank <= subspace.rank_above_noise <= rank + (not known)
+    assert subspace.noise_estimated is not known
+    off = true - true @ subspace.basis @ subspace.basis.T
+    assert np.sqrt(np.mean(off**2)) < 0.15 * subspace.noise_rmse
+
+
+def test_noise_alone_has_no_rank():
+    deviation = uneven_noise(np.full((400, BANDS), 0.3))
+    noise = deviation * np.random.default_rng(3).standard_normal(deviation.shape)
+    assert find_subspace(noise, deviation).rank_above_noise == 0
+
+
+def test_the_basis_is_orthonormal_and_keeps_squared_errors():
+    _, spectra, deviation = noisy(1500, 4)
+    subspace = find_subspace(spectra, deviation)
+    np.testing.assert_allclose(subspace.basis.T @ subspace.basis, np.eye(4), atol=1e-12)
+    coefficients = spectra @ np.linalg.pinv(subspace.scaled_basis).T
+    np.testing.assert_allclose(np.sqrt(np.mean(coefficients**2, axis=0)), subspace.coefficient_rms)
+    projected = coefficients @ subspace.scaled_basis.T
+    np.testing.assert_allclose((projected**2).mean(axis=1), (coefficients**2).sum(axis=1))
+    np.testing.assert_allclose(coefficients.mean(axis=0), subspace.mean_coefficients, atol=1e-12)
+    assert (subspace.mean_coefficients > 0).all()
+    assert 0.1 < subspace.coefficient_rms[0] < 1.0
+    assert (np.diff(subspace.coefficient_rms) < 0).all()
+
+
+def test_what_a_rank_costs_is_told_from_the_noise():
+    true, spectra, deviation = noisy(4000, 5, times=8.0)
+    for rank in (3, 4):
+        subspace = find_subspace(spectra, deviation, rank=rank)
+        assert subspace.basis.shape == (BANDS, rank)
+        projected = true @ subspace.basis @ subspace.basis.T
+        lost = np.sqrt(np.mean((true - projected) ** 2))
+        assert subspace.excess_rmse == pytest.approx(lost, rel=0.03)
+        cosine = (
+            np.einsum("nb,nb->n", true, projected) / np.linalg.norm(true, axis=1) / np.linalg.norm(projected, axis=1)
+        )
+        angle = np.sqrt(np.mean(np.arccos(cosine) ** 2))
+        assert subspace.excess_sam_rad == pytest.approx(angle, rel=0.05)
+        assert subspace.projection_rmse > 1.1 * subspace.excess_rmse
+    assert find_subspace(spectra, deviation).excess_rmse < 0.1 * subspace.noise_rmse
+
+
+def test_the_most_directions_are_bounded():
+    _, spectra, deviation = noisy(1500, 5)
+    subspace = find_subspace(spectra, deviation, max_rank=2)
+    assert subspace.basis.shape[1] == 2
+    assert subspace.rank_above_noise == 5
+    assert find_subspace(spectra[:, :5]).basis.shape[1] <= 5
+    for rank in (0, BANDS + 1):
+        with pytest.raises(InputError, match=f"not {rank};"):
+            find_subspace(spectra, deviation, rank=rank)
+
+
+def test_noise_is_estimated_from_the_spectra():
+    _, spectra, deviation = noisy(3000, 5)
+    np.testing.assert_allclose(estimate_noise(spectra), np.sqrt(np.mean(deviation**2, axis=0)), rtol=0.1)
+
+
+def test_flagged_values_take_their_spectra_out():
+    _, spectra, deviation = noisy(1500, 3)
+    valid = np.random.default_rng(4).random(spectra.shape) > 2e-3
+    spoilt = np.where(valid, spectra, 0.0)
+    whole = valid.all(axis=1)
+    subspace = find_subspace(spoilt, deviation, valid)
+    np.testing.assert_array_equal(subspace.basis, find_subspace(spectra[whole], deviation[whole]).basis)
+    valid[50:, 0] = False
+    with pytest.raises(InputError, match=r"free of flagged values.*--pipeline\.model\.head direct"):
+        find_subspace(spoilt, deviation, valid)
+
+
+def test_pixel_noise_has_no_share_that_all_pixels_have_in_common():
+    uncertainty = ReflectanceUncertainty(np.full(2, 1e-6), np.array([0.0, 3e-6]), np.full(2, 1.0))
+    noise = pixel_noise(uncertainty, np.array([[1.0, 1.0], [-0.1, -0.1]]))
+    np.testing.assert_allclose(noise, [[1e-3, 2e-3], [1e-3, 1e-3]], rtol=1e-3)
+
+
+def test_spectra_of_a_packed_dataset_are_sampled(tmp_path):
+    rng = np.random.default_rng(5)
+    frames = []
+    for i in range(2):
+        mask = np.zeros((6, 5), np.uint8)
+        mask[2:4, 1:3] = 255
+        cube = rng.uniform(0.3, 0.4, (6, 5, 3)) + 0.5 * (mask[..., None] > 0)
+        counts = pack(cube)
+        counts[0, 0, 1] = FLAGGED
+        write_packed_cube(tmp_path / f"{i}.hdr", counts, np.arange(3.0) + 400.0)
+        cv2.imwrite(str(tmp_path / f"{i}.png"), mask)
+        paths = dict.fromkeys(("image_path", "mask_path", "flags_path"), tmp_path / f"{i}.png")
+        frames.append(
+            PackedFrame(
+                "",
+                **paths,
+                cube_path=tmp_path / f"{i}.hdr",
+                angle_deg=0.0,
+                reprojection_error_px=None,
+                camera_to_world=np.eye(4),
+            )
+        )
+    spectra, valid = sample_training_spectra(frames, 400, foreground_share=0.25, seed=1)
+    assert spectra.shape == valid.shape == (400, 3)
+    assert (spectra[:, 0] > 0.75).sum() == 100
+    assert 0 < (~valid).sum() == (spectra == 0).sum()
+    np.testing.assert_array_equal(sample_training_spectra(frames, 400, 0.25, 1)[0], spectra)
+
+
+def test_noise_of_a_real_kernel_is_the_detectors_where_it_is_dark():
+    kernel, dark, white = (
+        open_cube(MAIZE / f"{name}.hdr").memmap().astype(float)
+        for name in ("4-22-22_right_same_B73_top_00", "dark_reference_crop", "white_reference_crop")
+    )
+    level, read_noise = dark.mean(axis=(0, 1)), dark.std(axis=0, ddof=1).mean(axis=0)
+    gain = 1.0 / (white.mean(axis=(0, 1)) - level)
+    spectra = ((kernel - level) * gain).reshape(-1, kernel.shape[2])
+    ratio = estimate_noise(spectra) / (read_noise * gain)
+    np.testing.assert_allclose(ratio[:15], 1.0, atol=0.1)  # hardly any light there
+    assert ratio[150:450].min() > 1.5  # where there is, it adds its own
+    assert find_subspace(spectra[:, 40:540], rank=12).excess_rmse < 2e-3

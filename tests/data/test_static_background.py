@@ -1,0 +1,294 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.data.static_background import (
+    BackgroundImageConfig,
+    estimate_static_background,
+    evenly_spread,
+    fill_in,
+    median_over_frames,
+    pixel_of_cells,
+    quieten,
+    turning_outline,
+    turning_solids,
+)
+from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack, unpack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, open_packed
+
+LENS = PinholeIntrinsics(48, 40, 70.0, 70.0, 24.0, 20.0)
+FIRST_POSE = look_at([0.5, 0.0, 0.35], [0.0, 0.0, 0.05])
+BANDS = 3
+
+
+def wall(lens=LENS, bands=BANDS):
+    """A linear ramp across the image, another one a band: bilinear look-up and Laplace's equation keep it exactly."""
+    y, x = np.mgrid[: lens.h, : lens.w] + 0.5
+    return 0.3 + 0.3 * (x / lens.w)[..., None] + 0.02 * (y / lens.h)[..., None] * np.arange(bands)
+
+
+def turning_block(k, lens=LENS):
+    """A blob that goes to and fro before the wall, half its width to each side."""
+    mask = np.zeros((lens.h, lens.w), bool)
+    left = lens.w // 2 - 4 + 4 * (k % 2)
+    mask[: lens.h // 3, left : left + 6] = True
+    return mask
+
+
+def write_dataset(root, cubes, masks, lens=LENS, container=None):
+    frames = []
+    for k, (cube, mask) in enumerate(zip(cubes, masks, strict=True)):
+        frame = PackedFrame(
+            capture=f"f{k}",
+            image_path=root / f"{k}.png",
+            mask_path=root / f"mask{k}.png",
+            cube_path=root / f"{k}.hdr",
+            flags_path=root / f"flags{k}.png",
+            angle_deg=30.0 * k,
+            reprojection_error_px=None,
+            camera_to_world=turntable_camera_to_world(FIRST_POSE, 30.0 * k),
+        )
+        write_packed_cube(frame.cube_path, cube, np.linspace(400, 1000, cube.shape[-1]))
+        write_png(frame.mask_path, mask.astype(np.uint8) * 255)
+        frames.append(frame)
+    return PackedDataset(
+        root=root,
+        intrinsics=lens,
+        distortion=np.zeros(4),
+        wavelengths_nm=np.linspace(400, 1000, cubes[0].shape[-1]),
+        pseudo_rgb_nm=np.zeros(3),
+        object_name="block",
+        scene_box_m=np.array([[-0.09, -0.09, -0.005], [0.09, 0.09, 0.2]]),
+        object_box_m=np.array([[-0.03, -0.03, 0.03], [0.03, 0.03, 0.2]]),
+        background_reflectance=np.full(cubes[0].shape[-1], 0.77),
+        container=container,
+        frames=tuple(frames),
+    )
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Eight frames of the ramp with a black block before it and a turntable that changes from frame to frame."""
+    rng = np.random.default_rng(0)
+    masks = [turning_block(k) for k in range(8)]
+    dataset = write_dataset(tmp_path, [pack(wall())] * 8, masks)
+    cubes = []
+    for frame, mask in zip(dataset.frames, masks, strict=True):
+        cube = wall()
+        cube[mask] = 0.0
+        table = turning_outline(turning_solids(dataset), frame.camera_to_world, LENS, np.zeros(4))
+        cube[table] = rng.random((table.sum(), BANDS))
+        cubes.append(pack(cube))
+    return write_dataset(tmp_path, cubes, masks)
+
+
+def test_the_wall_is_found_and_its_hidden_part_filled_in(session):
+    found = estimate_static_background(session, session.frames)
+    assert found.image.dtype == np.float32
+    assert found.cell_px == 1
+    known = found.coverage > 0
+    assert 0.4 < known.mean() < 0.9
+    np.testing.assert_allclose(found.image[known], wall()[known], atol=1.1 / REFLECTANCE_SCALE)
+    for left, coverage in ((20, 0.5), (24, 0.0), (28, 0.5), (40, 1.0)):
+        np.testing.assert_array_equal(found.coverage[4, left : left + 2], coverage)
+    # The block's hidden core lies between walls, what the turntable hides goes on to the image's border.
+    assert np.abs(found.image - wall())[:10].max() < 0.02
+    assert 0.3 - 0.05 < found.image.min() < found.image.max() < 0.65 + 0.05
+
+
+def test_what_few_frames_show_is_filled_in(session):
+    few = BackgroundImageConfig(least_share=0.6)
+    np.testing.assert_array_equal(
+        estimate_static_background(session, session.frames, few).coverage[4, [20, 24, 28, 40]], [0, 0, 0, 1]
+    )
+
+
+def test_flagged_values_count_nowhere(session):
+    cubes = [np.array(frame.cube()) for frame in session.frames]
+    for k, cube in enumerate(cubes):
+        cube[:25, 10, 1] = FLAGGED
+        cube[:25, 4, 2] = FLAGGED if k < 5 else cube[:25, 4, 2]
+    dataset = write_dataset(session.root, cubes, [frame.mask() for frame in session.frames])
+    found = estimate_static_background(dataset, dataset.frames).image
+    np.testing.assert_allclose(found[:20, :15], wall()[:20, :15], atol=2e-4)
+
+
+def test_a_band_measured_nowhere_takes_the_given_spectrum(session):
+    cubes = [np.array(frame.cube()) for frame in session.frames]
+    for cube in cubes:
+        cube[..., 2] = FLAGGED
+    dataset = write_dataset(session.root, cubes, [frame.mask() for frame in session.frames])
+    found = estimate_static_background(dataset, dataset.frames).image
+    np.testing.assert_array_equal(found[..., 2], np.float32(0.77))
+    assert (found[..., :2] < 0.7).all()
+
+
+@pytest.mark.parametrize("most_cells", [48, 24, 10])
+def test_cells_of_several_pixels(tmp_path, most_cells):
+    """The median over frames of other pixels of the cell is the cell's middle on a ramp."""
+    empty = np.zeros((LENS.h, LENS.w), bool)
+    dataset = write_dataset(tmp_path, [pack(wall())] * 12, [empty] * 12)
+    found = estimate_static_background(dataset, dataset.frames, BackgroundImageConfig(most_cells=most_cells))
+    size = found.cell_px
+    assert size == -(-48 // most_cells)
+    assert found.image.shape == (-(-LENS.h // size), -(-LENS.w // size), BANDS)
+    y, x = (
+        np.minimum(size * np.arange(n) + size / 2, side)
+        for n, side in zip(found.image.shape[:2], (LENS.h, LENS.w), strict=True)
+    )
+    middle = 0.3 + 0.3 * (x / LENS.w)[None, :, None] + 0.02 * (y / LENS.h)[:, None, None] * np.arange(BANDS)
+    known = found.coverage > 0
+    assert np.abs(found.image - middle)[known].max() < 0.7 * 0.3 * max(size / LENS.w, 1e-3)
+    assert abs((found.image - middle)[known].mean()) < 0.2 * 0.3 * size / LENS.w + 1e-4
+
+
+def test_reads_no_more_frames_than_told(session):
+    for frame in session.frames[1::2]:
+        frame.mask_path.unlink()
+    chosen = [session.frames[i] for i in (1, 0, 3, 2, 5, 4, 7, 6)]
+    estimate_static_background(session, chosen, BackgroundImageConfig(most_frames=4))
+
+
+def test_evenly_spread():
+    np.testing.assert_array_equal(evenly_spread(60, 4), [7, 22, 37, 52])
+    np.testing.assert_array_equal(evenly_spread(3, 12), [0, 1, 2])
+
+
+def test_pixels_of_cells_fill_the_cells():
+    seen = np.zeros((10, 9), int)
+    for turn in range(16):
+        y, x = pixel_of_cells(10, 9, 4, turn)
+        np.testing.assert_array_equal([y // 4, x // 4], [[0, 1, 2], [0, 1, 2]])
+        seen[np.ix_(y, x)] += 1
+    assert (seen[:8, :8] > 0).mean() > 0.7
+    assert seen.max() <= 12
+
+
+def test_outline_of_the_turntable_is_where_rays_meet_it(tmp_path):
+    lens = PinholeIntrinsics(160, 120, 220.0, 230.0, 78.0, 63.0)
+    empty = np.zeros((lens.h, lens.w), bool)
+    container = Container(0.06, 0.05)
+    dataset = write_dataset(tmp_path, [np.zeros((lens.h, lens.w, 1), np.uint16)], [empty], lens, container)
+    pose = dataset.frames[0].camera_to_world
+    outline = turning_outline(turning_solids(dataset), pose, lens, dataset.distortion)
+    y, x = np.mgrid[: lens.h, : lens.w] + 0.5
+    origin, directions = pixel_rays(lens, pose, np.stack([x, y], -1))
+    steps = np.linspace(0.35, 0.8, 450)
+    met = np.zeros_like(outline)
+    for t in steps:
+        p = origin + t * directions
+        radius = np.hypot(p[..., 0], p[..., 1])
+        met |= (radius < 0.09) & (p[..., 2] > -0.005) & (p[..., 2] < 0.0)
+        met |= (radius < 0.03 / np.cos(np.pi / 6)) & (p[..., 2] > 0.0) & (p[..., 2] < 0.05)
+    assert 0.1 < met.mean() < 0.9
+    assert not (met & ~dilate(outline, 5)).any()
+    assert not (outline & ~dilate(met, 5)).any()
+
+
+def test_all_under_the_object_turns_where_the_container_is_not_known(tmp_path):
+    dataset = write_dataset(tmp_path, [np.zeros((LENS.h, LENS.w, 1), np.uint16)], [np.zeros((LENS.h, LENS.w), bool)])
+    (rims,) = turning_solids(dataset)
+    np.testing.assert_allclose(np.hypot(rims[:, 0], rims[:, 1]), 0.09)
+    np.testing.assert_allclose([rims[:, 2].min(), rims[:, 2].max()], [-0.005, 0.03])
+
+
+def test_lens_distortion_moves_the_outline(tmp_path):
+    dataset = write_dataset(tmp_path, [np.zeros((LENS.h, LENS.w, 1), np.uint16)], [np.zeros((LENS.h, LENS.w), bool)])
+    pose = dataset.frames[0].camera_to_world
+    plain = turning_outline(turning_solids(dataset), pose, LENS, np.zeros(4))
+    barrel = turning_outline(turning_solids(dataset), pose, LENS, np.array([-0.8, 0.0, 0.0, 0.0]))
+    assert barrel.sum() < 0.97 * plain.sum()
+
+
+def test_median_over_frames_agrees_with_numpy():
+    rng = np.random.default_rng(1)
+    counts = rng.integers(0, 50_000, (9, 40, 4), dtype=np.uint16)
+    counts[rng.random(counts.shape) < 0.3] = FLAGGED
+    free = rng.random((9, 40)) < 0.7
+    median, variance = median_over_frames(counts, free, least=2)
+    for cell in range(40):
+        for band in range(4):
+            value = counts[free[:, cell], cell, band]
+            value = value[value != FLAGGED] / REFLECTANCE_SCALE
+            if len(value) < 2:
+                assert np.isnan([median[cell, band], variance[cell, band]]).all()
+                continue
+            assert median[cell, band] == pytest.approx(np.median(value), rel=1e-5)
+            mad = np.median(np.abs(value - np.median(value)))
+            assert variance[cell, band] == pytest.approx(np.pi / 2 * (1.4826 * mad) ** 2 / len(value), rel=1e-4)
+    assert np.isnan(median).any()
+
+
+def test_variance_of_the_median_is_what_noise_gives_it():
+    rng = np.random.default_rng(2)
+    counts = pack(0.5 + 0.02 * rng.standard_normal((12, 20_000, 1)))
+    median, variance = median_over_frames(counts, np.ones((12, 20_000), bool), least=1)
+    assert variance.mean() == pytest.approx(median.var(), rel=0.15)
+
+
+def test_quieten_averages_noise_and_keeps_edges():
+    rng = np.random.default_rng(3)
+    clean = np.full((60, 60, 2), 0.4)
+    clean[:, 30:] = 0.8
+    noisy = (clean + 0.01 * rng.standard_normal(clean.shape)).astype(np.float32)
+    quiet = quieten(noisy, np.full(clean.shape, 1e-4, np.float32), 5)
+    far = np.abs(np.arange(60) - 29.5) > 4
+    assert np.sqrt(np.mean((quiet - clean)[:, far] ** 2)) < 0.35 * 0.01
+    assert np.abs(quiet - clean)[:, ~far].max() < 0.05
+
+
+def test_quieten_leaves_a_picture_without_noise_and_what_is_not_measured():
+    rng = np.random.default_rng(4)
+    image = rng.random((20, 20, 2)).astype(np.float32)
+    image[5:9, 5:9, 0] = np.nan
+    np.testing.assert_allclose(quieten(image, np.zeros_like(image), 5), image, atol=1e-6)
+    lonely = np.full((9, 9, 1), np.nan, np.float32)
+    lonely[4, 4] = 0.25
+    np.testing.assert_allclose(quieten(lonely, np.ones_like(lonely), 3), lonely, atol=1e-6)
+
+
+def test_quieten_does_not_mix_bands():
+    image = np.zeros((12, 12, 3), np.float32)
+    image[..., 1] = 1.0
+    quiet = quieten(image, np.full_like(image, 0.01), 5)
+    np.testing.assert_allclose(quiet, image, atol=1e-6)
+
+
+def test_fill_in_keeps_a_ramp_and_every_filled_cell_is_its_neighbours_mean():
+    y, x = np.mgrid[:20, :24]
+    ramp = np.stack([x + 2.0 * y, np.ones_like(x, float), -0.5 * x], -1)
+    image = ramp.copy()
+    image[5:15, 6:18] = np.nan
+    image[2, 3, 1] = np.nan
+    np.testing.assert_allclose(fill_in(image, np.zeros(3)), ramp, rtol=1e-5, atol=1e-5)
+
+    rng = np.random.default_rng(5)
+    image = rng.random((12, 10, 1))
+    hidden = rng.random((12, 10)) < 0.5
+    image[hidden] = np.nan
+    filled = fill_in(image, np.zeros(1))[..., 0]
+    np.testing.assert_allclose(filled[~hidden], image[~hidden, 0], rtol=1e-6)
+    for i, j in np.argwhere(hidden):
+        near = [(i + a, j + b) for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0)) if 0 <= i + a < 12 and 0 <= j + b < 10]
+        assert filled[i, j] == pytest.approx(np.mean([filled[place] for place in near]), abs=1e-5)
+
+
+def test_fill_in_without_anything_measured():
+    filled = fill_in(np.full((4, 5, 2), np.nan, np.float32), np.array([0.1, 0.9]))
+    np.testing.assert_allclose(filled, np.broadcast_to([0.1, 0.9], (4, 5, 2)))
+
+
+def test_held_out_frames_see_the_same_chamber(tiny_dataset):
+    dataset = open_packed(tiny_dataset[0])
+    held_out = dataset.frames[4]
+    found = estimate_static_background(dataset, [frame for frame in dataset.frames if frame is not held_out])
+    reflectance, _ = unpack(np.array(held_out.cube()))
+    solids = turning_solids(dataset)
+    outline = turning_outline(solids, held_out.camera_to_world, dataset.intrinsics, dataset.distortion)
+    static = ~dilate(held_out.mask() | outline, 3)
+    assert 0.3 < static.mean() < 0.9
+    assert np.sqrt(np.mean((found.image - reflectance)[static] ** 2)) < 1e-3

@@ -1,0 +1,320 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hsi_sc_nerf.evaluation import spectral_metrics as metrics
+
+H, W, BANDS = 17, 23, 5
+IMAGE_METRICS = [
+    metrics.spectral_angle_mapper,
+    metrics.spectral_rmse,
+    metrics.pixel_mean_rmse,
+    metrics.ssim,
+    metrics.windowed_ssim,
+    metrics.psnr,
+]
+
+
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    target = torch.rand(H, W, BANDS, generator=generator) * torch.linspace(0.2, 1.0, BANDS)
+    return (target + 0.1 * torch.randn(H, W, BANDS, generator=generator)).clamp(0, 1), target
+
+
+def blob() -> torch.Tensor:
+    rows, columns = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    return (rows - 3) ** 2 + (columns - 9) ** 2 < 40
+
+
+MASKS = pytest.mark.parametrize("mask", [None, blob()], ids=["full", "masked"])
+
+
+def pixels(image: torch.Tensor, mask: torch.Tensor | None) -> np.ndarray:
+    return image.double().numpy()[np.ones((H, W), bool) if mask is None else mask.numpy()]
+
+
+@MASKS
+def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    p, t = pixels(predicted, mask), pixels(target, mask)
+    angles = [math.acos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) for a, b in zip(p, t, strict=True)]
+    mse = np.mean([np.sum((a - b) ** 2) / BANDS for a, b in zip(p, t, strict=True)])
+    roots = [math.sqrt(np.sum((a - b) ** 2) / BANDS) for a, b in zip(p, t, strict=True)]
+    similarity, ratio = [], []
+    for band in range(BANDS):
+        x, y = p[:, band], t[:, band]
+        covariance = np.mean((x - x.mean()) * (y - y.mean()))
+        similarity.append(
+            (2 * x.mean() * y.mean() + 1e-4)
+            * (2 * covariance + 9e-4)
+            / ((x.mean() ** 2 + y.mean() ** 2 + 1e-4) * (x.var() + y.var() + 9e-4))
+        )
+        ratio.append(10 * math.log10(1 / (np.mean((x - y) ** 2) + 1e-10)))
+    found = metrics.spectral_metrics(predicted, target, mask)
+    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
+    assert found["rmse"] == pytest.approx(math.sqrt(mse), rel=1e-5)
+    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
+    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
+    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
+    assert found["rmse_pixel_mean"] < found["rmse"]
+
+
+@MASKS
+def test_windowed_ssim_is_wangs(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    x, y = predicted.double().numpy(), target.double().numpy()
+    by_band = []
+    for band in range(BANDS):
+        scores = []
+        for row in range(H):
+            for column in range(W):
+                if mask is not None and not mask[row, column]:
+                    continue
+                rows = np.arange(max(0, row - 5), min(H, row + 6))
+                columns = np.arange(max(0, column - 5), min(W, column + 6))
+                weights = np.exp(-((rows[:, None] - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
+                weights /= weights.sum()
+                a, b = x[rows[:, None], columns, band], y[rows[:, None], columns, band]
+                mean_a, mean_b = np.sum(weights * a), np.sum(weights * b)
+                variance_a, variance_b = np.sum(weights * (a - mean_a) ** 2), np.sum(weights * (b - mean_b) ** 2)
+                covariance = np.sum(weights * (a - mean_a) * (b - mean_b))
+                scores.append(
+                    (2 * mean_a * mean_b + 1e-4)
+                    * (2 * covariance + 9e-4)
+                    / ((mean_a**2 + mean_b**2 + 1e-4) * (variance_a + variance_b + 9e-4))
+                )
+        by_band.append(np.mean(scores))
+    found = metrics.per_band_windowed_ssim(predicted, target, mask)
+    np.testing.assert_allclose(found.numpy(), by_band, rtol=1e-5)
+    assert metrics.windowed_ssim(predicted, target, mask).item() == pytest.approx(np.mean(by_band), rel=1e-5)
+
+
+def test_closed_forms() -> None:
+    target = torch.full((H, W, BANDS), 0.5)
+    found = metrics.spectral_metrics(target + 0.1, target)
+    assert found["sam"] == pytest.approx(0, abs=1e-7)
+    assert found["rmse"] == pytest.approx(0.1, rel=1e-6)
+    assert found["rmse_pixel_mean"] == pytest.approx(0.1, rel=1e-6)
+    assert found["psnr"] == pytest.approx(20, rel=1e-6)
+    assert found["ssim"] == pytest.approx((2 * 0.6 * 0.5 + 1e-4) / (0.36 + 0.25 + 1e-4), rel=1e-6)
+    assert found["ssim_windowed"] == pytest.approx(found["ssim"], rel=1e-6)
+
+
+def test_known_angle_of_every_pixel() -> None:
+    target = torch.zeros(H, W, 2)
+    target[..., 0] = 0.7
+    angle = 1e-6
+    predicted = 0.3 * torch.stack([torch.full((H, W), math.cos(angle)), torch.full((H, W), math.sin(angle))], -1)
+    assert metrics.spectral_angle_mapper(predicted, target).item() == pytest.approx(angle, rel=1e-3)
+    assert metrics.spectral_angle_mapper(predicted, torch.zeros_like(target)).item() == pytest.approx(math.pi / 2)
+
+
+def test_psnr_is_a_mean_over_bands_of_decibels() -> None:
+    target = torch.zeros(4, 4, 2)
+    predicted = torch.tensor([0.1, 0.01]).expand(4, 4, 2)
+    torch.testing.assert_close(
+        metrics.per_band_psnr(predicted, target), torch.tensor([20.0, 40.0]), rtol=1e-4, atol=0
+    )
+    assert metrics.psnr(predicted, target).item() == pytest.approx(30, rel=1e-4)
+
+
+def test_ssim_of_the_whole_mask_ignores_where_pixels_lie_and_the_windowed_one_does_not() -> None:
+    predicted, target = pair()
+    order = torch.randperm(H * W, generator=torch.Generator().manual_seed(0))
+    shuffled = [image.reshape(-1, BANDS)[order].reshape(H, W, BANDS) for image in (predicted, target)]
+    assert metrics.ssim(*shuffled).item() == pytest.approx(metrics.ssim(predicted, target).item(), rel=1e-6)
+    assert metrics.windowed_ssim(*shuffled).item() != pytest.approx(
+        metrics.windowed_ssim(predicted, target).item(), rel=1e-4
+    )
+
+
+@MASKS
+def test_identical_images_score_full_marks(mask: torch.Tensor | None) -> None:
+    target = pair()[1]
+    found = metrics.spectral_metrics(target, target, mask)
+    assert found == pytest.approx(
+        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}, abs=1e-6
+    )
+
+
+def test_an_empty_mask_scores_like_identical_images() -> None:
+    predicted, target = pair()
+    assert metrics.spectral_metrics(predicted, target, torch.zeros(H, W, dtype=torch.bool)) == pytest.approx(
+        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
+    )
+
+
+def test_variance_survives_a_large_offset_in_float32() -> None:
+    generator = torch.Generator().manual_seed(0)
+    detail = torch.randint(0, 4, (64, 64, 1), generator=generator) / 8192.0
+    flat = (1000.0 + detail).double()
+    contrast = metrics.ssim((1000.0 + detail).float(), (1000.0 - detail).float())
+    variance = flat.var(unbiased=False).item()
+    assert contrast.item() == pytest.approx((9e-4 - 2 * variance) / (9e-4 + 2 * variance), rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 6e4, 1e30, 3e38])
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_metrics_are_finite(metric, scale: float, dtype: torch.dtype) -> None:
+    predicted, target = pair()
+    predicted[..., 1] = 0
+    target[..., 1] = 0
+    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype)
+    mask = blob()
+    for against in (target.to(dtype), predicted, torch.zeros_like(predicted)):
+        value = metric(predicted, against, mask)
+        assert torch.isfinite(value)
+        assert value.dtype == torch.float32
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_blocks_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted, target = pair()
+    whole = metric(predicted, target, blob())
+    monkeypatch.setattr(metrics, "_BLOCK_VALUES", 2 * H * W)
+    torch.testing.assert_close(metric(predicted, target, blob()), whole, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_images_and_masks_that_do_not_fit_are_refused(metric) -> None:
+    predicted, target = pair()
+    with pytest.raises(ValueError, match="differ in shape"):
+        metric(predicted, target[..., :1])
+    with pytest.raises(ValueError, match="mask"):
+        metric(predicted, target, blob()[1:])
+    with pytest.raises(ValueError, match="mask"):
+        metric(predicted, target, blob().float())
+
+
+@pytest.mark.parametrize("metric", [m for m in IMAGE_METRICS if m is not metrics.windowed_ssim])
+def test_pixels_outside_the_mask_may_be_anything(metric) -> None:
+    predicted, target = pair()
+    expected = metric(predicted, target, blob())
+    predicted[~blob()] = float("nan")
+    torch.testing.assert_close(metric(predicted, target, blob()), expected)
+
+
+def some_valid() -> torch.Tensor:
+    """A fifth flagged; band 4 wholly, pixel (3, 9) but for one band, pixel (3, 10) wholly."""
+    valid = torch.rand(H, W, BANDS, generator=torch.Generator().manual_seed(5)) > 0.2
+    valid[..., 4] = False
+    valid[3, 9:11] = False
+    valid[3, 9, 2] = True
+    return valid
+
+
+def score_of_windows(
+    x: np.ndarray, y: np.ndarray, valid: np.ndarray, centres: list[tuple[int, int]], reach: int
+) -> float:
+    """Mean SSIM of one band over Gaussian windows of the valid values around each centre."""
+    scores = []
+    for row, column in centres:
+        rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
+        weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
+        weights[(abs(rows - row) > reach) | (abs(columns - column) > reach)] = 0
+        w, a, b = weights[valid], x[valid], y[valid]
+        mean_a, mean_b = np.average(a, weights=w), np.average(b, weights=w)
+        variances = np.average((a - mean_a) ** 2, weights=w) + np.average((b - mean_b) ** 2, weights=w)
+        covariance = np.average((a - mean_a) * (b - mean_b), weights=w)
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        scores.append(luminance * (2 * covariance + 9e-4) / (variances + 9e-4))
+    return float(np.mean(scores))
+
+
+@MASKS
+def test_only_valid_values_are_judged(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
+    p, t, v = (image.numpy()[chosen] for image in (predicted.double(), target.double(), valid))
+    angles, squares, roots = [], [], []
+    for pixel in range(len(p)):
+        a, b = p[pixel][v[pixel]], t[pixel][v[pixel]]
+        squares.extend((a - b) ** 2)
+        if len(a) >= 1:
+            roots.append(math.sqrt(np.mean((a - b) ** 2)))
+        if len(a) >= 2:
+            angles.append(math.acos(min(1.0, a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))))
+    similarity, ratio, windowed = [], [], []
+    for band in range(BANDS - 1):  # nothing is valid in the last one
+        a, b = p[v[:, band], band], t[v[:, band], band]
+        covariance = np.mean((a - a.mean()) * (b - b.mean()))
+        luminance = (2 * a.mean() * b.mean() + 1e-4) / (a.mean() ** 2 + b.mean() ** 2 + 1e-4)
+        similarity.append(luminance * (2 * covariance + 9e-4) / (a.var() + b.var() + 9e-4))
+        ratio.append(-10 * math.log10(np.mean((a - b) ** 2) + 1e-10))
+        in_band = valid[..., band].numpy()
+        centres = list(zip(*np.nonzero(chosen & in_band), strict=True))
+        images = (image[..., band].double().numpy() for image in (predicted, target))
+        windowed.append(score_of_windows(*images, in_band, centres, reach=5))
+    found = metrics.spectral_metrics(predicted, target, mask, valid)
+    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
+    assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
+    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
+    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
+    assert found["ssim_windowed"] == pytest.approx(np.mean(windowed), rel=1e-5)
+    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
+
+
+@MASKS
+def test_everything_valid_changes_nothing(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    found = metrics.spectral_metrics(predicted, target, mask, torch.ones(H, W, BANDS, dtype=torch.bool))
+    assert found == pytest.approx(metrics.spectral_metrics(predicted, target, mask), rel=1e-6)
+
+
+@pytest.mark.parametrize("anything", [0.0, -7.0, 1e30, float("nan")])
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_flagged_values_may_be_anything(metric, anything: float) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    expected = metric(predicted, target, blob(), valid)
+    target[~valid] = predicted[~valid] = anything
+    assert metric(predicted, target, blob(), valid).item() == expected.item()
+
+
+@MASKS
+def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool)
+    assert metrics.spectral_metrics(predicted, target, mask, nothing) == pytest.approx(
+        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
+    )
+
+
+def test_maps_are_nan_where_nothing_can_be_told() -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    angles = metrics.spectral_angle_map(predicted, target, valid)
+    np.testing.assert_array_equal(angles.isnan(), valid.sum(-1) < 2)
+    errors = metrics.squared_error_map(predicted, target, valid)
+    np.testing.assert_array_equal(errors.isnan(), valid.sum(-1) < 1)
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_errors_of_valid_values_are_not_hidden(metric) -> None:
+    predicted, target = pair()
+    valid = some_valid()
+    row, column, band = ((valid & blob()[..., None]) & (valid.sum(-1, keepdim=True) > 2)).nonzero()[0]
+    predicted[row, column, band] = float("nan")
+    assert math.isnan(metric(predicted, target, blob(), valid).item())
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_blocks_of_valid_values_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted, target = pair()
+    whole = metric(predicted, target, blob(), some_valid())
+    monkeypatch.setattr(metrics, "_BLOCK_VALUES", 2 * H * W)
+    torch.testing.assert_close(metric(predicted, target, blob(), some_valid()), whole, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("metric", IMAGE_METRICS)
+def test_a_validity_that_does_not_fit_is_refused(metric) -> None:
+    predicted, target = pair()
+    for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
+        with pytest.raises(ValueError, match="the validity of values of shape"):
+            metric(predicted, target, blob(), valid)

@@ -1,0 +1,273 @@
+import shutil
+from pathlib import Path
+
+import ball_run
+import capture_factory as factory
+import numpy as np
+import pytest
+import torch
+import yaml
+from plyfile import PlyData, PlyElement
+
+from hsi_sc_nerf.cli.sample import SampleCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.surface_files import read_surface
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.sample_points import frontal_views, mean_and_spread, outward
+from hsi_sc_nerf.export.sampled_ply import read_points
+from hsi_sc_nerf.models import trained_run
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def test_frontal_views_are_the_largest_cosines_in_the_frame():
+    cosines = np.array([[0.9, 0.5, 0.99, 0.7], [0.3, 0.2, 0.1, -1.0], [0.6, 0.6, 0.6, 0.6]])
+    in_frame = np.array([[True, True, False, True], [True, True, True, True], [False, False, False, False]])
+    point, camera = frontal_views(cosines, in_frame, 2)
+    assert set(zip(point.tolist(), camera.tolist(), strict=True)) == {(0, 0), (0, 3)}
+    point, camera = frontal_views(cosines, in_frame, 9)
+    assert set(zip(point.tolist(), camera.tolist(), strict=True)) == {(0, 0), (0, 3), (0, 1)}
+
+
+def test_mean_and_spread_are_numpys():
+    rng = np.random.default_rng(0)
+    point = rng.integers(1, 5, 30)  # none of point 0
+    point[point == 3] = 2
+    point[0] = 3  # one of point 3
+    spectra = rng.random((30, 7))
+    found = mean_and_spread(spectra, point, 5)
+    np.testing.assert_array_equal(found.views, np.bincount(point, minlength=5))
+    for i in (1, 2, 4):
+        own = spectra[point == i]
+        np.testing.assert_allclose(found.spectra[i], own.mean(axis=0), rtol=1e-6)
+        np.testing.assert_allclose(found.spectral_std[i], own.std(axis=0, ddof=1).mean(), rtol=1e-6)
+    np.testing.assert_allclose(found.spectra[3], spectra[0], rtol=1e-6)
+    assert np.isnan(found.spectra[0]).all()
+    assert np.isnan(found.spectral_std[[0, 3]]).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_normals_turn_to_where_there_is_less(device):
+    points = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    signs = torch.ones(20, 1)
+    signs[::2] = -1.0
+
+    def ball(places):
+        return (places.norm(dim=-1, keepdim=True) < 1.0).float()
+
+    turned = outward((signs * points).to(device), points.to(device), ball, 0.1)
+    torch.testing.assert_close(turned.cpu(), points)
+    far = 9.0 * points
+    torch.testing.assert_close(outward(signs * points, far, ball, 0.1), signs * points)
+
+
+@pytest.fixture(scope="module")
+def run_config(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ball")
+    return ball_run.write_untrained_run(ball_run.write_ball_dataset(folder / "data"), folder / "runs")
+
+
+@pytest.fixture(scope="module")
+def run(run_config):
+    opened = trained_run.open_run(run_config)
+    ball_run.fill_with_ball(opened)
+    return opened
+
+
+@pytest.fixture
+def sample(run, monkeypatch):
+    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+
+    def sample(path, **options):
+        SampleCommand(path, load_config=None, **options).main()
+        return path.with_name(f"{path.stem}-spectral.ply")
+
+    return sample
+
+
+def sphere_mesh(path, *, scale=1.0, binary=False, radius_m=factory.SPHERE_RADIUS_M, normals_sign=None):
+    """A sphere of triangles with a property of its own, and its radial directions."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    columns = dict(zip("xyz", (scale * (factory.SPHERE_CENTRE_M + radius_m * mesh.vertices)).T, strict=True))
+    if normals_sign is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), normals_sign * mesh.vertices.T, strict=True))
+    columns |= {"quality": np.arange(len(mesh.vertices), dtype=np.int32)}
+    vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    faces = np.array([(face,) for face in mesh.faces.tolist()], [("vertex_indices", "O")])
+    described = PlyElement.describe(faces, "face", len_types={"vertex_indices": "u1"})
+    PlyData([PlyElement.describe(vertices, "vertex"), described], text=not binary).write(str(path))
+    return np.asarray(mesh.vertices)
+
+
+def test_a_ball_gives_its_spectrum_where_cameras_see_it(tmp_path, sample, capsys):
+    path = tmp_path / "ball.ply"
+    radial = sphere_mesh(path)
+    written = sample(path)
+    cloud = read_spectral_ply(written)
+    given, after = PlyData.read(str(path)), PlyData.read(str(written))
+    for name in ("x", "y", "z", "quality"):
+        np.testing.assert_array_equal(after["vertex"][name], given["vertex"][name])
+    assert [list(f) for f in after["face"]["vertex_indices"]] == [list(f) for f in given["face"]["vertex_indices"]]
+    np.testing.assert_allclose(cloud.wavelengths_nm, factory.WAVELENGTHS_NM, atol=0.01)
+    np.testing.assert_allclose((cloud.normals * radial).sum(axis=1), 1.0, atol=1e-3)
+
+    poses = np.stack([factory.true_pose(angle) for angle in ball_run.ANGLES_DEG])
+    held_out = np.setdiff1d(np.arange(10), run_training_frames())
+    poses = np.delete(poses, held_out, axis=0)
+    points = factory.SPHERE_CENTRE_M + factory.SPHERE_RADIUS_M * radial
+    towards = poses[:, :3, 3] - points[:, None]
+    incidence_deg = np.rad2deg(
+        np.arccos(np.einsum("nk,nck->nc", radial, towards) / np.linalg.norm(towards, axis=-1)).min(axis=1)
+    )
+    seen = np.isfinite(cloud.spectra).all(axis=1)
+    assert seen[incidence_deg < 65.0].all()
+    assert not seen[incidence_deg > 75.0].any()
+    np.testing.assert_array_equal(seen, np.isfinite(cloud.spectra).any(axis=1))
+    np.testing.assert_array_equal(seen, cloud.extra["sampled_views"] > 0)
+    assert cloud.extra["sampled_views"].max() == 4
+    np.testing.assert_allclose(cloud.spectra[seen], np.broadcast_to(factory.PLANT, (seen.sum(), 12)), atol=1e-3)
+    assert np.nanmax(cloud.extra["sampled_std"]) < 1e-3
+    assert (cloud.colours[~seen] == 64).all()
+    assert np.abs(cloud.colours[seen] - 255.0 * factory.PLANT[[5, 3, 1]]).max() <= 1.0
+    assert f"{(~seen).sum()} of {len(seen)} points have no spectrum" in " ".join(capsys.readouterr().out.split())
+
+
+def run_training_frames():
+    from hsi_sc_nerf.data.dataparser import split_frames
+
+    return split_frames(10, 0.9)[0]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_units_binary_files_and_normals_to_either_side(tmp_path, sample, sign):
+    metres, millimetres = tmp_path / "m.ply", tmp_path / "mm.ply"
+    sphere_mesh(metres, normals_sign=1.0)
+    sphere_mesh(millimetres, scale=1000.0, binary=True, normals_sign=sign)
+    inwards = read_spectral_ply(sample(millimetres, unit="mm"))
+    expected = read_spectral_ply(sample(metres))
+    np.testing.assert_array_equal(np.isnan(inwards.spectra), np.isnan(expected.spectra))
+    np.testing.assert_allclose(inwards.points, 1000.0 * expected.points, rtol=1e-5)
+    np.testing.assert_allclose(PlyData.read(str(millimetres))["vertex"]["nx"], inwards.normals[:, 0], atol=1e-6)
+
+
+def test_normals_that_a_cloud_lacks_point_outwards(tmp_path, sample):
+    path = tmp_path / "ball.ply"
+    radial = sphere_mesh(path)
+    PlyData([PlyData.read(str(path))["vertex"]]).write(str(path))
+    assert (read_points(path).normals() * radial).sum(axis=1).min() < -0.9
+    assert (read_spectral_ply(sample(path)).normals * radial).sum(axis=1).min() > 0.9
+
+
+def test_points_off_the_surface_have_no_spectrum(tmp_path, sample):
+    path = tmp_path / "off.ply"
+    sphere_mesh(path, radius_m=factory.SPHERE_RADIUS_M + 0.002)
+    near = read_spectral_ply(sample(path))
+    assert np.isfinite(near.spectra).any()
+    sphere_mesh(path, radius_m=factory.SPHERE_RADIUS_M + 0.006)
+    (tmp_path / "off-spectral.ply").unlink()
+    with pytest.raises(InputError, match="none of its points lies on the object"):
+        sample(path)
+    assert not (tmp_path / "off-spectral.ply").exists()
+
+
+def test_a_cloud_keeps_its_colours_and_its_spectra_are_replaced(tmp_path, sample):
+    path = tmp_path / "ball.ply"
+    sphere_mesh(path)
+    first = sample(path)
+    content = PlyData.read(str(first))
+    content["vertex"]["red"] = 200
+    content["vertex"]["scalar_400.00nm"] = 9.0
+    again = tmp_path / "again.ply"
+    PlyData([content["vertex"]], byte_order=">").write(str(again))
+    cloud, before = read_spectral_ply(sample(again)), read_spectral_ply(first)
+    assert (cloud.colours[:, 0] == 200).all()
+    np.testing.assert_array_equal(cloud.spectra, before.spectra)
+    assert list(cloud.extra) == ["quality", "sampled_views", "sampled_std"]
+
+
+def test_bad_points_are_refused_in_a_sentence(tmp_path):
+    with pytest.raises(InputError, match="there is no such file"):
+        read_points(tmp_path / "none.ply")
+    text = tmp_path / "text.ply"
+    text.write_text("x y z\n0 0 0\n")
+    with pytest.raises(InputError, match="is no readable PLY file"):
+        read_points(text)
+    empty = tmp_path / "empty.ply"
+    empty.write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    with pytest.raises(InputError, match="has no points"):
+        read_points(empty)
+    with pytest.raises(InputError, match="--views"):
+        SampleCommand(text, load_config=text, views=0).main()
+
+
+TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize(
+    ("face", "told"),
+    [
+        ("property list uchar int corners\nend_header\n{}3 0 1 2\n", "its faces have no vertex_indices"),
+        ("property int vertex_index\nend_header\n{}2\n", "its faces have no vertex_indices"),
+        (
+            "property list uchar int vertex_indices\nend_header\n{}3 0 1 3\n",
+            "its faces name vertices that it has not",
+        ),
+        (
+            "property list uchar int vertex_indices\nend_header\n{}3 0 1 -1\n",
+            "its faces name vertices that it has not",
+        ),
+    ],
+)
+def test_odd_faces_are_refused_in_a_sentence(tmp_path, face, told):
+    path = tmp_path / "odd.ply"
+    path.write_text(TRIANGLE + "element face 1\n" + face.format("0 0 0\n1 0 0\n0 1 0\n"))
+    for read in (lambda path: read_points(path).normals(), read_surface):
+        with pytest.raises(InputError, match=rf"odd\.ply.*{told}"):
+            read(path)
+
+
+def test_points_that_hold_lists_are_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "lists.ply"
+    path.write_text(TRIANGLE + "property list uchar int near\nend_header\n0 0 0 1 1\n1 0 0 1 0\n0 1 0 1 0\n")
+    with pytest.raises(InputError, match=r"lists\.ply: its points hold lists \(near\)"):
+        read_points(path)
+
+
+def test_what_is_no_run_is_refused_in_a_sentence(tmp_path, run_config):
+    with pytest.raises(InputError, match="there is no such file"):
+        trained_run.open_run(tmp_path / "config.yml")
+    other = tmp_path / "config.yml"
+    other.write_text("a: 1\n")
+    with pytest.raises(InputError, match=r"is no run of hsi-sc-nerf"):
+        trained_run.open_run(other)
+    alone = tmp_path / "alone.yml"
+    alone.write_text(run_config.read_text())
+    with pytest.raises(InputError, match="checkpoint"):
+        trained_run.open_run(alone)
+
+
+def test_a_run_that_was_moved_is_opened_from_anywhere(tmp_path, run_config, run, monkeypatch):
+    moved = shutil.copytree(run_config.parent, tmp_path / "archive" / "apple 7")
+    monkeypatch.chdir(moved)
+    opened = trained_run.open_run(Path("config.yml"))
+    for name, value in run.model.state_dict().items():
+        torch.testing.assert_close(opened.model.state_dict()[name], value)
+
+
+def test_a_dataset_given_relative_to_another_folder_is_found_above_the_run(tmp_path, run_config, monkeypatch):
+    home = run_config.parents[4]
+    config = yaml.load(run_config.read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path("data")
+    relative = run_config.with_name("relative.yml")
+    relative.write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    assert trained_run.open_run(relative).dataset.root.resolve() == (home / "data").resolve()
+
+
+def test_metres_and_scene_units_are_inverse(run):
+    points = np.random.default_rng(0).random((5, 3))
+    np.testing.assert_allclose(run.to_metres(run.to_scene(points)), points)
+    expected = np.stack([factory.true_pose(angle) for angle in ball_run.ANGLES_DEG])
+    np.testing.assert_allclose(run.refined_poses_m(), expected, atol=1e-6)

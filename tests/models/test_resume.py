@@ -1,0 +1,186 @@
+"""A run that is killed and resumed comes to the very weights of one that was not; stages leave their results."""
+
+import json
+
+import pytest
+import torch
+from small_trainer import trainer
+
+from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.stages import full_frame_stage
+
+SWITCH, STEPS = 8, 20
+EVALUATIONS = {"steps_per_eval_batch": 5, "steps_per_eval_image": 13}
+
+
+class Killed(BaseException):
+    """Stands for the end of a process."""
+
+
+def longer(tiny_dataset, folder, switch=SWITCH, **changes):
+    """A run long enough for the proposal networks to learn at some steps only."""
+    first = full_frame_stage()
+    first.num_iterations, first.learn_after = switch, {"camera_opt": 0.5}
+    options = {"full_frame": first, "max_num_iterations": STEPS, "steps_per_save": 3, "ema_decay": 0.8}
+    torch.manual_seed(99 if "load_dir" in changes else 0)  # ns-train seeds the weights; a checkpoint replaces them
+    made = trainer(tiny_dataset, folder, **(options | changes))
+    model = made.pipeline.model.config
+    model.proposal_warmup, model.proposal_update_every = 1, 4
+    return made
+
+
+def fail_in(made, part, method, when):
+    original = getattr(part, method)
+
+    def failing(*arguments, **options):
+        if when(*arguments, **options):
+            raise Killed
+        return original(*arguments, **options)
+
+    setattr(part, method, failing)
+    with pytest.raises(Killed):
+        made.train()
+
+
+def differences(first, second, path=""):
+    """Places in two checkpoints whose contents differ by so much as a bit."""
+    if isinstance(first, torch.Tensor):
+        return [] if torch.equal(first, second) else [path]
+    if isinstance(first, dict):
+        keys = sorted(map(str, first.keys() ^ second.keys()))
+        return keys + [
+            d for key in first.keys() & second for d in differences(first[key], second[key], f"{path}/{key}")
+        ]
+    if isinstance(first, list | tuple):
+        pairs = enumerate(zip(first, second, strict=True))
+        return [d for i, pair in pairs for d in differences(*pair, f"{path}/{i}")]
+    return [] if first == second else [path]
+
+
+def checkpoint(folder):
+    return torch.load(max(folder.glob("*.ckpt")))
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_dataset, tmp_path_factory):
+    """A run from beginning to end that evaluates on the way, and its raw weights after every step."""
+    made = longer(tiny_dataset, tmp_path_factory.mktemp("whole"), evaluate_stages=True, **EVALUATIONS)
+    update, raw = made.pipeline.weight_average.update, []
+
+    def recording(count):
+        update(count)
+        raw.append({name: value.clone() for name, value in made.pipeline.weight_average.weights().items()})
+
+    made.pipeline.weight_average.update = recording
+    made.train()
+    return made, raw
+
+
+@pytest.mark.parametrize("killed_at", [5, SWITCH, 15])
+def test_killed_and_resumed(tiny_dataset, tmp_path, whole, killed_at):
+    made = longer(tiny_dataset, tmp_path)
+    fail_in(made, made.pipeline.datamanager, "next_train", lambda step: step == killed_at)
+    torch.rand(7)  # another process has other random numbers
+    resumed = longer(tiny_dataset, tmp_path, load_dir=made.checkpoint_dir)
+    assert 0 < resumed._start_step <= killed_at
+    resumed.train()
+    first, second = checkpoint(whole[0].checkpoint_dir), checkpoint(resumed.checkpoint_dir)
+    assert first["step"] == STEPS - 1
+    assert differences(first, second) == []
+
+
+def test_checkpoints_hold_the_average_of_their_own_stage(whole):
+    made, raw = whole
+    assert len(raw) == STEPS
+    for name, begin, end in (("full-frame", 0, SWITCH), ("masked", SWITCH, STEPS)):
+        found = checkpoint(made.base_dir / f"stage-{name}")["pipeline"]
+        powers = [0.8 ** (end - 1 - i) for i in range(begin, end)]
+        for key in raw[0]:
+            expected = sum(p * w[key].double() for p, w in zip(powers, raw[begin:end], strict=True)) / sum(powers)
+            torch.testing.assert_close(found[key].double(), expected, rtol=1e-4, atol=1e-6)
+    assert made.pipeline.weight_average is None
+    assert differences(made.pipeline.state_dict(), checkpoint(made.checkpoint_dir)["pipeline"]) == []
+    assert any(not torch.equal(raw[-1][key], found[key]) for key in found.keys() & raw[-1].keys())
+
+
+def test_both_stages_leave_their_held_out_metrics(whole):
+    made, _ = whole
+    for name, step in (("full-frame", SWITCH - 1), ("masked", STEPS - 1)):
+        folder = made.base_dir / f"stage-{name}"
+        assert {path.name for path in folder.iterdir()} == {f"step-{step:09d}.ckpt", f"step-{step:09d}.json"}
+        found = json.loads((folder / f"step-{step:09d}.json").read_text())
+        assert (found["stage"], found["step"]) == (name, step)
+        assert {"sam", "rmse", "ssim", "psnr", "full_sam", "full_psnr", "psnr_std"} <= found["results"].keys()
+    # What stands there is what ns-eval gives with the stage's checkpoint: the last one's weights are still there.
+    again = made.pipeline.get_average_eval_image_metrics(get_std=True)
+    assert again["psnr"] == pytest.approx(found["results"]["psnr"], rel=1e-6)
+
+
+@pytest.mark.parametrize("stage", ["full-frame", "masked"])
+def test_killed_while_a_stage_is_evaluated(tiny_dataset, tmp_path, monkeypatch, stage):
+    values = {f"{prefix}{name}": 0.5 for prefix in ("", "full_") for name in ("sam", "rmse", "ssim", "psnr")}
+    monkeypatch.setattr(SpectralPipeline, "get_average_eval_image_metrics", lambda *_, **__: values)
+    made = longer(tiny_dataset, tmp_path / "killed", max_num_iterations=SWITCH + 1, evaluate_stages=True)
+    last = SWITCH - (stage == "full-frame")
+    fail_in(made, made.pipeline, "get_average_eval_image_metrics", lambda step, **_: step == last)
+    assert not (made.base_dir / f"stage-{stage}").exists()
+
+    options = {"load_dir": made.checkpoint_dir, "max_num_iterations": SWITCH + 1, "evaluate_stages": True}
+    resumed = longer(tiny_dataset, tmp_path / "resumed", **options)
+    if stage == "full-frame":
+        resumed.train()
+    else:
+        with pytest.raises(SystemExit, match="has all 9 iterations"):
+            resumed.train()
+    for name in {stage, "masked"}:
+        assert {path.suffix for path in (resumed.base_dir / f"stage-{name}").iterdir()} == {".ckpt", ".json"}
+
+
+def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp_path, whole):
+    made = longer(tiny_dataset, tmp_path, switch=15, load_dir=whole[0].base_dir / "stage-full-frame")
+    seen = []
+    original = made.pipeline.datamanager.next_train
+
+    def next_train(step):
+        rays, batch = original(step)
+        seen.append((step, batch["mask"].float().mean().item()))
+        return rays, batch
+
+    made.pipeline.datamanager.next_train = next_train
+    made.train()
+    assert not (made.base_dir / "stage-full-frame").exists()  # the first run has kept it
+    assert seen == [(step, 0.75) for step in range(SWITCH, SWITCH + STEPS - 15)]
+    assert checkpoint(made.checkpoint_dir)["training"]["completed_stage"] == "masked"
+
+
+def test_a_second_stage_after_another_runs_first_is_resumed_where_it_was(tiny_dataset, tmp_path, whole):
+    """The settings alone would put its steps back into the first stage."""
+    made = longer(tiny_dataset, tmp_path / "killed", switch=15, load_dir=whole[0].base_dir / "stage-full-frame")
+    fail_in(made, made.pipeline.datamanager, "next_train", lambda step: step == SWITCH + 3)
+    resumed = longer(tiny_dataset, tmp_path / "resumed", switch=15, load_dir=made.checkpoint_dir)
+    assert SWITCH < resumed._start_step <= SWITCH + 3
+    assert resumed.plan == made.plan
+    assert resumed.plan.at(resumed._start_step).config.name == "masked"
+
+
+def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, tmp_path, whole):
+    """Though its last step may be where the first stage of the longer run would end."""
+    made = longer(
+        tiny_dataset, tmp_path, switch=STEPS, max_num_iterations=2 * STEPS, load_dir=whole[0].checkpoint_dir
+    )
+    assert made.plan.at(STEPS).config.name == "masked"
+    assert made.plan.num_iterations == SWITCH + STEPS
+    made._keep_stage_of(made._loaded)
+    assert not list(made.base_dir.glob("stage-*"))
+
+
+def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, whole):
+    with pytest.raises(SystemExit, match="holds no checkpoint; --load-dir takes"):
+        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
+    damaged = tmp_path / "step-000000003.ckpt"
+    damaged.write_bytes(max(whole[0].checkpoint_dir.glob("*.ckpt")).read_bytes()[:1000])
+    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is no readable checkpoint"):
+        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
+    torch.save({"step": 3}, damaged)
+    with pytest.raises(SystemExit, match="is no checkpoint that hsi-sc-nerf can go on from"):
+        longer(tiny_dataset, tmp_path, load_dir=tmp_path)

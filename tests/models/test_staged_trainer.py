@@ -1,0 +1,156 @@
+"""Stages, checkpoints and skipped steps of real, tiny training runs."""
+
+import pytest
+import torch
+from scipy.ndimage import distance_transform_edt
+from small_trainer import STEPS, trainer
+
+from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
+from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
+from hsi_sc_nerf.packed.pixels import RIM_PX
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
+    made = trainer(tiny_dataset, tmp_path, device)
+    seen = []
+    original = made.pipeline.datamanager.next_train
+    from_object = [distance_transform_edt(~mask) for mask in made.pipeline.datamanager.train_pixel_sampler.masks]
+
+    def next_train(step):
+        rays, batch = original(step)
+        beside = sum(0 < from_object[f][line, sample] < RIM_PX + 1 for f, line, sample in batch["indices"].tolist())
+        seen.append((made.pipeline.model.camera_optimizer.frozen, int(batch["mask"].sum()), beside))
+        return rays, batch
+
+    made.pipeline.datamanager.next_train = next_train
+    twists = []
+    step_before = made.optimizers.optimizer_scaler_step_some
+
+    def step_some(*arguments):
+        step_before(*arguments)
+        twists.append(made.pipeline.model.camera_optimizer.camera_twist.detach().clone())
+
+    made.optimizers.optimizer_scaler_step_some = step_some
+    made.train()
+
+    assert [row[:2] for row in seen] == [(False, 13)] * 3 + [(True, 48)] * 3  # 20 and 75 % of 64 rays
+    # 20 and 80 % of the others pass just beside the object; of 51 rays drawn anywhere, two or three do by chance.
+    assert all(10 <= beside <= 20 for *_, beside in seen[:3])
+    assert all(13 <= beside <= 16 for *_, beside in seen[3:])
+    assert twists[2].abs().sum() > 0
+    torch.testing.assert_close(twists[2], twists[5], rtol=0, atol=0)  # kept, and frozen
+
+
+def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path):
+    """Frozen groups, loss weights, learning rates and the paper's rays, by stage."""
+    first, second = full_frame_stage(), masked_stage()
+    first.frozen_groups, first.angular_loss_mult, first.group_lr = ("proposal_networks",), 0.0, {"fields": (0.1, 0.1)}
+    second.frozen_groups, second.hsi_loss_mult, second.foreground_share = ("camera_opt", "fields"), 9.0, 1.0
+    made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
+    weight, seen, changed = made.pipeline.model.config.angular_loss_mult, [], []
+    original = made.train_iteration
+
+    def train_iteration(step):
+        before = {name: [p.clone() for p in group] for name, group in made.optimizers.parameters.items()}
+        result = original(step)
+        for name, group in made.optimizers.parameters.items():
+            if any(not torch.equal(a, b) for a, b in zip(before[name], group, strict=True)):
+                changed.append((step, name))
+        config = made.pipeline.model.config
+        lr = made.optimizers.optimizers["fields"].param_groups[0]["lr"]
+        seen.append((config.angular_loss_mult, config.hsi_loss_mult, lr, "angular_loss" in result[1]))
+        return result
+
+    made.train_iteration = train_iteration
+    made.train()
+    assert seen[:3] == [(0.0, 0.75, pytest.approx(1e-3), False)] * 3
+    assert [row[:2] for row in seen[3:]] == [(weight, 9.0)] * 3
+    assert {name for step, name in changed if step < 3} == {"fields", "camera_opt"}
+    assert {name for step, name in changed if step >= 3} == {"proposal_networks"}
+    assert made.config.pipeline.model.hsi_loss_mult == 0.75  # the run's own configuration stays as it is
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [({"ema_decay": 1.0}, "ema-decay"), ({"full_frame": StageConfig("a", 1.0, frozen_groups=("x",))}, "named 'x'")],
+)
+def test_impossible_settings_end_in_a_sentence(tiny_dataset, tmp_path, changes, sentence):
+    with pytest.raises(SystemExit, match=f"hsi-sc-nerf: .*{sentence}"):
+        trainer(tiny_dataset, tmp_path, **changes)
+
+
+def test_several_devices_are_refused(tiny_dataset, tmp_path):
+    config = trainer(tiny_dataset, tmp_path).config
+    with pytest.raises(SystemExit, match="trains on one device"):
+        config.setup(local_rank=0, world_size=2).setup()
+
+
+def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
+    first = trainer(tiny_dataset, tmp_path / "first")
+    first.train()
+    kept = first.base_dir / "stage-full-frame"
+    assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
+
+    second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
+    assert second._start_step == 3
+    second.train()
+    assert second.step == STEPS - 1
+    assert second._stage.config.name == "masked"
+
+
+def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path)
+    made.train()
+    again = trainer(tiny_dataset, tmp_path / "again", load_dir=made.checkpoint_dir)
+    with pytest.raises(SystemExit, match="max-num-iterations"):
+        again.train()
+
+
+def poison(made, bad_steps):
+    """Make the batch of some steps infinite, as a damaged cube would."""
+    original = made.pipeline.datamanager.next_train
+
+    def next_train(step):
+        rays, batch = original(step)
+        if step in bad_steps:
+            batch["spectral"] = batch["spectral"] * float("inf")
+        return rays, batch
+
+    made.pipeline.datamanager.next_train = next_train
+
+
+def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
+    made = trainer(tiny_dataset, tmp_path)
+    poison(made, {2})
+    made.train()
+    assert "step 2 skipped: loss hsi_loss" in capsys.readouterr().out
+    assert all(torch.isfinite(parameter).all() for parameter in made.pipeline.model.parameters())
+
+
+def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path, max_nonfinite_steps=2)
+    poison(made, {1, 2, 3, 4, 5})
+    with pytest.raises(SystemExit, match=r"step 2 skipped.*last good checkpoint"):
+        made.train()
+    (checkpoint,) = made.checkpoint_dir.glob("*.ckpt")
+    allow_nerfstudio_checkpoints()
+    state = torch.load(checkpoint)  # the safe loader
+    assert all(torch.isfinite(value).all() for value in state["pipeline"].values() if value.is_floating_point())
+
+
+def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monkeypatch):
+    made = trainer(tiny_dataset, tmp_path)
+    made.save_checkpoint(0)
+    before = list(made.checkpoint_dir.iterdir())
+
+    def full_disk(*arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(SystemExit, match="No space left"):
+        made.save_checkpoint(1)
+    assert list(made.checkpoint_dir.iterdir()) == before
+    assert [path for path in made.base_dir.iterdir() if path.name.startswith(".")] == []

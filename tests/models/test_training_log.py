@@ -1,0 +1,69 @@
+"""What TensorBoard is given, read back with its own reader; the picture of spectra."""
+
+import numpy as np
+import pytest
+import torch
+from small_trainer import STEPS, trainer
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from hsi_sc_nerf.models.training_log import draw_spectra, stage_summary
+
+
+@pytest.fixture
+def events(tiny_dataset, tmp_path, monkeypatch):
+    """Everything that a small run logs."""
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
+    made = trainer(tiny_dataset, tmp_path, evaluate_stages=True, steps_per_eval_batch=4, steps_per_eval_image=4)
+    made.config.logging.steps_per_log = 1
+    made.config.full_frame.learn_after = {}
+    made.train()
+    accumulator = EventAccumulator(str(made.base_dir), size_guidance={"scalars": 0, "images": 0})
+    accumulator.Reload()
+    return accumulator
+
+
+def test_events_of_a_run(events):
+    tags = events.Tags()
+    losses = ["hsi_loss", "angular_loss", "interlevel_loss", "distortion_loss"]
+    metrics = ["sam", "rmse", "psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
+    expected = {
+        *(f"Train Loss Dict/{name}" for name in [*losses, "camera_opt_regularizer"]),
+        *(f"Train Metrics Dict/{name}" for name in metrics),
+        *(f"learning_rate/{group}" for group in ("fields", "proposal_networks", "camera_opt")),
+        *(f"Eval Images Metrics/{name}" for name in ("sam", "rmse", "psnr", "full_sam", "full_rmse", "full_psnr")),
+        *("Eval Images Metrics Dict (all images)/sam", "Eval Metrics Dict/psnr", "Train Rays / Sec"),
+    }
+    assert expected <= set(tags["scalars"])
+    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error", "spectra")} <= set(tags["images"])
+
+    rates = [event.value for event in events.Scalars("learning_rate/fields")]
+    assert rates == pytest.approx([1e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
+    assert [event.step for event in events.Scalars("Train Loss")] == list(range(STEPS))
+    ends = [event.step for event in events.Scalars("Eval Images Metrics Dict (all images)/sam")]
+    assert ends == [STEPS // 2 - 1, STEPS - 1]
+
+
+def test_picture_of_spectra():
+    wavelengths_nm = np.linspace(400, 1000, 20)
+    measured, rendered = torch.zeros(2, 20), torch.full((2, 20), 0.5)
+    picture = draw_spectra(wavelengths_nm, measured, rendered, ["line 3, sample 5", "line 4, sample 5"])
+    assert picture.ndim == 3
+    assert 0.0 <= float(picture.min()) < 0.2
+    assert float(picture.max()) == 1.0
+    # Values that are no measurements are not drawn, whatever number stands there.
+    measured[:, 10:] = 7.0
+    valid = torch.ones(2, 20, dtype=torch.bool)
+    valid[:, 10:] = False
+    shorter = draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"], valid)
+    measured[:, 10:] = 0.3
+    assert torch.equal(shorter, draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"], valid))
+    assert not torch.equal(shorter, draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"]))
+
+
+def test_summary_names_both_readings():
+    values = {"sam": 0.0292, "rmse": 0.0305, "ssim": 0.888, "psnr": 29.14}
+    metrics = values | {f"full_{name}": 2 * value for name, value in values.items()}
+    assert stage_summary("masked", metrics) == (
+        "masked stage, held-out views: object SAM 0.0292 rad, RMSE 0.0305, SSIM 0.888, PSNR 29.1 dB; "
+        "whole frame SAM 0.0584 rad, RMSE 0.0610, SSIM 1.776, PSNR 58.3 dB"
+    )

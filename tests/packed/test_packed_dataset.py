@@ -1,0 +1,242 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spectral.io import envi as spy
+
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
+from hsi_sc_nerf.packed.cube import (
+    FLAGGED,
+    LARGEST_REFLECTANCE,
+    REFLECTANCE_SCALE,
+    PixelFlag,
+    pack,
+    unpack,
+    write_packed_cube,
+)
+from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
+from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.processing.frames import border_spectrum
+
+WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
+
+
+@pytest.fixture
+def dataset(tmp_path) -> PackedDataset:
+    rng = np.random.default_rng(0)
+    frames = []
+    for name in ("a", "b"):
+        write_packed_cube(tmp_path / "cubes" / f"{name}.hdr", pack(rng.random((4, 5, 3))), WAVELENGTHS_NM)
+        write_png(tmp_path / "images" / f"{name}.png", rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
+        write_png(tmp_path / "masks" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * 255)
+        write_png(tmp_path / "flags" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * PixelFlag.SATURATED)
+        frames.append(
+            PackedFrame(
+                capture=name,
+                image_path=tmp_path / "images" / f"{name}.png",
+                mask_path=tmp_path / "masks" / f"{name}.png",
+                cube_path=tmp_path / "cubes" / f"{name}.hdr",
+                flags_path=tmp_path / "flags" / f"{name}.png",
+                angle_deg=12.5,
+                reprojection_error_px=0.25,
+                camera_to_world=look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.1]),
+            )
+        )
+    return PackedDataset(
+        root=tmp_path,
+        intrinsics=PinholeIntrinsics(5, 4, 10.0, 11.0, 2.5, 2.0),
+        distortion=np.array([0.1, 0.2, 0.3, 0.4]),
+        wavelengths_nm=WAVELENGTHS_NM,
+        pseudo_rgb_nm=WAVELENGTHS_NM[::-1],
+        object_name="pear",
+        scene_box_m=np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]),
+        object_box_m=np.array([[-0.05, -0.05, 0.07], [0.05, 0.05, 0.2]]),
+        background_reflectance=np.array([0.9, 0.91, 0.92]),
+        container=Container(0.09, 0.07),
+        frames=tuple(frames),
+        flagged_values=7,
+        bad_bands_nm=np.array([397.5, 1003.5]),
+        fwhm_nm=np.array([7.0, 7.1, 7.2]),
+        uncertainty=ReflectanceUncertainty(*np.array([[1e-6, 2e-6, 3e-6], [1e-5, 2e-5, 3e-5], [1e-4, 2e-4, 3e-4]])),
+        typical_uncertainty=np.array([0.004, 0.005, 0.006]),
+        fingerprint="f00",
+    )
+
+
+def edit(root: Path, change) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    change(content)
+    (root / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("container", [Container(0.09, 0.07), None])
+def test_round_trip(dataset, container):
+    write_transforms(replace(dataset, container=container))
+    for path in (dataset.root, dataset.root / "transforms.json"):
+        opened = open_packed(path)
+        assert (opened.intrinsics, opened.container) == (dataset.intrinsics, container)
+        assert (opened.object_name, opened.fingerprint, opened.root) == ("pear", "f00", dataset.root)
+        for name in ("distortion", "wavelengths_nm", "pseudo_rgb_nm", "scene_box_m", "object_box_m"):
+            np.testing.assert_array_equal(getattr(opened, name), getattr(dataset, name))
+        np.testing.assert_array_equal(opened.background_reflectance, dataset.background_reflectance)
+        np.testing.assert_array_equal(opened.camera_to_worlds, dataset.camera_to_worlds)
+        assert [(f.capture, f.angle_deg, f.reprojection_error_px) for f in opened.frames] == [
+            ("a", 12.5, 0.25),
+            ("b", 12.5, 0.25),
+        ]
+        assert [f.flags_path for f in opened.frames] == [f.flags_path for f in dataset.frames]
+
+
+def test_round_trip_of_what_calibration_found(dataset):
+    opened = open_packed(write_transforms(dataset))
+    assert opened.flagged_values == 7
+    for name in ("bad_bands_nm", "fwhm_nm", "typical_uncertainty"):
+        np.testing.assert_array_equal(getattr(opened, name), getattr(dataset, name))
+    for name in ("constant", "linear", "quadratic"):
+        np.testing.assert_array_equal(getattr(opened.uncertainty, name), getattr(dataset.uncertainty, name))
+    unknown = replace(dataset, fwhm_nm=None, uncertainty=None, typical_uncertainty=None, bad_bands_nm=np.zeros(0))
+    opened = open_packed(write_transforms(unknown))
+    assert (opened.fwhm_nm, opened.uncertainty, opened.typical_uncertainty) == (None, None, None)
+    assert opened.bad_bands_nm.shape == (0,)
+
+
+def test_flags(dataset):
+    flags = open_packed(write_transforms(dataset)).frames[0].flags()
+    assert flags.dtype == np.uint8
+    np.testing.assert_array_equal(flags == PixelFlag.SATURATED, np.eye(4, 5, dtype=bool))
+    dataset.frames[0].flags_path.write_bytes(b"")
+    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture of flags"):
+        dataset.frames[0].flags()
+
+
+def test_nerfstudio_keys(dataset):
+    content = json.loads(write_transforms(dataset).read_text())
+    assert content["camera_model"] == "OPENCV"
+    assert [content[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [5, 4, 10.0, 11.0, 2.5, 2.0]
+    assert [content[k] for k in ("k1", "k2", "p1", "p2")] == [0.1, 0.2, 0.3, 0.4]
+    assert content["frames"][1]["file_path"] == "images/b.png"
+    assert content["frames"][1]["mask_path"] == "masks/b.png"
+    assert content["frames"][1]["cube_path"] == "cubes/b.hdr"
+
+
+def test_pixels(dataset):
+    frame = open_packed(write_transforms(dataset)).frames[0]
+    assert frame.cube().dtype == np.uint16
+    assert isinstance(frame.cube(), np.memmap)
+    np.testing.assert_array_equal(frame.mask(), np.eye(4, 5, dtype=bool))
+    reread = np.random.default_rng(0).random((4, 5, 3))
+    assert np.abs(frame.cube() / REFLECTANCE_SCALE - reread).max() <= 0.5 / REFLECTANCE_SCALE + 1e-12
+
+
+@pytest.mark.parametrize(("interleave", "dtype"), [("bil", np.uint16), ("bip", np.int16), ("bip", np.float32)])
+def test_another_cube_is_not_taken_for_a_packed_one(dataset, interleave, dtype):
+    frame = dataset.frames[0]
+    cube = np.ones((4, 5, 3), dtype)
+    write_cube(frame.cube_path, cube, wavelengths_nm=WAVELENGTHS_NM, interleave=interleave, data_suffix=".bip")
+    with pytest.raises(InputError, match=r"a\.hdr: is no BIP cube of 16-bit numbers"):
+        frame.cube()
+
+
+def test_pseudo_rgb_keeps_its_channels(tmp_path, dataset):
+    image = np.zeros((4, 5, 3), np.uint8)
+    image[..., 0], image[..., 2] = 200, 30
+    write_png(dataset.frames[0].image_path, image)
+    np.testing.assert_array_equal(dataset.frames[0].pseudo_rgb(), image)
+
+
+def test_cubes_open_in_spy_as_reflectance(dataset):
+    header = dataset.frames[0].cube_path
+    cube = spy.open(str(header))
+    assert cube.metadata["interleave"] == "bip"
+    assert header.with_suffix(".bip").is_file()
+    assert float(cube.metadata["reflectance scale factor"]) == REFLECTANCE_SCALE
+    assert int(cube.metadata["data ignore value"]) == FLAGGED
+    assert "fwhm" not in cube.metadata
+    expected = np.random.default_rng(0).random((4, 5, 3))
+    np.testing.assert_allclose(np.asarray(cube.load()), expected, atol=1e-5)
+
+
+def test_widths_of_the_bands_are_in_the_header(tmp_path):
+    write_packed_cube(tmp_path / "c.hdr", pack(np.ones((2, 2, 3))), WAVELENGTHS_NM, np.array([7.0, 7.125, 8.0]))
+    assert spy.open(str(tmp_path / "c.hdr")).bands.bandwidths == [7.0, 7.125, 8.0]
+
+
+def test_packing_clips_and_flags(tmp_path):
+    packed = pack(np.array([-0.5, 0.5, 7.0, np.nan]))
+    assert packed.tolist() == [0, 25_000, 65_534, FLAGGED]
+    reflectance, valid = unpack(packed)
+    np.testing.assert_allclose(reflectance, [0.0, 0.5, LARGEST_REFLECTANCE, 0.0], rtol=1e-6)
+    assert valid.tolist() == [True, True, True, False]
+
+
+def test_is_packed(tmp_path, dataset):
+    assert not is_packed(tmp_path)
+    write_transforms(dataset)
+    assert is_packed(tmp_path)
+    edit(tmp_path, lambda content: content.pop("wavelengths_nm"))
+    assert not is_packed(tmp_path)
+    (tmp_path / "transforms.json").write_text("[")
+    assert not is_packed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("fl_x"), "lacks the key 'fl_x'"),
+        (lambda c: c.pop("object_box_m"), "lacks the key 'object_box_m'"),
+        (lambda c: c["frames"][0].pop("cube_path"), "lacks the key 'cube_path'"),
+        (lambda c: c.update(scene_box_m=[1, 2]), r"cannot be read \(scene_box_m is no list of 2 x 3 numbers\)"),
+        (
+            lambda c: c.update(background_reflectance=[1, 2]),
+            "cannot be read .background_reflectance is no list",
+        ),
+        (lambda c: c.pop("flagged_values"), "lacks the key 'flagged_values'"),
+        (lambda c: c.update(flagged_values=None), "cannot be read"),
+        (lambda c: c.pop("bad_bands_nm"), "lacks the key 'bad_bands_nm'"),
+        (lambda c: c.update(bad_bands_nm=["red"]), r"cannot be read \(bad_bands_nm is no list of numbers"),
+        (lambda c: c.pop("fwhm_nm"), "lacks the key 'fwhm_nm'"),
+        (lambda c: c.update(fwhm_nm=[7.0]), r"cannot be read \(fwhm_nm is no list of 3 numbers\)"),
+        (lambda c: c.pop("uncertainty"), "lacks the key 'uncertainty'"),
+        (lambda c: c["uncertainty"].pop("linear"), "lacks the key 'linear'"),
+        (lambda c: c["uncertainty"].update(linear=[1.0]), r"cannot be read \(linear is no list of 3 numbers\)"),
+        (lambda c: c.update(uncertainty=[1.0]), "cannot be read"),
+        (lambda c: c.update(typical_uncertainty=0.01), r"cannot be read \(typical_uncertainty is no list of 3"),
+        (lambda c: c["frames"][0].pop("flags_path"), "lacks the key 'flags_path'"),
+        (lambda c: c.update(frames=[]), "lists no frames"),
+        (lambda c: c["frames"][0].update(angle_deg=None), "cannot be read"),
+    ],
+)
+def test_transforms_that_cannot_be_used(dataset, change, message):
+    write_transforms(dataset)
+    edit(dataset.root, change)
+    with pytest.raises(InputError, match=rf"transforms\.json: {message}"):
+        open_packed(dataset.root)
+
+
+def test_missing_files(tmp_path, dataset):
+    with pytest.raises(InputError, match="no packed dataset here"):
+        open_packed(tmp_path)
+    write_transforms(dataset)
+    for folder in ("masks", "flags"):
+        (tmp_path / folder / "b.png").rename(tmp_path / "elsewhere.png")
+        with pytest.raises(InputError, match=rf"{folder}.b\.png: is missing"):
+            open_packed(tmp_path)
+        (tmp_path / "elsewhere.png").rename(tmp_path / folder / "b.png")
+
+
+def test_border_spectrum_is_the_background(tmp_path):
+    reflectance = np.full((64, 64, 3), 0.5)
+    reflectance[:2] = reflectance[-2:] = reflectance[:, :2] = reflectance[:, -2:] = [0.7, 0.8, 0.9]
+    foreground = np.zeros((64, 64), bool)
+    foreground[:40, 10:50] = True
+    reflectance[foreground] = 0.1
+    write_packed_cube(tmp_path / "c.hdr", pack(reflectance), WAVELENGTHS_NM)
+    np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), [0.7, 0.8, 0.9], atol=1e-4)
+    assert np.isnan(border_spectrum(tmp_path / "c.hdr", np.ones((64, 64), bool))).all()

@@ -1,0 +1,137 @@
+"""Marker detection and the fit of a marker's pattern, against rendered markers with known corners."""
+
+import cv2
+import numpy as np
+import pytest
+from turntable_scene import MarkerScene
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import project
+from hsi_sc_nerf.poses.fit import fit_marker
+from hsi_sc_nerf.poses.markers import detect_markers, dictionary_by_name, find_dictionary, marker_pattern
+from hsi_sc_nerf.poses.observe import find_blur
+
+DICTIONARY = "DICT_5X5_50"
+
+
+def truth_and_images(**options):
+    scene = MarkerScene(**{"frames": 4, **options})
+    corners = [
+        {m: project(c, pose, scene.intrinsics)[0] for m, c in scene.corners_m.items()}
+        for pose in scene.camera_to_world
+    ]
+    return corners, scene.render()
+
+
+@pytest.fixture(scope="module")
+def small():
+    return truth_and_images(size_px=128, noise=0.005)
+
+
+def fits(truth, images, blur_px=0.0):
+    for corners, image in zip(truth, images, strict=True):
+        for marker, start in detect_markers(image, DICTIONARY).items():
+            yield corners[marker], start, fit_marker(image.astype(float), DICTIONARY, marker, start, blur_px)
+
+
+def side(corners):
+    return np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=-1).mean()
+
+
+@pytest.mark.parametrize("width", [1100, 300])
+def test_detected_corners_count_from_the_images_corner(width):
+    # At the first width the image is taken as it is, at the second it is magnified.
+    page = np.full((200, width), 255, np.uint8)
+    page[50:120, 40:110] = cv2.aruco.generateImageMarker(dictionary_by_name(DICTIONARY), 4, 70)
+    found = detect_markers(page, DICTIONARY)
+    np.testing.assert_allclose(found[4], [[40, 50], [110, 50], [110, 120], [40, 120]], atol=0.1)
+
+
+def test_fitted_corners_are_good_to_hundredths_of_a_pixel(small):
+    found = [(truth, start, fitted) for truth, start, fitted in fits(*small) if fitted is not None]
+    assert len(found) >= 12
+    before = np.sqrt(np.mean([(start - truth) ** 2 for truth, start, _ in found]))
+    after = np.sqrt(np.mean([(fitted.corners_px - truth) ** 2 for truth, _, fitted in found]))
+    assert after < 0.06
+    assert after < before / 4
+    bias = np.mean([side(fitted.corners_px) / side(truth) - 1 for truth, _, fitted in found])
+    assert abs(bias) < 0.002  # 1 mm in half a metre
+
+
+def test_covariance_tells_the_size_of_the_error():
+    squared = [
+        (fitted.corners_px - truth).ravel()
+        @ np.linalg.solve(fitted.covariance_px2, (fitted.corners_px - truth).ravel())
+        for truth, _, fitted in fits(*truth_and_images(size_px=160, noise=0.03))
+        if fitted is not None
+    ]
+    assert 0.2 < np.median(squared) / 8 < 4.0
+
+
+def test_fit_moves_with_the_image(small):
+    _, images = small
+    marker, start = next(iter(detect_markers(images[0], DICTIONARY).items()))
+    image = images[0].astype(float)
+    here = fit_marker(image, DICTIONARY, marker, start)
+    moved = np.pad(image, ((2, 0), (3, 0)), mode="edge")
+    there = fit_marker(moved, DICTIONARY, marker, start + np.array([3.0, 2.0]))
+    np.testing.assert_allclose(there.corners_px - here.corners_px, np.tile([3.0, 2.0], (4, 1)), atol=1e-3)
+
+
+def test_fit_does_not_mind_exposure_and_shading(small):
+    _, images = small
+    marker, start = next(iter(detect_markers(images[0], DICTIONARY).items()))
+    image = images[0].astype(float)
+    here = fit_marker(image, DICTIONARY, marker, start)
+    darker = fit_marker(0.3 * image + 20.0, DICTIONARY, marker, start)
+    np.testing.assert_allclose(darker.corners_px, here.corners_px, atol=2e-3)
+    shaded = image * np.linspace(0.7, 1.3, image.shape[1])
+    np.testing.assert_allclose(fit_marker(shaded, DICTIONARY, marker, start).corners_px, here.corners_px, atol=0.03)
+
+
+def test_fit_refuses_another_marker_and_the_images_edge(small):
+    _, images = small
+    marker, start = next(iter(detect_markers(images[0], DICTIONARY).items()))
+    image = images[0].astype(float)
+    assert fit_marker(image, DICTIONARY, (marker + 1) % 50, start) is None
+    assert fit_marker(image, DICTIONARY, marker, start - np.array([start[:, 0].min(), 0.0])) is None
+    assert fit_marker(np.full_like(image, 7.0), DICTIONARY, marker, start) is None
+
+
+@pytest.mark.parametrize("blur_px", [0.0, 0.7])
+def test_blur_is_found(blur_px):
+    _, images = truth_and_images(size_px=160, blur_px=blur_px, noise=0.005)
+    detections = [detect_markers(image, DICTIONARY) for image in images]
+    assert find_blur(images, DICTIONARY, detections) == pytest.approx(blur_px, abs=0.08)
+
+
+@pytest.mark.parametrize("name", ["DICT_5X5_50", "DICT_4X4_50", "DICT_6X6_250"])
+def test_dictionary_is_found(name):
+    scene_dictionary = getattr(cv2.aruco, name)
+    cells = int(name[5]) + 2
+    book = cv2.aruco.getPredefinedDictionary(scene_dictionary)
+    highest = book.bytesList.shape[0] - 1
+    page = np.full((160, 320), 255, np.uint8)
+    for k, marker in enumerate((0, 7, highest)):
+        page[40 : 40 + 8 * cells, 20 + 100 * k : 20 + 100 * k + 8 * cells] = cv2.aruco.generateImageMarker(
+            book, marker, 8 * cells
+        )
+    assert find_dictionary([page, page, page]) == name
+
+
+def test_no_dictionary_where_there_is_no_marker():
+    noise = np.random.default_rng(0).integers(0, 255, (3, 96, 96)).astype(np.uint8)
+    assert find_dictionary(list(noise)) is None
+    assert detect_markers(noise[0], DICTIONARY) == {}
+
+
+def test_unknown_dictionary_is_refused():
+    with pytest.raises(InputError, match="DICT_5X5_50"):
+        dictionary_by_name("DICT_9X9")
+
+
+def test_pattern_has_a_black_border():
+    pattern = marker_pattern(DICTIONARY, 3)
+    assert pattern.shape == (7, 7)
+    assert pattern[[0, -1]].sum() == pattern[:, [0, -1]].sum() == 0
+    assert set(np.unique(pattern)) == {0, 1}

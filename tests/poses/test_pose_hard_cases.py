@@ -1,0 +1,408 @@
+"""Poses from markers in hard cases: on exact corners of machines that are not perfect, and on simulated sessions."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from turntable_scene import MarkerScene
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses.adjust import reproject, whitening
+from hsi_sc_nerf.poses.choose import LOSS_SIGMAS, choose
+from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
+from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m
+from hsi_sc_nerf.poses.initialise import Observations, Turntable
+from hsi_sc_nerf.poses.knocked import frame_motions
+from hsi_sc_nerf.poses.outliers import KNOCKED, adjust_without_outliers, usable, well_known
+from hsi_sc_nerf.poses.picture import draw_poses
+from hsi_sc_nerf.poses.scale import apparent_sides, container_diameter, length_sigma, resized
+from hsi_sc_nerf.simulate.frames import Simulation
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from pose_hard_cases import CASES, Case, grey_images, pose, scene_of
+
+SIDE_M, CENTRE_PX, NOISE_PX = 0.03, (128.0, 128.0), 0.03
+
+
+def true_machine(scene, **changes):
+    """The scene's machine in the adjustment's terms."""
+    pose_in_object = scene.first_camera_to_world
+    camera_m = pose_in_object[:3, 3]
+    markers = np.array(sorted(scene.corners_m))
+    poses = np.tile(np.eye(4), (len(markers), 1, 1))
+    for marker_pose, marker in zip(poses, markers, strict=True):
+        corners = scene.corners_m[marker]
+        x, y = corners[1] - corners[0], corners[0] - corners[3]
+        axes = np.stack([x / np.linalg.norm(x), y / np.linalg.norm(y)], axis=-1)
+        marker_pose[:3, :3] = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+        marker_pose[:3, 3] = corners.mean(0) - [0.0, 0.0, camera_m[2]]
+    machine = Turntable(
+        scene.intrinsics.fl_x,
+        (pose_in_object @ np.diag([1.0, -1.0, -1.0, 1.0]))[:3, :3].T,
+        float(np.hypot(camera_m[0], camera_m[1])),
+        np.arange(scene.frames),
+        np.deg2rad(scene.angles_deg),
+        markers,
+        poses,
+    )
+    return replace(machine, **changes)
+
+
+def observed(machine, side_m=SIDE_M, noise_px=NOISE_PX, seed=0):
+    """Noisy corners of all markers that face the camera."""
+    rng = np.random.default_rng(seed)
+    rotations, shifts = machine.motions()
+    normals, centres = machine.marker_poses[:, :3, 2], machine.marker_poses[:, :3, 3]
+    pairs = []
+    for frame, (rotation, shift) in enumerate(zip(rotations, shifts, strict=True)):
+        view = ([machine.distance_m, 0.0, 0.0] - shift) @ rotation - centres
+        facing = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1) > 0.25
+        pairs += [(frame, marker) for marker in machine.markers[facing]]
+    frame, marker = np.array(pairs).T
+    covariance = np.tile(np.eye(8) * NOISE_PX**2, (len(frame), 1, 1))
+    blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), covariance)
+    corners = reproject(machine, blank, CENTRE_PX, side_m)
+    return replace(blank, corners_px=corners + noise_px * rng.normal(size=corners.shape))
+
+
+def solved(machine, observations):
+    start = replace(machine, radial=(0.0, 0.0), tilts_rad=None, shifts_m=None, focal_px=1.01 * machine.focal_px)
+    return choose(start, observations, CENTRE_PX, SIDE_M, whitening(observations.covariance_px2))
+
+
+def wobbling(amplitude_deg, frames=18, cycles=2.0, seed=None):
+    scene = MarkerScene(size_px=256, frames=frames)
+    phase = cycles * np.deg2rad(scene.angles_deg)
+    if seed is not None:
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, frames)
+    tilts = np.deg2rad(amplitude_deg) * np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+    # The table leans about a point 0.12 m below the camera's height.
+    foot = np.array([0.0, 0.0, -0.12])
+    lean = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1)))).as_matrix()
+    return true_machine(scene, tilts_rad=tilts, shifts_m=foot - lean @ foot)
+
+
+def relative_errors(found, truth):
+    """Errors of poses against the first frame's, which no choice of the axes changes: degrees and millimetres."""
+    steps = [np.linalg.inv(poses[0]) @ poses for poses in (found, truth)]
+    rotation = max(rotation_angle_deg(a, b) for a, b in zip(*steps, strict=True))
+    return rotation, 1e3 * np.abs(steps[0][:, :3, 3] - steps[1][:, :3, 3]).max()
+
+
+@pytest.mark.parametrize(("amplitude_deg", "seed"), [(0.3, None), (1.0, None), (0.5, 3)])
+def test_a_wobbling_table_gets_free_poses(amplitude_deg, seed):
+    machine = wobbling(amplitude_deg, seed=seed)
+    found = solved(machine, observed(machine)).turntable
+    assert found.tilts_rad is not None
+    rotation, position = relative_errors(camera_to_world(found, -0.1), camera_to_world(machine, -0.1))
+    assert rotation < 0.06
+    assert position < 0.4
+    # Against the one axis that is nearest, the same poses would be wrong by the wobble.
+    still = replace(machine, tilts_rad=None, shifts_m=None)
+    assert relative_errors(camera_to_world(still, -0.1), camera_to_world(machine, -0.1))[0] > amplitude_deg
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_steady_table_and_a_straight_lens_stay_so(seed):
+    machine = true_machine(MarkerScene(size_px=256, frames=14))
+    found = solved(machine, observed(machine, seed=seed)).turntable
+    assert found.tilts_rad is None
+    assert found.radial == (0.0, 0.0)
+
+
+def test_a_disc_that_sits_askew_on_a_steady_axis_is_no_wobble():
+    machine = wobbling(1.0, cycles=1.0)
+    assert solved(machine, observed(machine)).turntable.tilts_rad is None
+
+
+@pytest.mark.parametrize("radial", [(-0.15, 0.0), (0.1, 0.0), (-0.3, 1.5)])
+def test_lens_distortion_is_found(radial):
+    machine = true_machine(MarkerScene(size_px=256, frames=18, fov_deg=35.0), radial=radial)
+    found = solved(machine, observed(machine)).turntable
+    assert found.tilts_rad is None
+    assert found.focal_px == pytest.approx(machine.focal_px, rel=2e-3)
+    corner = 0.25 * np.tan(np.deg2rad(17.5))  # within what the markers reach
+    squared = (4.0 * corner) ** 2 * np.linspace(0.0, 1.0, 5)
+    np.testing.assert_allclose(
+        squared * (found.radial[0] + found.radial[1] * squared),
+        squared * (radial[0] + radial[1] * squared),
+        atol=3e-3,
+    )
+    assert (found.radial[1] == 0.0) == (radial[1] == 0.0)
+
+
+def test_lens_and_table_are_told_apart():
+    machine = replace(wobbling(0.5), radial=(-0.15, 0.0))
+    found = solved(machine, observed(machine)).turntable
+    assert found.tilts_rad is not None
+    assert found.radial[0] == pytest.approx(-0.15, abs=0.03)
+
+
+def test_displaced_markers_are_thrown_out():
+    machine = true_machine(MarkerScene(size_px=256, frames=14))
+    observations = observed(machine)
+    corners = observations.corners_px.copy()
+    displaced = [10, 33, 52]
+    corners[displaced] += np.array([3.0, -3.0])
+    spoilt = replace(observations, corners_px=corners)
+    adjusted, kept, rejected = adjust_without_outliers(machine, spoilt, CENTRE_PX, SIDE_M)
+    assert [(r.frame, r.marker) for r in rejected] == [(spoilt.frame[i], spoilt.marker[i]) for i in displaced]
+    np.testing.assert_allclose([r.error_px for r in rejected], 3.0 * np.sqrt(2.0), atol=0.2)
+    assert len(kept) == len(spoilt) - len(rejected)
+    assert adjusted.turntable.tilts_rad is None
+    assert adjusted.turntable.focal_px == pytest.approx(machine.focal_px, rel=2e-3)
+
+
+def knocked(machine, frames, tilt_deg, shift_m, seed=0):
+    """The machine with some frames tilted and shifted."""
+    rng = np.random.default_rng(seed)
+    n = len(machine.frames)
+    tilts = np.zeros((n, 2)) if machine.tilts_rad is None else machine.tilts_rad.copy()
+    shifts = np.zeros((n, 3)) if machine.shifts_m is None else machine.shifts_m.copy()
+    for moved, size in ((tilts, np.deg2rad(tilt_deg)), (shifts, shift_m)):
+        directions = rng.normal(size=(len(frames), moved.shape[1]))
+        moved[list(frames)] += size * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return replace(machine, tilts_rad=tilts, shifts_m=shifts)
+
+
+@pytest.mark.parametrize(
+    ("frames", "which", "tilt_deg", "shift_m"),
+    [(14, [6], 0.2, 0.0002), (14, [0], 8.0, 0.015), (30, [4, 5, 19], 0.3, 0.0003), (30, [0, 11, 29], 2.0, 0.003)],
+)
+def test_a_few_knocked_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
+    machine = true_machine(MarkerScene(size_px=256, frames=frames))
+    observations = observed(knocked(machine, which, tilt_deg, shift_m))
+    adjusted, kept, rejected = adjust_without_outliers(machine, observations, CENTRE_PX, SIDE_M)
+    assert adjusted.turntable.tilts_rad is None
+    assert sorted(adjusted.knocked) == which
+    assert sorted({r.frame for r in rejected}) == which
+    assert all(r.why == KNOCKED and r.error_px > 3.0 * NOISE_PX for r in rejected)
+    np.testing.assert_array_equal(np.unique(kept.frame), adjusted.turntable.frames)
+    assert len(kept) + len(rejected) == len(observations)
+    rotation, position = relative_errors(
+        camera_to_world(adjusted.turntable, -0.1), camera_to_world(machine.restricted(kept), -0.1)
+    )
+    assert rotation < 0.05
+    assert position < 0.4
+
+
+@pytest.mark.parametrize("which", [[], [5]])
+def test_a_table_that_wobbles_is_not_taken_for_knocked_frames(which):
+    machine = knocked(wobbling(0.1, frames=24), which, 2.0, 0.003)
+    adjusted, _, rejected = adjust_without_outliers(machine, observed(machine), CENTRE_PX, SIDE_M)
+    assert adjusted.turntable.tilts_rad is not None
+    assert adjusted.knocked == {}
+    assert rejected == []
+
+
+def test_more_knocks_than_a_few_are_a_wobble():
+    machine = knocked(true_machine(MarkerScene(size_px=256, frames=20)), range(1, 20, 5), 1.0, 0.001)
+    assert solved(machine, observed(machine)).turntable.tilts_rad is not None
+
+
+def test_one_displaced_marker_is_no_knocked_frame():
+    machine = true_machine(MarkerScene(size_px=256, frames=14))
+    observations = observed(machine)
+    corners = observations.corners_px + np.where(np.arange(len(observations)) == 33, 2.0, 0.0)[:, None, None]
+    weights = whitening(observations.covariance_px2)
+    found = frame_motions(machine, replace(observations, corners_px=corners), CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
+    assert found.chance.min() > 1e-4
+    moved = np.where(observations.frame == 3, 0.5, 0.0)[:, None, None] * [1.0, -1.0]
+    bumped = replace(observations, corners_px=corners + moved)
+    found = frame_motions(machine, bumped, CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
+    assert np.flatnonzero(found.chance < 1e-6).tolist() == [3]
+    assert 0.2 < found.away_px[3] < 0.75
+
+
+@pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
+def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames, which):
+    scene = MarkerScene(size_px=128, frames=frames, knocked=which)
+    names = scene.names()
+    poses = estimate_turntable_poses(scene.render(), names, marker_side_m=SIDE_M, progress=False)
+    assert poses.model == "turntable"
+    assert set(poses.dropped) == {names[i] for i in which}
+    assert all(KNOCKED in why for why in poses.dropped.values())
+    truth = rotation_about_z(scene.angles_deg[poses.used][0]) @ scene.camera_to_world[poses.used]
+    rotation, position = relative_errors(poses.camera_to_world[poses.used], truth)
+    assert rotation < 0.1
+    assert position < 1.5
+    (warning,) = [w for w in poses.report()["warnings"] if "left out" in w]
+    assert warning.startswith(f"{len(which)} of {frames} frames are left out: {', '.join(names[i] for i in which)} (")
+
+
+def test_a_session_on_a_wobbling_table_keeps_its_frames():
+    scene = MarkerScene(size_px=128, frames=10, wobble_deg=0.5)
+    poses = estimate_turntable_poses(scene.render(), scene.names(), marker_side_m=SIDE_M, progress=False)
+    assert poses.model == "free poses"
+    assert poses.used.all()
+    assert poses.wobble_deg == pytest.approx(0.5, abs=0.1)
+
+
+def test_markers_that_cannot_count_are_named_with_the_reason():
+    machine = true_machine(MarkerScene(size_px=256, frames=10))
+    observations = observed(machine)
+    rng = np.random.default_rng(0)
+    still = np.tile(observations.corners_px[0], (10, 1, 1)) + 0.01 * rng.normal(size=(10, 4, 2))
+    extra = Observations(
+        np.append(np.arange(10), 4), np.append(np.full(10, 40), 41), np.concatenate([still, still[:1] + 9.0]),
+        observations.covariance_px2[:11],
+    )  # fmt: skip
+    both = Observations(
+        *(np.concatenate([getattr(observations, k), getattr(extra, k)]) for k in Observations.__dataclass_fields__)
+    )
+    kept, rejected, stands_still = usable(both)
+    assert stands_still == [40]
+    assert len(kept) == len(observations)
+    assert {(r.marker, r.why) for r in rejected} == {
+        (40, "it stands still in the image"),
+        (41, "it is seen in no other frame"),
+    }
+
+
+def test_a_frame_whose_angle_is_hardly_known_is_left_out():
+    machine = true_machine(MarkerScene(size_px=256, frames=12))
+    observations = observed(machine)
+    covariance = observations.covariance_px2.copy()
+    covariance[observations.frame == 5] *= 400.0**2
+    vague = replace(observations, covariance_px2=covariance)
+    adjusted, kept, rejected = well_known(solved(machine, vague), vague, CENTRE_PX, SIDE_M)
+    assert 5 not in adjusted.turntable.frames
+    assert {r.frame for r in rejected} == {5}
+    assert len(kept) + len(rejected) == len(vague)
+    vague = replace(observations, covariance_px2=400.0**2 * covariance)
+    adjusted = solved(machine, vague)
+    with pytest.raises(InputError, match="larger or sharper"):
+        well_known(adjusted, vague, CENTRE_PX, SIDE_M)
+
+
+def test_uncertainties_are_those_of_the_errors():
+    machine = true_machine(MarkerScene(size_px=256, frames=12))
+    errors, angles = [], []
+    for seed in range(12):
+        adjusted = solved(machine, observed(machine, seed=seed))
+        covariance = adjusted.covariance()
+        away = np.rad2deg(np.unwrap(adjusted.turntable.angles_rad) - machine.angles_rad)
+        angles.append((away - away.mean()) / adjusted.angle_sigmas_deg(covariance))
+        radius = np.linalg.norm(adjusted.turntable.marker_poses[:, :2, 3])
+        errors.append(
+            [
+                np.log(adjusted.turntable.focal_px / machine.focal_px) / np.sqrt(covariance[0, 0]),
+                np.log(adjusted.turntable.distance_m / machine.distance_m) / np.sqrt(covariance[4, 4]),
+                np.log(radius / np.linalg.norm(machine.marker_poses[:, :2, 3]))
+                / length_sigma(adjusted.turntable, adjusted.problem, covariance),
+            ]
+        )
+    spread = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert spread.min() > 0.5
+    assert spread.max() < 1.6
+    assert 0.75 < np.sqrt(np.mean(np.square(angles))) < 1.25
+
+
+def test_a_marker_of_another_side_stands_out():
+    machine = true_machine(MarkerScene(size_px=256, frames=14))
+    observations = observed(machine)
+    centre = observations.corners_px.mean(axis=1, keepdims=True)
+    grown = (observations.marker == 3)[:, None, None]
+    corners = np.where(grown, centre + 1.01 * (observations.corners_px - centre), observations.corners_px)
+    adjusted = solved(machine, replace(observations, corners_px=corners))
+    sides, sigmas = apparent_sides(adjusted.turntable, adjusted.problem, LOSS_SIGMAS)
+    assert sides[3] == pytest.approx(1.01 - 0.01 / len(sides), abs=2e-3)
+    assert np.abs(np.delete(sides, 3) - 1.0).max() < 5e-3
+    assert sigmas.min() > 1e-4
+    assert sigmas.max() < 3e-3
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 0.01])
+def test_the_container_is_measured_by_its_markers(shift_m):
+    machine = true_machine(MarkerScene(size_px=256, frames=4))
+    poses = machine.marker_poses.copy()
+    poses[:, 0, 3] += shift_m
+    machine = replace(machine, marker_poses=poses)
+    disc_m = disc_height_m(machine, SIDE_M)
+    faces = machine.marker_poses[:, :3, 2], machine.marker_poses[:, :3, 3]
+    assert container_diameter(*faces, SIDE_M, disc_m, 0.07) == pytest.approx(2 * 0.0455, abs=1e-9)
+    larger = resized(machine, 1.7).marker_poses
+    assert container_diameter(larger[:, :3, 2], larger[:, :3, 3], 1.7 * SIDE_M, 1.7 * disc_m, None) == pytest.approx(
+        1.7 * 2 * 0.0455, abs=1e-9
+    )
+    assert container_diameter(*faces, SIDE_M, disc_m, 0.02) is None
+    corners = reproject(machine, observed(machine), CENTRE_PX, SIDE_M)
+    np.testing.assert_allclose(
+        corners, reproject(resized(machine, 2.0), observed(machine), CENTRE_PX, 2.0 * SIDE_M), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "size_px", "frames", "largest_deg", "largest_mm"),
+    [
+        ("one or two markers visible", 128, 24, 0.2, 2.5),
+        ("markers hidden by the object", 128, 8, 0.1, 2.0),
+        ("two frames covered", 128, 12, 0.1, 2.0),
+        ("textured background", 128, 12, 0.1, 2.0),
+        ("blurred and noisy", 224, 6, 0.15, 2.5),
+        ("every fifth frame out of focus", 128, 12, 0.2, 2.0),
+    ],
+)
+def test_hard_session_is_posed(name, size_px, frames, largest_deg, largest_mm):
+    # The target of 0.5 mm at 512 px is 2 mm at 128 px.
+    posed = pose(CASES[name], size_px, frames)
+    covered = [2, 7] if name == "two frames covered" else []
+    np.testing.assert_array_equal(np.flatnonzero(~posed.poses.used), covered)
+    assert set(posed.poses.dropped) == {posed.poses.names[i] for i in covered}
+    assert posed.poses.model == "turntable"
+    assert posed.poses.distortion == (0.0, 0.0, 0.0, 0.0)
+    assert posed.rotation_deg.max() < largest_deg
+    assert posed.place_mm.max() < largest_mm
+    assert abs(posed.focal_percent) < 0.7
+
+
+def test_a_wobbling_and_distorted_session_is_posed_and_reported(tmp_path):
+    effects = ("{wobble: {amplitude_deg: 1}}", "{lens_distortion: {k1: -0.3}}", "{axis_tilt: {tilt_deg: 5}}")
+    posed = pose(Case(effects, any_axis=True), 224, 10)
+    assert posed.poses.model == "free poses"
+    assert posed.rotation_deg.max() < 0.1
+    assert posed.place_mm.max() < 0.7
+    assert posed.poses.distortion[0] == pytest.approx(-0.3, abs=0.05)
+    assert posed.poses.distortion[2:] == (0.0, 0.0)
+    report = json.loads(json.dumps(posed.poses.report()))
+    assert report["model"] == "free poses"
+    assert report["wobble_deg"] == pytest.approx(1.0, abs=0.1)
+    assert any("wobbles" in warning for warning in report["warnings"])
+    assert abs(report["axis_tilt_in_image_deg"]) == pytest.approx(5.0, abs=0.1)
+    # The simulator's plaques stand off the container's wall by 0.5 mm.
+    assert report["scale"]["container_diameter_m"]["disagreement_percent"] == pytest.approx(100.0 / 90.0, abs=0.3)
+    assert report["scale"]["uncertainty_percent"] < 0.1
+    assert report["uncertainty"]["focal_percent"] < 0.3
+    draw_poses(posed.poses, tmp_path / "poses.png")
+    assert (tmp_path / "poses.png").stat().st_size > 1000
+
+
+def test_the_container_alone_gives_the_scale_and_a_wrong_one_is_noticed():
+    scene = scene_of(Case(), 128, 8)
+    simulation = Simulation(scene)
+    images = grey_images(simulation)
+    wall_m = scene.container.diameter_m + 0.001  # what the plaques touch
+    known = {"dictionary": scene.markers.dictionary, "container_height_m": 0.07, "progress": False}
+    poses = estimate_turntable_poses(
+        images, simulation.captures, marker_side_m=None, container_diameter_m=wall_m, **known
+    )
+    assert poses.scale.source == "container"
+    assert poses.scale.marker_side_m == pytest.approx(scene.markers.side_m, rel=5e-3)
+    away_m = np.linalg.norm(poses.camera_to_world[:, :3, 3] - simulation.camera_to_world[:, :3, 3], axis=-1)
+    assert away_m.max() < 4e-3
+    wrong = estimate_turntable_poses(
+        images, simulation.captures, marker_side_m=1.05 * scene.markers.side_m, container_diameter_m=wall_m, **known
+    )
+    assert wrong.scale.disagreement_percent == pytest.approx(5.0, abs=0.5)
+    assert any("% wider than given" in warning for warning in wrong.report()["warnings"])
+
+
+def test_without_any_length_the_session_is_refused():
+    images = [np.zeros((16, 16), np.uint8)] * 3
+    with pytest.raises(InputError, match="marker_side_m"):
+        estimate_turntable_poses(images, list("abc"), marker_side_m=None, progress=False)

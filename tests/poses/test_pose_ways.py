@@ -1,0 +1,213 @@
+"""Which way to poses a session supports, and that all ways end in the same form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses import ways
+from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.report import describe_poses
+from hsi_sc_nerf.poses.scale import Scale
+from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
+from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, to_8_bit
+
+SIZE_PX, FRAMES = 288, 24
+CONFIG = FeatureConfig()
+
+
+@pytest.fixture(scope="module")
+def pear():
+    """Gray images, names, true poses and intrinsics of a pear with markers."""
+    simulation = Simulation(override(load_scene("pear"), size_px=SIZE_PX, frames=FRAMES, bands=4, effects=[]))
+    inside = bands_within(simulation.wavelengths_nm, (450.0, 700.0))
+    dark = float(simulation.scene.sensor.dark_level)
+    white = simulation.white().counts[SIZE_PX // 2, SIZE_PX // 2, inside] - dark
+    images = [
+        to_8_bit(((simulation.frame(i).counts[..., inside] - dark) / white).mean(axis=-1)) for i in range(FRAMES)
+    ]
+    return images, list(simulation.captures), simulation.camera_to_world, simulation.intrinsics
+
+
+def facts(**values):
+    side_m = load_scene("pear").markers.side_m
+    return replace(SessionFacts(marker_side_m=side_m, nominal_step_deg=360.0 / FRAMES, direction="ccw"), **values)
+
+
+def largest_errors(poses, truth):
+    rotation = max(rotation_angle_deg(a, b) for a, b in zip(poses.camera_to_world, truth, strict=True))
+    place = np.linalg.norm(poses.camera_to_world[:, :3, 3] - truth[:, :3, 3], axis=-1).max()
+    return rotation, place
+
+
+def test_auto_takes_markers(pear):
+    images, names, truth, _ = pear
+    poses = find_poses(images, names, facts(), "auto", CONFIG, progress=False)
+    assert (poses.method, poses.chosen) == ("markers", "by markers")
+    rotation_deg, place_m = largest_errors(poses, truth)
+    assert rotation_deg < 0.1
+    assert place_m < 0.5e-3
+
+
+@pytest.mark.parametrize("way", ["colmap", "angles"])
+def test_features_find_the_poses_and_markers_their_scale(pear, way):
+    images, names, truth, intrinsics = pear
+    poses = find_poses(images, names, facts(), way, CONFIG, progress=False)
+    assert poses.method == way
+    assert poses.metric
+    assert poses.used.all()
+    rotation_deg, _ = largest_errors(poses, truth)
+    assert rotation_deg < 0.3
+    # The focal length and the distance are hardly told from each other; together they give the size in the image.
+    distance, true_distance = (np.linalg.norm(p[0, :2, 3]) for p in (poses.camera_to_world, truth))
+    assert poses.intrinsics.fl_x / distance == pytest.approx(intrinsics.fl_x / true_distance, rel=5e-3)
+    assert len(poses.disc_markers) == load_scene("pear").markers.on_disc
+    for corners in poses.marker_corners_m.values():
+        side_m = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=-1).mean()
+        assert side_m == pytest.approx(load_scene("pear").markers.side_m, rel=0.02)
+    disc = np.concatenate([poses.marker_corners_m[m] for m in poses.disc_markers])
+    assert np.abs(disc[:, 2]).max() < 1e-3
+
+
+def test_without_markers_and_a_known_distance_there_is_no_scale(pear, monkeypatch):
+    images, names, truth, _ = pear
+    monkeypatch.setattr("hsi_sc_nerf.poses.from_features.find_dictionary", lambda images: None)
+    by_hand = facts(marker_side_m=None, camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])))
+    unknown = facts(marker_side_m=None)
+    metric, free = (find_poses(images, names, f, "angles", CONFIG, progress=False) for f in (by_hand, unknown))
+    assert metric.metric
+    assert not free.metric
+    assert any("nothing gives the scale" in warning for warning in free.report()["warnings"])
+    assert not any("nothing gives the scale" in warning for warning in metric.report()["warnings"])
+    for poses, distance in ((metric, by_hand.camera_distance_m), (free, 1.0)):
+        assert np.linalg.norm(poses.camera_to_world[0, :2, 3]) == pytest.approx(distance, rel=1e-6)
+
+
+def fails(*_, **__):
+    raise InputError("it fails.")
+
+
+def test_auto_says_why_not(pear, monkeypatch):
+    images, names, truth, intrinsics = pear
+    monkeypatch.setattr(ways, "estimate_turntable_poses", fails)
+    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    camera = KnownCamera(intrinsics, (0.0, 0.0, 0.0, 0.0), truth[0])
+    poses = find_poses(images, names, facts(camera=camera), "auto", CONFIG, progress=False)
+    assert largest_errors(poses, truth)[1] < 1e-9
+    assert poses.method == "angles"
+    assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
+
+
+def test_where_colmap_fails_known_angles_are_a_start(pear, monkeypatch):
+    images, names, truth, _ = pear
+    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    given = np.arange(FRAMES) * 360.0 / FRAMES + np.where(np.arange(FRAMES) % 5 == 2, 1.5, 0.0)
+    poses = find_poses(images, names, facts(frame_angles_deg=tuple(given)), "colmap", CONFIG, progress=False)
+    assert poses.method == "angles"
+    assert poses.chosen.startswith(
+        "by features, from known angles that were adjusted (not by features (COLMAP): it f"
+    )
+    assert any("known angles were taken to start from" in warning for warning in poses.report()["warnings"])
+    assert poses.used.all()
+    away = poses.angles_deg - np.arange(FRAMES) * 360.0 / FRAMES
+    assert np.abs(away - away.mean()).max() < 0.3
+    assert largest_errors(poses, truth)[0] < 0.5
+
+
+def test_where_colmap_fails_and_no_angle_is_known_it_says_why(pear, monkeypatch):
+    images, names, _, _ = pear
+    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    with pytest.raises(InputError, match=r"^it fails\.$"):
+        find_poses(images, names, facts(nominal_step_deg=None), "colmap", CONFIG, progress=False)
+    monkeypatch.setattr(ways, "poses_by_freed_angles", fails)
+    with pytest.raises(InputError, match="it fails; nor do features suit the known angles: it fails"):
+        find_poses(images, names, facts(), "colmap", CONFIG, progress=False)
+
+
+def test_no_way_works(pear, monkeypatch):
+    images, names, _, _ = pear
+    for way in ("estimate_turntable_poses", "poses_by_colmap", "poses_by_angles"):
+        monkeypatch.setattr(ways, way, fails)
+    with pytest.raises(InputError, match="no way to poses works: markers: it fails; features"):
+        find_poses(images, names, facts(), "auto", CONFIG, progress=False)
+
+
+CAMERA = KnownCamera(
+    PinholeIntrinsics(64, 48, 100.0, 100.0, 32.0, 24.0),
+    (0.01, 0.0, 0.0, 0.0),
+    look_at([0.4, 0.0, 0.2], [0, 0, 0.06]),
+    "ccw",
+)
+BLANK = [np.zeros((48, 64), np.uint8)] * 4
+
+
+@pytest.mark.parametrize(
+    ("told", "before", "sign"), [("ccw", None, 1.0), ("cw", "ccw", -1.0), (None, "ccw", 1.0), (None, "cw", -1.0)]
+)
+def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
+    camera = replace(CAMERA, direction=before)
+    known = SessionFacts(camera=camera, frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=told)
+    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    np.testing.assert_allclose(poses.angles_deg, sign * np.array([0.0, 10.0, 25.0, 80.0]))
+    for pose, angle in zip(poses.camera_to_world, poses.angles_deg, strict=True):
+        np.testing.assert_allclose(pose, rotation_about_z(-angle) @ CAMERA.camera_to_world, atol=1e-12)
+    assert poses.distortion == CAMERA.distortion
+    report = poses.report()
+    assert report["reprojection_error_px"]["overall"] is None
+    assert "nothing was measured" in report["warnings"][0]
+
+
+def test_angles_that_are_not_there():
+    with pytest.raises(InputError, match="the angles are not known"):
+        find_poses(BLANK, list("abcd"), SessionFacts(camera=CAMERA), "angles", CONFIG, progress=False)
+    few = SessionFacts(camera=CAMERA, frame_angles_deg=(0.0, 1.0))
+    with pytest.raises(InputError, match="2 frame angles are given for 4 frames"):
+        find_poses(BLANK, list("abcd"), few, "angles", CONFIG, progress=False)
+
+
+def test_a_direction_that_nothing_tells():
+    known = SessionFacts(camera=replace(CAMERA, direction=None), nominal_step_deg=90.0)
+    with pytest.raises(InputError, match=r"which way the turntable turns is not known.*give direction"):
+        find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+
+
+def test_a_camera_of_other_images():
+    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
+    images = [np.zeros((10, 10), np.uint8)] * 4
+    with pytest.raises(InputError, match="10 x 10 pixels, but the camera of the earlier session had 64 x 48"):
+        find_poses(images, list("abcd"), known, "angles", CONFIG, progress=False)
+
+
+def test_a_camera_that_no_one_has_is_not_believed(monkeypatch):
+    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
+    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
+        found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
+        monkeypatch.setattr(ways, "poses_by_colmap", lambda *_, found=found: found)
+        if believed:
+            assert find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG).intrinsics.fl_x == focal_px
+            continue
+        with pytest.raises(InputError, match="too few to tell the camera"):
+            find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG)
+
+
+def test_the_figures_in_words_and_the_warning_above_one_pixel():
+    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
+    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    words = ", ".join(describe_poses(poses, poses.report()))
+    assert words.startswith("4 of 4 frames, one axis, axis leans ")
+    assert words.endswith("scale as given")
+    scale = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.092)
+    worse = replace(poses, overall_error_px=1.2, loop_closure_deg=-0.25, disc_tilt_deg=0.5, scale=scale)
+    words = ", ".join(describe_poses(worse, worse.report()))
+    for part in ("error 1.20 px", "closes to 0.250°", "0.50° to the disc", "markers ± 0.20 % (by it", "+2.2 % off"):
+        assert part in words
+    assert "the reprojection error of 1.20 px is above 1.0 px" in worse.report()["warnings"]
+    assert not any("above 1.0 px" in w for w in replace(poses, overall_error_px=0.99).report()["warnings"])

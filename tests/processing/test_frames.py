@@ -1,0 +1,161 @@
+"""What one frame leaves behind in a packed dataset, and when it counts as finished."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.calibration.pixel_counts import Tally
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
+from hsi_sc_nerf.processing import frames
+from hsi_sc_nerf.processing.frames import FramePaths, border_spectrum, finished_notes, process_frame
+from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
+
+WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
+BANDS = len(WAVELENGTHS_NM)
+PICTURES = {"pseudo_rgb_nm": (600.0, 550.0, 450.0), "marker_range_nm": (490.0, 660.0)}
+CALIBRATION = FrameCalibration(
+    dark=np.full((1, BANDS), 100.0),
+    gain=np.full((1, BANDS), 1 / 2000),
+    bands=np.arange(BANDS),
+    saturation_counts=4000.0,
+)
+
+
+@pytest.fixture
+def cube(tmp_path):
+    reflectance = np.random.default_rng(0).uniform(-0.02, 1.05, (20, 16, BANDS))
+    counts = np.rint(reflectance * 2000 + 100).astype(np.uint16)
+    counts[3, 4, 2] = 4050
+    write_cube(
+        tmp_path / "raw.hdr",
+        counts,
+        wavelengths_nm=WAVELENGTHS_NM,
+        extra_header={"fwhm": [7.0, 7.1, 7.2, 7.3, 7.4, 8.0]},
+    )
+    return open_cube(tmp_path / "raw.hdr")
+
+
+def process(cube, root, calibration=CALIBRATION, stamp="made"):
+    paths = FramePaths.of(root, "frame")
+    return paths, process_frame(cube, calibration, paths, stamp, MaskConfig(smoothing_px=0.0), **PICTURES)
+
+
+def test_everything_is_written_upright(cube, tmp_path):
+    bands = np.array([0, 1, 2, 3, 4])
+    paths, notes = process(cube, tmp_path / "data", replace(CALIBRATION, bands=bands, quarter_turns=1))
+    packed = open_cube(paths.cube)
+    assert packed.shape == (16, 20, 5)
+    np.testing.assert_array_equal(packed.wavelengths_nm, WAVELENGTHS_NM[bands])
+    np.testing.assert_array_equal(packed.fwhm_nm, [7.0, 7.1, 7.2, 7.3, 7.4])
+    assert (packed.reflectance_scale, packed.ignore_value) == (REFLECTANCE_SCALE, FLAGGED)
+
+    expected = np.rot90(np.clip((cube.read()[..., bands] - 100.0) / 2000, 0.0, 1.0))
+    reflectance, valid = unpack(packed.read())
+    assert np.argwhere(~valid).tolist() == [[11, 3, 2]]
+    np.testing.assert_allclose(reflectance[valid], expected[valid], atol=1.01 / REFLECTANCE_SCALE)
+    flags = cv2.imread(str(paths.flags), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(flags, np.where(valid.all(axis=-1), 0, PixelFlag.SATURATED))
+    picture = cv2.imread(str(paths.image))[..., ::-1]
+    np.testing.assert_allclose(picture / 255.0, expected[..., [3, 2, 0]], atol=0.5 / 255 + 1e-4)
+    np.testing.assert_allclose(notes.gray / 255.0, expected[..., 1:5].mean(axis=-1), atol=0.5 / 255 + 1e-4)
+    np.testing.assert_allclose(notes.score, expected.std(axis=-1), atol=1e-4)
+    assert notes.tally.saturated.tolist() == [0, 0, 1, 0, 0]
+    assert notes.tally.clipped_low.min() > 0
+    assert not list((tmp_path / "data").rglob("*partial*"))
+
+
+def test_finished_reflectance_goes_the_same_way(tmp_path):
+    rng = np.random.default_rng(1)
+    stored = rng.uniform(0.0, 10_000.0, (8, 6, BANDS)).astype(np.float32)
+    stored[2, 3] = -9999.0
+    header = {"reflectance scale factor": 10_000, "data ignore value": -9999}
+    path = tmp_path / "product.hdr"
+    write_cube(path, stored, wavelengths_nm=WAVELENGTHS_NM, interleave="bsq", extra_header=header)
+    cube = open_cube(path)
+    calibration = FrameCalibration(
+        dark=np.zeros((1, BANDS)),
+        gain=np.full((1, BANDS), 1 / cube.reflectance_scale),
+        bands=np.arange(BANDS),
+        ignore_value=cube.ignore_value,
+    )
+    paths, notes = process(cube, tmp_path / "data", calibration)
+    reflectance, valid = unpack(open_cube(paths.cube).read())
+    np.testing.assert_array_equal(valid, stored != -9999.0)
+    np.testing.assert_allclose(reflectance[valid], stored[valid] / 10_000, atol=1e-5)
+    assert notes.tally.no_data.tolist() == [1] * BANDS
+    assert notes.score[2, 3] < 1e-6
+
+
+def test_notes_of_a_finished_frame_are_read_again(cube, tmp_path):
+    paths, notes = process(cube, tmp_path / "data")
+    again = finished_notes(paths, "made")
+    assert again.fingerprint == "made"
+    np.testing.assert_array_equal(again.gray, notes.gray)
+    np.testing.assert_array_equal(again.score, notes.score)
+    for field in fields(Tally):
+        np.testing.assert_array_equal(getattr(again.tally, field.name), getattr(notes.tally, field.name))
+    assert finished_notes(paths, "other files") is None
+
+
+@pytest.mark.parametrize("kind", ["image", "cube", "flags", "notes"])
+def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
+    paths, _ = process(cube, tmp_path / "data")
+    getattr(paths, kind).unlink()
+    assert finished_notes(paths, "made") is None
+
+
+def test_notes_of_an_earlier_version_are_not_finished(cube, tmp_path):
+    paths, notes = process(cube, tmp_path / "data")
+    np.savez(paths.notes, fingerprint="made", gray=notes.gray, score=notes.score)
+    assert finished_notes(paths, "made") is None
+
+
+def test_a_frame_whose_pictures_cannot_be_written_has_no_notes(cube, tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "images").write_text("in the way")
+    with pytest.raises(InputError, match="cannot be written"):
+        process(cube, tmp_path / "data")
+    assert finished_notes(FramePaths.of(tmp_path / "data", "frame"), "made") is None
+
+
+def test_notes_do_not_vouch_for_a_cube_of_other_settings(cube, tmp_path, monkeypatch):
+    paths, _ = process(cube, tmp_path / "data")
+
+    def stops(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(frames, "write_png", stops)
+    with pytest.raises(KeyboardInterrupt):
+        process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
+    assert finished_notes(paths, "made") is None
+
+
+def test_border_spectrum_of_measured_values(tmp_path):
+    rng = np.random.default_rng(2)
+    reflectance = rng.random((12, 12, BANDS))
+    reflectance[rng.random(reflectance.shape) < 0.4] = np.nan
+    reflectance[..., 5] = np.nan
+    write_packed_cube(tmp_path / "c.hdr", pack(reflectance), WAVELENGTHS_NM)
+    foreground = np.zeros((12, 12), bool)
+    foreground[:5, :] = True
+    border = ~foreground
+    border[1:-1, 1:-1] = False
+    expected = np.append(np.nanmedian(reflectance[border][:, :5], axis=0), np.nan)
+    np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), expected, atol=1e-5)
+
+
+def test_pictures_of_bands():
+    reflectance = np.zeros((2, 2, BANDS), np.float32)
+    reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, -0.5, 1.5]
+    image = to_8_bit(reflectance[..., nearest_bands(WAVELENGTHS_NM, (990.0, 640.0, 490.0))])
+    assert image[0, 0].tolist() == [255, 0, round(0.2 * 255)]
+    assert bands_within(WAVELENGTHS_NM, (500.0, 700.0)).tolist() == [1, 2, 3, 4]
+    assert bands_within(WAVELENGTHS_NM, (2000.0, 2500.0)).tolist() == list(range(BANDS))

@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from capture_factory import (
+    INTRINSICS,
+    SPHERE_CENTRE_M,
+    SPHERE_RADIUS_M,
+    frame_reflectance,
+    sphere_mask,
+    true_pose,
+)
+from scipy import ndimage
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
+from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.masks import (
+    MaskConfig,
+    above_lid,
+    bin_width,
+    brightness,
+    choose_threshold,
+    foreground_mask,
+    foreground_score,
+    otsu_threshold,
+    shaded_parts,
+)
+from hsi_sc_nerf.processing.report import mask_picture
+from hsi_sc_nerf.processing.scene_box import DISC_OVER_CONTAINER, assumed_disc, focus_point, object_box, scene_box
+
+NO_DISTORTION = np.zeros(4)
+CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+
+
+def test_score_is_the_spread_over_bins():
+    bins = np.random.default_rng(1).random((6, 5, 4), dtype=np.float32)
+    np.testing.assert_allclose(foreground_score(bins, smoothing_px=0.0), bins.std(axis=0), atol=1e-6)
+    assert (foreground_score(bins) < foreground_score(bins, smoothing_px=0.0)).mean() > 0.9
+    assert foreground_score(np.full((6, 4, 4), 0.4, np.float32)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("bands", "spectral_bins", "width"), [(204, 24, 9), (12, 24, 1), (24, 24, 1), (25, 24, 2)])
+def test_bins_of_one_width(bands, spectral_bins, width):
+    assert bin_width(bands, spectral_bins) == width
+
+
+def test_score_is_linear_in_the_share_of_a_pixel():
+    plant = np.linspace(0.1, 0.6, 12)
+    shares = np.array([0.0, 0.25, 0.5, 1.0])
+    cube = (shares[:, None] * plant + (1 - shares[:, None]) * 0.8)[None].astype(np.float32)
+    score = foreground_score(np.moveaxis(cube, -1, 0), smoothing_px=0.0)[0]
+    np.testing.assert_allclose(score, shares * score[-1], atol=1e-6)
+
+
+def test_otsu_separates_two_classes_and_says_how_far_they_are_apart():
+    rng = np.random.default_rng(2)
+    scores = [np.abs(rng.normal(0.02, 0.01, (50, 50))) for _ in range(3)]
+    scores[1][:10, :20] = rng.normal(0.3, 0.03, (10, 20))
+    threshold, contrast = otsu_threshold(scores)
+    assert 0.1 < threshold < 0.2
+    assert contrast == pytest.approx(0.28, abs=0.01)
+
+
+def test_otsu_agrees_with_opencv():
+    rng = np.random.default_rng(3)
+    gray = np.clip(np.concatenate([rng.normal(60, 20, 4000), rng.normal(180, 25, 2000)]), 1, 255).astype(np.uint8)
+    gray[0] = 255
+    expected, _ = cv2.threshold(gray.reshape(60, 100), 0, 255, cv2.THRESH_OTSU)
+    threshold, _ = otsu_threshold([gray.reshape(60, 100).astype(float)])
+    assert abs(threshold - expected) < 2.0  # OpenCV's bins are 1 wide and its threshold is the lower bin
+
+
+def test_no_contrast():
+    rng = np.random.default_rng(4)
+    with pytest.raises(InputError, match="no object can be told from the background"):
+        choose_threshold([np.abs(rng.normal(0.0, 0.01, (30, 30)))], MaskConfig())
+    with pytest.raises(InputError, match="no object"):
+        choose_threshold([np.zeros((30, 30))], MaskConfig())
+    assert choose_threshold([np.zeros((30, 30))], MaskConfig(threshold=0.2)) == 0.2
+
+
+def test_mask_is_one_whole_region_with_its_stem():
+    score = np.zeros((60, 60))
+    score[20:50, 15:45] = 0.3
+    score[30:33, 25:28] = 0.0  # a label on the fruit
+    score[5:20, 30] = 0.12  # a woody stem, weaker than the threshold
+    score[20:50, 45] = 0.12  # the fruit's rim, part background
+    score[2:6, 2:6] = 0.3  # something else
+    score[30, 46:49] = 0.12  # noise
+    mask = foreground_mask(score, 0.2)
+    expected = np.zeros((60, 60), bool)
+    expected[20:50, 15:45] = True
+    expected[5:20, 30] = True
+    np.testing.assert_array_equal(mask, expected)
+    assert not foreground_mask(score, 0.2, weak_share=1.0)[:20].any()
+    allowed = np.ones((60, 60), bool)
+    allowed[40:] = False
+    assert not foreground_mask(score, 0.2, allowed=allowed)[40:].any()
+    assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
+
+
+def shaded_ball(background: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bins of a red ball whose lower half gets ever less light, on a gray background; where it is and its light."""
+    y, x = np.mgrid[:60, :60]
+    ball = np.hypot(x - 30, y - 30) < 20
+    light = np.where(y > 30, np.clip(1.0 - (y - 30) / 22.0, 0.0, 1.0), 1.0)
+    spectrum = np.linspace(0.1, 0.7, 24)[:, None, None]
+    wall = np.full((24, 1, 1), background)
+    bins = np.where(ball, spectrum * light, wall * np.where(y > 50, 0.1, 1.0))
+    return bins.astype(np.float32), ball, light
+
+
+def test_shaded_parts_are_told_by_spread_relative_to_brightness():
+    bins, ball, light = shaded_ball(background=0.9)
+    score, bright = foreground_score(bins), brightness(bins)
+    body = foreground_mask(score, 0.1)
+    assert (ball & ~body).sum() > 60  # what the score alone misses
+    shaded = shaded_parts(body, score, bright)
+    rim = ball & ~ndimage.binary_erosion(ball)
+    assert not (ball & (light > 0.15) & ~body & ~shaded & ~rim).any()
+    assert (shaded & ~ball).sum() <= 4
+    assert not shaded_parts(body, score, bright, share=1.5).any()
+    upper = np.zeros_like(ball)
+    upper[:40] = True
+    assert not shaded_parts(body, score, bright, allowed=upper)[40:].any()
+
+
+def test_shaded_parts_are_not_looked_for_before_a_dark_background():
+    bins, _, _ = shaded_ball(background=0.1)
+    bins += np.random.default_rng(0).normal(0.0, 0.02, bins.shape).astype(np.float32)
+    score, bright = foreground_score(bins), brightness(bins)
+    body = foreground_mask(score, 0.1)
+    assert not shaded_parts(body, score, bright).any()
+    assert not shaded_parts(np.zeros_like(body), score, bright).any()
+    assert not shaded_parts(np.ones_like(body), score, bright).any()
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 77.0])
+def test_mask_of_a_sphere(angle_deg):
+    score = foreground_score(np.moveaxis(frame_reflectance(angle_deg), -1, 0).astype(np.float32))
+    truth = sphere_mask(true_pose(angle_deg))
+    mask = foreground_mask(score, choose_threshold([score], MaskConfig()))
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.97
+
+
+@pytest.mark.parametrize("height", [0.25, 0.05])
+def test_above_lid_agrees_with_marching_along_the_rays(height):
+    pose = look_at([0.35, 0.1, height], [0.0, 0.0, 0.08])
+    intrinsics = PinholeIntrinsics(24, 24, 35.0, 35.0, 12.0, 12.0)
+    x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(24) + 0.5)
+    origin, directions = pixel_rays(intrinsics, pose, np.stack([x, y], axis=-1))
+    expected, blocked = np.zeros((2, 24, 24), bool)
+    radius = CONTAINER.diameter_m / 2
+    for t in np.arange(0.0, 0.8, 0.0005):
+        points = origin + t * directions
+        distance = np.hypot(points[..., 0], points[..., 1])
+        above, inside = points[..., 2] > CONTAINER.height_m, points[..., 2] > 0.0
+        expected |= (distance < 1.2 * radius) & above & ~blocked
+        blocked |= (distance < radius) & inside & ~above
+    result = above_lid(intrinsics, NO_DISTORTION, pose, CONTAINER, overhang=1.2)
+    assert 0.1 < expected.mean() < 0.9
+    assert (result != expected).sum() <= 3
+
+
+def test_above_lid_undoes_lens_distortion():
+    pose = true_pose(0.0)
+    distortion = np.array([2.0, 0.0, 0.03, 0.0])
+    straight = above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER)
+    bent = above_lid(INTRINSICS, distortion, pose, CONTAINER)
+    y, x = np.mgrid[0 : INTRINSICS.h, 0 : INTRINSICS.w]
+    rays = np.stack(
+        [(x + 0.5 - INTRINSICS.cx) / INTRINSICS.fl_x, (y + 0.5 - INTRINSICS.cy) / INTRINSICS.fl_y, np.ones(x.shape)],
+        -1,
+    )
+    moved = cv2.projectPoints(rays.reshape(-1, 3), np.zeros(3), np.zeros(3), INTRINSICS.matrix(), distortion)[0]
+    column, row = np.clip(moved.reshape(*x.shape, 2).astype(int), 0, INTRINSICS.w - 1).transpose(2, 0, 1)
+    central = np.hypot(x - INTRINSICS.cx, y - INTRINSICS.cy) < 20
+    disagree = (bent[row, column] != straight)[central].mean()
+    assert disagree < 0.02
+    assert (bent != straight)[central].mean() > 2 * disagree
+
+
+def turn(count: int) -> np.ndarray:
+    return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
+
+
+def test_focus_point_is_where_the_cameras_look():
+    np.testing.assert_allclose(focus_point(turn(8)), [0.0, 0.0, 0.1], atol=1e-9)
+
+
+def test_object_box_of_a_sphere():
+    poses = turn(24)
+    intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
+    outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
+    assert outside.min() > -0.001
+    # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
+    assert outside[:, :2].max() < 0.005
+    np.testing.assert_allclose(
+        object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
+    )
+    assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
+    """Beyond the common field of view a voxel is in a few frames only, and in front of their masks by chance."""
+    start = look_at([0.42, 0.0, 0.23], [0.0, 0.0, 0.06])
+    poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
+    intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
+
+
+def test_one_wrong_mask_does_not_cut_the_object():
+    poses = turn(24)
+    masks = np.stack([sphere_mask(pose) for pose in poses])
+    box = object_box(masks, poses, INTRINSICS)
+    masks[5] = False
+    assert np.abs(object_box(masks, poses, INTRINSICS) - box).max() < 0.01
+
+
+def test_box_keeps_a_part_thinner_than_a_voxel():
+    poses = turn(12)
+    stem = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.1, 0.17, 200)])
+    intrinsics = PinholeIntrinsics(160, 160, 300.0, 300.0, 80.0, 80.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    for mask, pose in zip(masks, poses, strict=True):
+        x, y = project(stem, pose, intrinsics)[0].astype(int).T
+        mask[y, x] = True
+    assert 0.17 <= object_box(masks, poses, intrinsics, margin_m=0.0)[1, 2] < 0.18
+
+
+def test_masks_that_do_not_fit_the_poses():
+    poses = turn(6)
+    masks = np.zeros((6, 48, 48), bool)
+    with pytest.raises(InputError, match="do not fit each other"):
+        object_box(masks, poses, INTRINSICS)
+
+
+def test_scene_box_holds_all_that_turns():
+    corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    disc = 1.1 * np.hypot(0.12, 0.02)
+    reach = disc + 0.01
+    np.testing.assert_allclose(
+        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
+    )
+    wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
+
+
+def test_without_markers_the_scene_box_holds_a_disc_as_wide_as_the_container_suggests():
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    reach = DISC_OVER_CONTAINER * CONTAINER.diameter_m / 2.0
+    assert reach > 0.205 / 2.0  # the simulator's disc
+    expected = [[-reach, -reach, 0.0], [reach, reach, 0.2]]
+    np.testing.assert_allclose(scene_box(obj, {}, CONTAINER, margin_m=0.0), expected)
+    np.testing.assert_allclose(
+        scene_box(obj, {}, None, margin_m=0.0, container_diameter_m=CONTAINER.diameter_m), expected
+    )
+    np.testing.assert_allclose(scene_box(obj, {}, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.02, 0.02, 0.2]])
+    assert assumed_disc(True, 0.09) is None
+    assert "207 mm" in assumed_disc(False, 0.09)
+    assert "masks' hull" in assumed_disc(False, None)
+
+
+def test_mask_picture_draws_each_outline(tmp_path):
+    images = [np.full((30, 40, 3), 90, np.uint8)] * 4
+    masks = [np.zeros((30, 40), bool) for _ in images]
+    masks[3][10:20, 10:20] = True
+    path = tmp_path / "masks.png"
+    mask_picture(path, images, masks, list("abcd"), columns=3, tile_px=80)
+    sheet = cv2.imread(str(path))[..., ::-1].astype(int)
+    assert sheet.shape == (120, 240, 3)
+    magenta = (sheet == [255, 0, 200]).all(-1)
+    assert magenta[60:, :80].sum() > 40
+    assert not magenta[:60].any()

@@ -1,0 +1,356 @@
+from __future__ import annotations
+
+import errno
+import json
+import logging
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+from capture_factory import (
+    BACKGROUND,
+    INFO,
+    INTRINSICS,
+    PLANT,
+    SPHERE_CENTRE_M,
+    SPHERE_RADIUS_M,
+    WAVELENGTHS_NM,
+    expose,
+    frame_reflectance,
+    sphere_mask,
+    true_pose,
+    true_poses,
+    write_capture,
+    write_session,
+)
+
+from hsi_sc_nerf.calibration.config import CalibrationConfig, LampDriftConfig
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import Container, open_packed
+from hsi_sc_nerf.processing import calibrated_frames as frames_module
+from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.processing.posed_frames import session_facts
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+
+ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
+
+
+def run(session, output, config=None, poses=true_poses):
+    return process_session(session, output, config or ProcessConfig(), progress=False, estimate_poses=poses)
+
+
+@pytest.fixture
+def session(tmp_path):
+    return write_session(tmp_path / "session", ANGLES_DEG)
+
+
+@pytest.fixture
+def calls(monkeypatch) -> list[str]:
+    """Names of the captures that are really calibrated."""
+    seen = []
+    real = frames_module.process_frame
+
+    def counting(cube, *arguments, **options):
+        seen.append(cube.header_path.stem)
+        return real(cube, *arguments, **options)
+
+    monkeypatch.setattr(frames_module, "process_frame", counting)
+    return seen
+
+
+def no_markers(images, names, **_):
+    raise InputError("no marker was found")
+
+
+@pytest.mark.parametrize("specim", [True, False])
+def test_session_to_dataset(tmp_path, specim):
+    session = write_session(tmp_path / "session", ANGLES_DEG, specim=specim)
+    output = run(session, tmp_path / "data")
+    dataset = open_packed(output)
+    assert [frame.capture for frame in dataset.frames] == ["ball_1", "ball_2", "ball_3", "ball_4"]
+    assert dataset.intrinsics == INTRINSICS
+    assert dataset.container == Container(0.09, 0.07)
+    assert dataset.object_name == "ball"
+    np.testing.assert_array_equal(dataset.wavelengths_nm, WAVELENGTHS_NM)
+    np.testing.assert_allclose(dataset.background_reflectance, BACKGROUND, atol=2e-3)
+    assert dataset.pseudo_rgb_nm.tolist() == [WAVELENGTHS_NM[i] for i in (4, 3, 1)]
+    for frame, angle in zip(dataset.frames, ANGLES_DEG, strict=True):
+        truth = frame_reflectance(angle)
+        np.testing.assert_allclose(frame.cube() / REFLECTANCE_SCALE, truth, atol=1e-3)
+        np.testing.assert_allclose(frame.pseudo_rgb() / 255.0, truth[..., [4, 3, 1]], atol=5e-3)
+        ball = sphere_mask(true_pose(angle))
+        mask = frame.mask()
+        assert (mask & ball).sum() / (mask | ball).sum() > 0.97
+        np.testing.assert_array_equal(frame.camera_to_world, true_pose(angle))
+        assert frame.angle_deg == angle
+    assert PLANT.min() < 0.2
+    low, high = dataset.object_box_m
+    assert (low[:2] <= SPHERE_CENTRE_M[:2] - SPHERE_RADIUS_M + 1e-3).all()
+    assert (high >= SPHERE_CENTRE_M + SPHERE_RADIUS_M - 1e-3).all()
+    assert low[2] == 0.07
+    assert (dataset.scene_box_m[0] < low).all()
+    assert dataset.scene_box_m[0, 2] < 0.0
+    assert dataset.scene_box_m[1, 0] >= 0.08  # a marker on the disc
+    for picture in ("white_reference", "masks", "poses"):
+        assert cv2.imread(str(output / "report" / f"{picture}.png")).std() > 1.0
+    assert json.loads((output / "poses.json").read_text())["marker_dictionary"] == "DICT_5X5_50"
+    assert not [path for path in output.rglob("*") if "partial" in path.name]
+
+
+def test_a_session_of_finished_reflectance(tmp_path):
+    session = tmp_path / "session"
+    for number, angle in enumerate(ANGLES_DEG, start=1):
+        finished = frame_reflectance(angle).astype(np.float32)
+        write_cube(session / f"REFLECTANCE_ball_{number}.hdr", finished, wavelengths_nm=WAVELENGTHS_NM)
+    (session / "session.json").write_text(json.dumps(INFO))
+    output = run(session, tmp_path / "data")
+    dataset = open_packed(output)
+    assert dataset.uncertainty is None
+    for frame, angle in zip(dataset.frames, ANGLES_DEG, strict=True):
+        np.testing.assert_allclose(frame.cube() / REFLECTANCE_SCALE, frame_reflectance(angle), atol=1e-4)
+    assert sorted(path.name for path in (output / "report").iterdir()) == ["masks.png", "poses.png"]
+
+
+def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
+    info = {**INFO, "nominal_step_deg": 90, "direction": "ccw", "marker_dictionary": "DICT_4X4_50"}
+    session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
+    got = {}
+
+    def poses(images, names, **options):
+        got.update(options, images=images, names=names)
+        return true_poses(images, names)
+
+    run(session, tmp_path / "data", poses=poses)
+    assert got["names"] == ["ball_1", "ball_2", "ball_3", "ball_4"]
+    facts = got["facts"]
+    assert (facts.marker_dictionary, facts.marker_side_m) == ("DICT_4X4_50", 0.02)
+    assert (facts.nominal_step_deg, facts.direction) == (90, "ccw")
+    assert (facts.container_diameter_m, facts.container_height_m) == (0.09, 0.07)
+    visible = (WAVELENGTHS_NM >= 450.0) & (WAVELENGTHS_NM <= 700.0)
+    for image, angle in zip(got["images"], ANGLES_DEG, strict=True):
+        assert image.dtype == np.uint8
+        np.testing.assert_allclose(image, 255 * frame_reflectance(angle)[..., visible].mean(-1), atol=1.0)
+
+
+def test_the_same_input_is_processed_once(session, tmp_path, calls):
+    output = run(session, tmp_path / "data")
+    stamp = (output / "transforms.json").stat().st_mtime_ns
+    assert run(session, tmp_path / "data", poses=no_markers) == output
+    assert len(calls) == 4
+    assert (output / "transforms.json").stat().st_mtime_ns == stamp
+
+
+def test_other_settings_redo_what_depends_on_them(session, tmp_path, calls):
+    output = run(session, tmp_path / "data")
+    run(session, output, ProcessConfig(masks=MaskConfig(threshold=0.1)))
+    assert len(calls) == 4
+    run(session, output, ProcessConfig(calibration=CalibrationConfig(bounds=(0.0, 0.9))))
+    assert len(calls) == 8
+
+
+@pytest.mark.parametrize("kind", ["panel", "camera"])
+def test_a_changed_file_that_a_setting_names_is_noticed(session, tmp_path, calls, kind):
+    if kind == "panel":
+        named = tmp_path / "panel.csv"
+        named.write_text("400,1.0\n1000,1.0\n")
+        config = ProcessConfig(calibration=CalibrationConfig(panel=named))
+    else:
+        named = run(session, tmp_path / "earlier") / "transforms.json"
+        config = ProcessConfig(camera=named.parent)
+    output = run(session, tmp_path / "data", config)
+    named.write_text(named.read_text().replace("1.0\n", "0.9\n") + "\n")
+    with pytest.raises(InputError, match="no marker was found"):
+        run(session, output, config, poses=no_markers)
+    run(session, output, config)
+    assert len(calls) == 8
+    white = 0.9 if kind == "panel" else 1.0
+    np.testing.assert_allclose(
+        open_packed(output).frames[0].cube() / REFLECTANCE_SCALE, white * frame_reflectance(0.0), atol=1e-3
+    )
+
+
+def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
+    dataset = open_packed(run(session, tmp_path / "data"))
+
+    def told(*angles_deg):
+        frames = [replace(frame, angle_deg=a) for frame, a in zip(dataset.frames, angles_deg, strict=False)]
+        return session_facts(open_session(session), None, replace(dataset, frames=tuple(frames))).camera.direction
+
+    assert told(0.0, 90.0, 180.0) == "ccw"
+    assert told(0.0, -90.0, -180.0) == "cw"
+    assert told(0.0, 90.0, -90.0) is None
+    assert told(0.0) is None
+
+
+def test_a_changed_capture_is_done_again_alone(session, tmp_path, calls):
+    # All of that frame gets darker, which would be taken for the lamps.
+    config = ProcessConfig(calibration=CalibrationConfig(lamp_drift=LampDriftConfig(correct="never")))
+    output = run(session, tmp_path / "data", config)
+    write_capture(session, "ball_3", expose(frame_reflectance(180.0) * 0.9))
+    run(session, output, config)
+    assert calls[4:] == ["ball_3"]
+    cube = open_packed(output).frames[2].cube()
+    np.testing.assert_allclose(cube / REFLECTANCE_SCALE, 0.9 * frame_reflectance(180.0), atol=1e-3)
+
+
+def test_damaged_output_is_made_again(session, tmp_path, calls):
+    output = run(session, tmp_path / "data")
+    data = output / "cubes" / "ball_2.bip"
+    data.write_bytes(data.read_bytes()[:-2])
+    (output / "masks" / "ball_1.png").unlink()
+    run(session, output)
+    assert calls[4:] == ["ball_2"]
+    assert open_packed(output).frames[0].mask().any()
+
+
+def test_a_stopped_run_goes_on(session, tmp_path, monkeypatch):
+    done = []
+    real = frames_module.process_frame
+
+    def stops_at_the_third(cube, *arguments, **options):
+        name = cube.header_path.stem
+        if name == "ball_3" and "stopped" not in done:
+            done.append("stopped")
+            raise KeyboardInterrupt
+        done.append(name)
+        return real(cube, *arguments, **options)
+
+    monkeypatch.setattr(frames_module, "process_frame", stops_at_the_third)
+    one_by_one = ProcessConfig(workers=1)
+    with pytest.raises(KeyboardInterrupt):
+        run(session, tmp_path / "data", one_by_one)
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    finished = done[: done.index("stopped")]
+    assert finished == ["ball_1", "ball_2"]
+    kept = (tmp_path / "data" / "cubes" / "ball_1.bip").stat().st_mtime_ns
+    output = run(session, tmp_path / "data", one_by_one)
+    assert not set(done[done.index("stopped") + 1 :]) & set(finished)
+    assert (output / "cubes" / "ball_1.bip").stat().st_mtime_ns == kept
+    assert len(open_packed(output).frames) == 4
+
+
+def test_full_disk(session, tmp_path, monkeypatch):
+    from spectral.io import envi as spy
+
+    real = spy.write_envi_header
+
+    def full(path, *arguments, **options):
+        if "ball_2" in path:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(path, *arguments, **options)
+
+    monkeypatch.setattr(spy, "write_envi_header", full)
+    with pytest.raises(InputError, match=r"ball_2\.bip: cannot be written \(No space left"):
+        run(session, tmp_path / "data")
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    assert not list((tmp_path / "data").rglob("*ball_2*"))
+    monkeypatch.setattr(spy, "write_envi_header", real)
+    assert len(open_packed(run(session, tmp_path / "data")).frames) == 4
+
+
+def test_no_markers_leaves_no_dataset(session, tmp_path):
+    with pytest.raises(InputError, match="no marker was found"):
+        run(session, tmp_path / "data", poses=no_markers)
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    assert not (tmp_path / "data" / "poses.json").exists()
+
+
+def test_an_outdated_dataset_does_not_survive_a_failure(session, tmp_path):
+    run(session, tmp_path / "data")
+    write_capture(session, "ball_1", expose(frame_reflectance(0.0) * 0.9))
+    with pytest.raises(InputError, match="no marker"):
+        run(session, tmp_path / "data", poses=no_markers)
+    assert not (tmp_path / "data" / "transforms.json").exists()
+
+
+def test_frames_without_a_pose_are_left_out_with_a_warning(session, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        output = run(session, tmp_path / "data", poses=partial(true_poses, unused=("ball_2",)))
+    assert "ball_2" in caplog.text
+    assert [frame.capture for frame in open_packed(output).frames] == ["ball_1", "ball_3", "ball_4"]
+
+
+def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
+    angles_deg = tuple(np.arange(20) * 18.0)
+    session = write_session(tmp_path / "session", angles_deg)
+    write_capture(session, "ball_7", expose(np.full((48, 48, len(WAVELENGTHS_NM)), BACKGROUND)))
+    with caplog.at_level(logging.WARNING):
+        output = run(session, tmp_path / "data", poses=partial(true_poses, angles_deg=angles_deg))
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["ball_7"]
+    assert [frame.capture for frame in open_packed(output).frames if not frame.mask().any()] == ["ball_7"]
+
+
+def test_names_are_printed_as_they_are(tmp_path, capsys):
+    info = {**INFO, "white_reference": "[white]"}
+    session = write_session(tmp_path / "[session]", ANGLES_DEG, info=info)
+    (session / "white_reference").rename(session / "[white]")
+    for _ in range(2):
+        process_session(session, tmp_path / "[apple]", estimate_poses=true_poses)
+    # Lines are broken wherever the folder's path makes them too long.
+    printed = "".join(capsys.readouterr().err.split())
+    for words in ("the tarp in [white].", "[apple]: 4 frames are ready", "[apple]: is up to date"):
+        assert words.replace(" ", "") in printed
+
+
+@pytest.mark.parametrize(
+    ("config", "sentence"),
+    [
+        (ProcessConfig(workers=0), "--workers is 0, but must be 1 or more"),
+        (ProcessConfig(masks=MaskConfig(spectral_bins=0)), "--masks.spectral-bins is 0, but must be 2 or more"),
+    ],
+)
+def test_settings_that_cannot_be(session, tmp_path, config, sentence):
+    with pytest.raises(InputError, match=sentence):
+        run(session, tmp_path / "data", config)
+
+
+def test_marker_size_is_needed(tmp_path):
+    session = write_session(tmp_path / "session", info=None)
+    with pytest.raises(InputError, match=r"session\.json: does not give marker_side_m"):
+        run(session, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
+    seen = []
+
+    def poses(images, names, **options):
+        seen.append(options["facts"].marker_side_m)
+        raise InputError("enough")
+
+    for info in (None, {"marker_side_m": 0.02}):
+        session = write_session(tmp_path / f"session_{info is None}", info=info)
+        with pytest.raises(InputError, match="enough"):
+            run(session, tmp_path / f"data_{info is None}", config=ProcessConfig(marker_side_m=0.04), poses=poses)
+    assert seen == [0.04, 0.04]
+
+
+def test_bad_tarp_writes_nothing(session, tmp_path):
+    write_capture(session, "white_reference", np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16))
+    with pytest.raises(InputError, match="no usable region"):
+        run(session, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_another_dataset_is_not_overwritten(session, tmp_path):
+    other = tmp_path / "data" / "transforms.json"
+    other.parent.mkdir()
+    other.write_text('{"frames": []}')
+    with pytest.raises(InputError, match="another kind of dataset"):
+        run(session, tmp_path / "data")
+    assert other.read_text() == '{"frames": []}'
+
+
+def test_object_without_contrast(tmp_path):
+    session = tmp_path / "session"
+    for name in ("a", "b", "c", "d"):
+        write_capture(session, name, expose(np.full((48, 48, len(WAVELENGTHS_NM)), 0.5)))
+    write_capture(session, "white_reference", expose(np.ones((48, 48, len(WAVELENGTHS_NM)))))
+    (session / "session.json").write_text(json.dumps(INFO))
+    with pytest.raises(InputError, match="no object can be told from the background"):
+        run(session, tmp_path / "data")

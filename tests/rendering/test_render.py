@@ -1,0 +1,212 @@
+import json
+
+import av
+import ball_run
+import capture_factory as factory
+import numpy as np
+import pytest
+import spectral
+import torch
+from PIL import Image
+
+from hsi_sc_nerf.cli.render import RenderCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import pixel_rays
+from hsi_sc_nerf.models import trained_run
+from hsi_sc_nerf.models.camera_background import in_camera_frame
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.rendering.cubes import RenderedView, write_view
+from hsi_sc_nerf.rendering.pictures import find_look
+from hsi_sc_nerf.rendering.video import open_video
+from hsi_sc_nerf.rendering.views import orbit_poses, views_of_orbit, views_of_path
+from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.spectra.indices import INDICES
+
+NM = factory.WAVELENGTHS_NM
+HELD_OUT = "ball_8"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return open_packed(ball_run.write_ball_dataset(tmp_path_factory.mktemp("ball") / "data"))
+
+
+def random_view(lines=5, samples=7):
+    generator = torch.Generator().manual_seed(0)
+    spectral_ = torch.rand(lines, samples, len(NM), generator=generator)
+    return RenderedView(spectral_, torch.rand(lines, samples, generator=generator))
+
+
+@pytest.mark.parametrize("kind", ["float32", "uint16"])
+def test_spy_reads_a_view_as_it_was(tmp_path, dataset, kind):
+    view = random_view()
+    write_view(tmp_path, "view", view, dataset, kind)
+    read = spectral.open_image(str(tmp_path / "view.hdr"))
+    assert read.metadata["interleave"] == "bil"
+    assert read.dtype == np.dtype(kind)
+    assert read.metadata["band names"][0] == "400.00 nm"
+    assert read.metadata["default bands"] == ["6", "4", "2"]
+    np.testing.assert_allclose(read.bands.centers, NM, atol=1e-6)
+    np.testing.assert_allclose(read.bands.bandwidths, 7.0)
+    # SPy divides by the reflectance scale factor.
+    np.testing.assert_allclose(np.array(read.load()), view.spectral, atol=0.0 if kind == "float32" else 0.51 / 50_000)
+    valid = spectral.open_image(str(tmp_path / "view_valid.hdr"))
+    np.testing.assert_array_equal(np.array(valid.load())[..., 0], view.opacity > 0.5)
+    assert valid.shape == (5, 7, 1)
+    assert valid.bands.centers is None
+
+
+def test_an_orbit_is_one_turn_before_a_chamber_that_stands_still():
+    first = factory.true_pose(0.0)
+    poses = orbit_poses(first, 4)
+    np.testing.assert_allclose(poses, [factory.true_pose(angle) for angle in (0.0, 90.0, 180.0, 270.0)], atol=1e-12)
+
+
+def test_looks_are_the_viewers_pictures():
+    wavelengths_nm = np.arange(400.0, 1001.0, 10.0)
+    values = torch.rand(3, 4, len(wavelengths_nm), generator=torch.Generator().manual_seed(0))
+    opacity = torch.ones(3, 4)
+    opacity[0] = 0.2
+    view = RenderedView(values, opacity)
+    bands = [int(np.abs(wavelengths_nm - nm).argmin()) for nm in COMPOSITES["CIR"].wavelengths_nm]
+    look = find_look("cir", wavelengths_nm)
+    assert look.name == "CIR"
+    torch.testing.assert_close(look.paint(view), values[..., bands])
+    painted = find_look("ndvi", wavelengths_nm).paint(view)
+    assert (painted[0] == 0.25).all()
+    assert (painted[1:] != 0.25).any(dim=-1).all()
+    with pytest.raises(InputError, match=f"choose from .*{next(iter(INDICES))}"):
+        find_look("beauty", wavelengths_nm)
+    with pytest.raises(InputError, match="needs a band near"):
+        find_look("NDVI", wavelengths_nm[wavelengths_nm < 650.0])
+
+
+def test_a_video_holds_its_frames(tmp_path):
+    path = tmp_path / "video.mp4"
+    shades = (20, 120, 220)
+    with open_video(path, 5) as add:
+        for shade in shades:
+            add(np.full((33, 47, 3), shade, np.uint8))
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.average_rate) == ("h264", 5)
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+    assert [frame.shape for frame in frames] == [(32, 46, 3)] * 3
+    np.testing.assert_allclose([frame.mean() for frame in frames], shades, atol=3)
+
+
+def camera_path(tmp_path, pose, **changes):
+    camera = {"camera_to_world": pose.reshape(-1).tolist(), "fov": 30.0, "aspect": 1.0}
+    content = {"render_height": 20, "render_width": 30, "camera_type": "perspective", "camera_path": [camera] * 2}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(content | changes))
+    return path
+
+
+def test_a_camera_path_is_nerfstudios(tmp_path):
+    pose = factory.true_pose(30.0)
+    views = views_of_path(camera_path(tmp_path, pose))
+    assert [name for name, _ in views] == ["path_000", "path_001"]
+    _, camera = next(iter(views))
+    np.testing.assert_allclose(camera.camera_to_worlds[0], pose[:3], atol=1e-6)
+    assert (camera.height.item(), camera.width.item()) == (20, 30)
+    for bad in (camera_path(tmp_path, pose, camera_path=[{}]), camera_path(tmp_path, pose, camera_path=[])):
+        with pytest.raises(InputError, match="is no camera path"):
+            views_of_path(bad)
+    with pytest.raises(InputError, match="there is no such file"):
+        views_of_path(tmp_path / "none.json")
+
+
+def test_what_cannot_be_rendered_is_refused_before_anything_is_loaded(tmp_path):
+    for options in ({"orbit_views": 0}, {"orbit_size": 0.0}, {"frames_per_second": 0}):
+        with pytest.raises(InputError, match="have to be positive"):
+            RenderCommand(tmp_path / "config.yml", tmp_path, **options).main()
+    with pytest.raises(InputError, match="nothing to do"):
+        RenderCommand(tmp_path / "config.yml", tmp_path, cubes="none").main()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, dataset):
+    opened = trained_run.open_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))
+    ball_run.fill_with_ball(opened)
+    return opened
+
+
+def silhouette(pose, lens=factory.INTRINSICS):
+    """Signed distance of each pixel's ray from the ball's outline, in metres at the ball; negative inside."""
+    x, y = np.meshgrid(np.arange(lens.w) + 0.5, np.arange(lens.h) + 0.5)
+    origin, directions = pixel_rays(lens, pose, np.stack([x, y], axis=-1))
+    towards = factory.SPHERE_CENTRE_M - origin
+    return np.sqrt(towards @ towards - (directions @ towards) ** 2) - factory.SPHERE_RADIUS_M
+
+
+def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
+    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    RenderCommand(tmp_path, tmp_path / "out", video=("pseudo-RGB",)).main()
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    of_view = {HELD_OUT + end for end in (".hdr", ".raw", ".png", "_valid.hdr", "_valid.raw")}
+    assert names == of_view | {"render.md", "render.json", "held-out-pseudo-RGB.mp4"}
+    cube, valid = (
+        np.array(spectral.open_image(str(tmp_path / "out" / f"{HELD_OUT}{end}.hdr")).load()) for end in ("", "_valid")
+    )
+    valid = valid[..., 0]
+    distance = silhouette(factory.true_pose(36.0 * int(HELD_OUT[-1])))
+    np.testing.assert_array_equal(valid[distance < -0.002], 1)
+    np.testing.assert_array_equal(valid[distance > 0.0], 0)
+    assert np.abs(cube[distance < -0.003] - factory.PLANT).max() < 2e-3
+    np.testing.assert_allclose(cube[distance > 0.0], factory.BACKGROUND, atol=1e-5)
+    (row,) = json.loads((tmp_path / "out" / "render.json").read_text())["views"]
+    assert row["view"] == HELD_OUT
+    assert row["rmse"] < 0.1
+    assert f"| {HELD_OUT} |" in (tmp_path / "out" / "render.md").read_text()
+    assert Image.open(tmp_path / "out" / f"{HELD_OUT}.png").width > 1000
+
+
+def test_an_orbit_of_another_size_has_no_truth_and_no_cubes_if_so_wished(tmp_path, run, monkeypatch):
+    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    RenderCommand(
+        tmp_path,
+        tmp_path / "out",
+        views="orbit",
+        orbit_views=3,
+        orbit_size=0.5,
+        cubes="none",
+        video=("pseudo-RGB", "PSEUDO-rgb"),
+    ).main()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "render.md",
+        "render.json",
+        "orbit-pseudo-RGB.mp4",
+    }
+    with av.open(str(tmp_path / "out" / "orbit-pseudo-RGB.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert [frame.shape for frame in frames] == [(24, 24, 3)] * 3
+
+
+def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
+    from hsi_sc_nerf.rendering import cubes as render_cubes
+
+    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    render_view, seen = render_cubes.render_view, []
+
+    def fail_at_the_second(model, camera):
+        seen.append(camera)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return render_view(model, camera)
+
+    monkeypatch.setattr(render_cubes, "render_view", fail_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        RenderCommand(tmp_path, tmp_path, views="orbit", orbit_views=3, orbit_size=0.3, video=("pseudo-RGB",)).main()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"orbit_000{end}" for end in (".hdr", ".raw", "_valid.hdr", "_valid.raw")
+    }
+
+
+def test_every_view_of_an_orbit_looks_at_the_chamber_alike(run):
+    behind = []
+    for _, camera in views_of_orbit(run, 3):
+        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+        behind.append(in_camera_frame(rays.directions, rays.metadata["camera_rotation"]))
+    for directions in behind[1:]:
+        torch.testing.assert_close(directions, behind[0], atol=1e-6, rtol=0)

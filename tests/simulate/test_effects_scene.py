@@ -1,0 +1,483 @@
+"""Effects of the turntable, the chamber, the lamps and of time: closed forms, and what they leave alone."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, project, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.simulate import assemble, effects
+from hsi_sc_nerf.simulate.effects import ageing, illumination, motion, surroundings
+from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.materials import MATERIALS, PlantTissue, endmembers
+from hsi_sc_nerf.simulate.render import Renderer
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.sensor import white_signal
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
+
+OURS = [
+    cls
+    for module in (ageing, illumination, motion, surroundings)
+    for cls in vars(module).values()
+    if isinstance(cls, type) and cls.__module__ == module.__name__
+]
+SMALL = {"frames": 4, "size_px": 40, "bands": 10}
+
+
+def scene(*names, name="cylinder", **values):
+    return override(load_scene(name), **{**SMALL, **values}, effects=names)
+
+
+def pseudo_rgb(reflectance, wavelengths_nm):
+    return to_8_bit(reflectance[..., nearest_bands(wavelengths_nm, paper.PSEUDO_RGB_NM)])
+
+
+def signal(simulation, capture):
+    """Counts above dark."""
+    return capture.counts.astype(float) - simulation.scene.sensor.dark_level
+
+
+def white(simulation):
+    return white_signal(simulation.scene.sensor, simulation.wavelengths_nm)
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+def plan(*names, **values):
+    return assemble.frame_plan(scene(*names, **values))
+
+
+def test_a_partial_turn_spans_its_angle_evenly_and_the_operator_knows_the_step():
+    found = plan("{partial_turn: {span_deg: 90}}", frames=10)
+    np.testing.assert_allclose(found.angles_deg, np.arange(10) * 10.0)
+    assert found.nominal_step_deg == pytest.approx(10.0)
+    assert plan("partial_turn", frames=1).angles_deg.tolist() == [0.0]
+
+
+def test_clockwise_is_the_scenes_own_clockwise(tmp_path):
+    def turning(direction):
+        even = scene("clockwise")
+        return type(even)(**{**vars(even), "turntable": type(even.turntable)(0.205, frames=4, direction=direction)})
+
+    for direction in ("ccw", "cw"):
+        np.testing.assert_array_equal(
+            assemble.frame_plan(turning(direction)).angles_deg, [0.0, -90.0, -180.0, -270.0]
+        )
+    session = simulate_session(scene("clockwise", size_px=16), tmp_path / "s", False)
+    written = json.loads((session / "session.json").read_text())
+    assert (written["direction"], written["nominal_step_deg"]) == ("cw", 90.0)
+    np.testing.assert_array_equal(load_truth(session).angles_deg, [0.0, -90.0, -180.0, -270.0])
+
+
+def test_jitter_is_evenly_spread_and_leaves_the_first_frame_and_the_operators_belief():
+    found = plan("{angle_jitter: {spread_deg: 2}}", frames=2000)
+    errors = found.angles_deg - plan(frames=2000).angles_deg
+    assert errors[0] == 0.0
+    assert np.abs(errors).max() <= 2.0
+    # An even spread of +-a has the standard deviation a / sqrt(3); five standard errors of it and of the mean.
+    assert errors.std() == pytest.approx(2.0 / np.sqrt(3.0), rel=0.05)
+    assert abs(errors.mean()) < 5 * 2.0 / np.sqrt(3.0 * 2000)
+    assert found.nominal_step_deg == plan(frames=2000).nominal_step_deg
+    # Another seed gives other errors, the same seed the same.
+    np.testing.assert_array_equal(plan("angle_jitter").angles_deg, plan("angle_jitter").angles_deg)
+    assert (plan("angle_jitter", seed=5).angles_deg[1:] != plan("angle_jitter", seed=6).angles_deg[1:]).all()
+
+
+def test_missing_frames_leave_gaps_in_angle_and_time_but_not_in_the_numbering(tmp_path):
+    whole = plan(frames=12)
+    chosen = set()
+    for seed in range(6):
+        found = plan("{missing_frames: {count: 4}}", frames=12, seed=seed)
+        places = np.searchsorted(whole.angles_deg, found.angles_deg)
+        assert len(places) == 8
+        assert places[0] == 0
+        assert (np.diff(places) > 0).all()
+        np.testing.assert_array_equal(found.angles_deg, whole.angles_deg[places])
+        np.testing.assert_array_equal(found.elapsed, whole.elapsed[places])
+        chosen.add(tuple(places.tolist()))
+    assert len(chosen) > 1
+    assert plan("{missing_frames: {count: 11}}", frames=12).angles_deg.tolist() == [0.0]
+    session = simulate_session(scene("{missing_frames: {count: 2}}", frames=5, size_px=16), tmp_path / "s", False)
+    assert load_truth(session).captures == ("cylinder_000", "cylinder_001", "cylinder_002")
+
+
+def test_repeated_frames_are_the_same_view_later():
+    found = plan("{repeated_frames: {count: 3}}", "angle_jitter", frames=12)
+    once = plan("angle_jitter", frames=12)
+    angles, times_taken = np.unique(found.angles_deg, return_counts=True)
+    np.testing.assert_array_equal(angles, once.angles_deg)
+    assert sorted(times_taken.tolist()) == [1] * 9 + [2] * 3
+    np.testing.assert_allclose(found.elapsed, np.linspace(0.0, 1.0, 15))
+    assert (np.diff(found.angles_deg) >= 0.0).all()
+    simulation = Simulation(scene("{repeated_frames: {count: 1}}"))
+    first = int(np.flatnonzero(np.diff(simulation.plan.angles_deg) == 0.0)[0])
+    np.testing.assert_array_equal(simulation.frame(first).counts, simulation.frame(first + 1).counts)
+
+
+@pytest.mark.parametrize("effect", ["{missing_frames: {count: 4}}", "{repeated_frames: {count: 5}}"])
+def test_more_frames_than_there_are_cannot_be_missing_or_repeated(effect):
+    with pytest.raises(InputError, match=r"count is \d, but"):
+        plan(effect)
+
+
+def in_the_room(step, angle_deg):
+    """Object to room by 4 x 4 matrices: turn about z, then lean by Rodrigues' formula about the axis across."""
+    amplitude_deg, cycles = step
+    azimuth = np.deg2rad(cycles * angle_deg)
+    across = np.cross([0.0, 0.0, 1.0], [np.cos(azimuth), np.sin(azimuth), 0.0])
+    lean = np.eye(4)
+    lean[:3, :3] = cv2.Rodrigues(np.deg2rad(amplitude_deg) * across)[0]
+    return lean @ rotation_about_z(angle_deg)
+
+
+MOVED = (
+    "clockwise",
+    "{angle_jitter: {spread_deg: 5}}",
+    "{axis_tilt: {tilt_deg: 12}}",
+    "{wobble: {amplitude_deg: 3, cycles_per_turn: 2.5}}",
+    "{off_centre: {shift_m: 0.011, azimuth_deg: 40}}",
+)
+
+
+def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
+    """The room is rendered as it is: everything moved by 4 x 4 matrices, before a camera that stands still."""
+    moved = scene(*MOVED, name="pear")
+    simulation = Simulation(moved)
+    camera = assemble.first_camera(moved.camera) @ rotation_about_z(12.0)
+    np.testing.assert_allclose(simulation.plan.room_camera, camera, atol=1e-12)
+    shift = 0.011 * np.array([np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), 0.0])
+    parts = [assemble.object_part(moved), *assemble.support_parts(moved)]
+    for i, angle in enumerate(simulation.plan.angles_deg):
+        to_room = in_the_room((3.0, 2.5), angle)
+        placed = []
+        for part in parts:
+            vertices = (part.mesh.vertices + shift) @ to_room[:3, :3].T + to_room[:3, 3]
+            placed.append(type(part)(type(part.mesh)(vertices, part.mesh.triangles), part.materials, part.weights))
+        expected, _ = Renderer(placed).render(simulation.intrinsics, camera, moved.camera.supersampling)
+        seen = simulation.frame(i).material_weights
+        # Rays along an edge may fall on either side of it in float32.
+        assert np.abs(seen - expected).mean() < 2e-5
+        np.testing.assert_allclose(simulation.camera_to_world[i], np.linalg.inv(to_room) @ camera, atol=1e-12)
+
+
+def test_a_positive_tilt_leans_the_axis_to_the_right_in_the_image():
+    simulation = Simulation(scene("{axis_tilt: {tilt_deg: 10}}"))
+    axis = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]])
+    (foot, tip), _ = project(axis, simulation.camera_to_world[0], simulation.intrinsics)
+    assert np.rad2deg(np.arctan2(tip[0] - foot[0], foot[1] - tip[1])) == pytest.approx(10.0)
+
+
+def test_a_wobble_of_one_cycle_is_a_disc_askew_on_a_steady_axis():
+    """Then, and only then, all poses lie on one circle about an axis of the object."""
+
+    def off_circle(cycles):
+        poses = Simulation(scene(f"{{wobble: {{amplitude_deg: 2, cycles_per_turn: {cycles}}}}}")).camera_to_world
+        steps = [b @ np.linalg.inv(a) for a, b in pairwise(poses)]
+        return max(rotation_angle_deg(steps[0], step) for step in steps)
+
+    assert off_circle(1) < 1e-6
+    assert off_circle(2) > 1.0
+
+
+def detect(image, enlarge=2):
+    """Marker corners in corner-origin pixels of ``image``, by number."""
+    enlarged = cv2.resize(image, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(enlarged)
+    return {int(n): (c[0] + 0.5) / enlarge for n, c in zip(numbers.ravel(), corners, strict=True)}
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["{axis_tilt: {tilt_deg: 15}}"],
+        ["{wobble: {amplitude_deg: 3}}"],
+        ["{off_centre: {shift_m: 0.01}}"],
+        ["clockwise"],
+        ["{partial_turn: {span_deg: 120}}"],
+        ["{angle_jitter: {spread_deg: 8}}"],
+        MOVED,
+    ],
+    ids=lambda names: "+".join(name.strip("{").split(":")[0] for name in names),
+)
+def test_marker_corners_are_seen_where_truth_projects_them(tmp_path, names):
+    session = simulate_session(scene(*names, frames=3, size_px=256, bands=3), tmp_path / "s", False)
+    truth = load_truth(session)
+    errors = []
+    for capture, pose in zip(truth.captures, truth.camera_to_world, strict=True):
+        picture = cv2.cvtColor(pseudo_rgb(truth.reflectance(capture), truth.wavelengths_nm), cv2.COLOR_RGB2GRAY)
+        for number, seen in detect(picture).items():
+            expected, _ = project(truth.marker_layout[number], pose, truth.intrinsics)
+            errors.append(seen - expected)
+    errors = np.array(errors)
+    assert len(errors) >= 12
+    assert np.median(np.linalg.norm(errors, axis=-1)) < 0.3
+    assert np.abs(np.median(errors, axis=(0, 1))).max() < 0.1
+
+
+def test_the_object_frame_keeps_its_x_axis_towards_the_first_camera():
+    for name in ("axis_tilt", "wobble", "clockwise", "angle_jitter", "off_centre", "partial_turn"):
+        first = Simulation(scene(name)).camera_to_world[0]
+        assert first[0, 3] > 0.3
+        assert first[1, 3] == pytest.approx(0.0, abs=1e-12)
+        assert np.linalg.det((first @ OPENCV_TO_OPENGL)[:3, :3]) == pytest.approx(1.0)
+
+
+# --- ageing ---------------------------------------------------------------------------------------------------------
+
+
+def test_deformation_shrinks_about_the_foot_and_keeps_poses_and_the_mesh_of_the_start(tmp_path):
+    shrinking = scene("{deformation: {shrink_percent: 20}}", "{off_centre: {shift_m: 0.01, azimuth_deg: 0}}")
+    simulation = Simulation(shrinking)
+    mesh = simulation.object_part.mesh
+    foot = np.array([0.01, 0.0, shrinking.container.height_m])
+    for elapsed in (0.0, 0.25, 1.0):
+        vertices = shrinking.effects[-1].deform(mesh.vertices, foot, elapsed)
+        small = type(mesh)(vertices, mesh.triangles)
+        assert small.volume_m3() == pytest.approx((1.0 - 0.2 * elapsed) ** 3 * mesh.volume_m3())
+        assert small.area_m2() == pytest.approx((1.0 - 0.2 * elapsed) ** 2 * mesh.area_m2())
+        assert vertices[:, 2].min() == pytest.approx(shrinking.container.height_m)
+    rigid = Simulation(override(shrinking, effects=["{off_centre: {shift_m: 0.01, azimuth_deg: 0}}"]))
+    np.testing.assert_array_equal(simulation.camera_to_world, rigid.camera_to_world)
+    np.testing.assert_array_equal(simulation.frame(0).counts, rigid.frame(0).counts)
+    # In the last frame, what the camera sees is the mesh shrunk by hand.
+    part = type(rigid.object_part)(small, rigid.object_part.materials, rigid.object_part.weights, is_object=True)
+    by_hand = assemble.build_renderer(shrinking, part, np.array([0.01, 0.0, 0.0]))
+    _, coverage = by_hand.render(rigid.intrinsics, rigid.camera_to_world[3], shrinking.camera.supersampling)
+    seen = simulation.frame(3).coverage
+    assert np.abs(seen - coverage).mean() < 1e-4
+    assert seen.sum() < 0.75 * rigid.frame(3).coverage.sum()
+    assert load_truth(simulate_session(shrinking, tmp_path / "s", False)).volume_m3 == mesh.volume_m3()
+
+
+def test_drying_takes_away_the_absorbance_of_the_lost_water():
+    simulation = Simulation(scene("{drying: {water_loss: 0.4}}", name="apple", bands=204))
+    nm = simulation.wavelengths_nm
+    frame = simulation.frame(2)
+    log_ratio = np.log10(frame.light.spectra / simulation.endmembers)
+    elapsed = simulation.plan.elapsed[2]
+    # The bands as gaussians, written out.
+    shape = sum(
+        height * np.exp(-((nm - centre) ** 2) / (2.0 * width**2))
+        for height, centre, width in ((1.0, 970.0, 24.0), (0.3, 1010.0, 40.0), (0.06, 835.0, 18.0))
+    )
+    for i, name in enumerate(simulation.materials):
+        of_object = name in simulation.object_part.materials
+        water = MATERIALS[name].water if of_object else 0.0
+        np.testing.assert_allclose(log_ratio[i], 0.4 * elapsed * water * shape, atol=1e-12)
+    assert log_ratio[0].max() > 0.015
+    # In the counts, to rounding.
+    expected = frame.material_weights.astype(float) @ (frame.light.spectra * white(simulation))
+    assert np.abs(signal(simulation, frame) - expected).max() <= 0.501
+    # The first frame has not dried yet.
+    np.testing.assert_array_equal(simulation.frame(0).light.spectra, simulation.endmembers)
+
+
+def test_bone_dry_tissue_reflects_what_tissue_without_water_does():
+    nm = np.linspace(397.0, 1003.0, 60)
+    wet = {"wet": PlantTissue(1.0, chlorophyll=0.3, water=2.0), "flat": MATERIALS["paper"]}
+    dry = {"wet": PlantTissue(1.0, chlorophyll=0.3), "flat": MATERIALS["paper"]}
+    dried = ageing.Drying(1.0).spectra(endmembers(wet, nm, wet), list(wet.values()), nm, 1.0)
+    np.testing.assert_allclose(dried, endmembers(dry, nm, dry), atol=1e-12)
+    assert dried.max() <= 1.0
+    # A table a sample, as for a detector's smile, is as many tables.
+    samples_nm = nm + np.array([[0.0], [3.0]])
+    tables = np.moveaxis(endmembers(wet, samples_nm, wet), 0, -2)
+    both = ageing.Drying(0.5).spectra(tables, list(wet.values()), samples_nm, 0.6)
+    for table, one, at_nm in zip(tables, both, samples_nm, strict=True):
+        np.testing.assert_array_equal(one, ageing.Drying(0.5).spectra(table, list(wet.values()), at_nm, 0.6))
+
+
+# --- illumination ---------------------------------------------------------------------------------------------------
+
+
+def recovered(simulation, frame):
+    """The illumination: counts divided by what the pixel would give under the lamps at the start."""
+    without = frame.material_weights.astype(float) @ (simulation.endmembers * white(simulation))
+    return signal(simulation, frame) / without, 0.501 / without
+
+
+def planck_ratio(nm, kelvin):
+    """Light of a black body over that of one at 3000 K: what is left of Planck's law in any unit."""
+    hc_over_k_nm = 1.438776877e7
+    return np.expm1(hc_over_k_nm / (nm * 3000.0)) / np.expm1(hc_over_k_nm / (nm * kelvin))
+
+
+def test_drift_is_what_is_left_after_dividing_truth_out():
+    simulation = Simulation(scene("{lamp_drift: {percent: -12, temperature_change_k: -150, settling: 0.4}}"))
+    nm = simulation.wavelengths_nm
+    for i, elapsed in enumerate(simulation.plan.elapsed):
+        done = (1.0 - np.exp(-elapsed / 0.4)) / (1.0 - np.exp(-1.0 / 0.4))
+        colour = planck_ratio(nm, 3000.0 - 150.0 * done) / planck_ratio(700.0, 3000.0 - 150.0 * done)
+        expected = (1.0 - 0.12 * done) * colour
+        found, rounding = recovered(simulation, simulation.frame(i))
+        assert (np.abs(found - expected) <= rounding + 1e-5).all()
+    assert expected[0] < 0.80 < 0.92 < expected[-1]
+    # The tarp was taken before.
+    even = Simulation(scene())
+    np.testing.assert_array_equal(simulation.white().counts, even.white().counts)
+    np.testing.assert_array_equal(simulation.frame(0).counts, even.frame(0).counts)
+
+
+def test_drift_is_smooth_and_ends_at_its_strength():
+    drift = illumination.LampDrift(percent=8.0)
+    nm = np.array([500.0, 700.0])
+    course = np.array([drift.factor(8, nm, 3000.0, e)[0, 0, 0] for e in np.linspace(0.0, 1.0, 101)])
+    assert (course[0], course[-1]) == (1.0, pytest.approx(1.08))
+    rate = np.diff(course)
+    assert (rate > 0.0).all()
+    assert (np.diff(rate) < 1e-7).all()
+    steady = illumination.LampDrift(percent=8.0, settling=100.0)
+    assert steady.factor(8, nm, 3000.0, 0.5)[0, 0, 1] == pytest.approx(1.04, abs=2e-4)
+
+
+def test_falloff_is_what_is_left_after_dividing_truth_out():
+    simulation = Simulation(scene("{illumination_falloff: {edge_loss: 0.3}}"))
+    size = SMALL["size_px"]
+    y, x = np.mgrid[:size, :size] + 0.5 - size / 2
+    # A light that falls on a plane under an angle loses cos^4 of it; the corner's angle makes the given loss.
+    corner_angle = np.arccos(0.7**0.25)
+    angle = np.arctan(np.hypot(y, x) / np.hypot(size / 2, size / 2) * np.tan(corner_angle))
+    expected = np.cos(angle)[..., None] ** 4
+    for i in (0, 3):
+        frame = simulation.frame(i)
+        found, rounding = recovered(simulation, frame)
+        assert (np.abs(found - expected) <= rounding + 1e-5).all()
+        # Tarp and object lose the same: divided by the tarp in its place, a frame is the true reflectance.
+        tarp = simulation.white()
+        on_tarp = tarp.light.weights[..., 0] == 1.0
+        ratio = (signal(simulation, frame) / signal(simulation, tarp))[on_tarp]
+        truth = (frame.material_weights.astype(float) @ simulation.endmembers)[on_tarp]
+        assert (np.abs(ratio - truth) <= 0.501 * (1.0 + truth) / signal(simulation, tarp)[on_tarp] + 1e-5).all()
+    factor = illumination.IlluminationFalloff(0.3).factor(1001, np.array([700.0]), 3000.0, 0.0)
+    assert factor[500, 500, 0] == 1.0
+    assert factor[0, 0, 0] == pytest.approx(0.7, abs=1e-3)
+
+
+def test_truth_keeps_the_illumination(tmp_path):
+    names = ["{lamp_drift: {percent: -10, temperature_change_k: 60}}", "{illumination_falloff: {edge_loss: 0.3}}"]
+    simulation = Simulation(scene(*names))
+    truth = load_truth(simulate_session(scene(*names), tmp_path / "s", False))
+    counts = truth.light("cylinder_002").radiance(None, white(simulation))
+    assert np.abs(signal(simulation, simulation.frame(2)) - counts).max() <= 0.501
+
+
+# --- surroundings ---------------------------------------------------------------------------------------------------
+
+
+def test_the_background_stands_still_and_nothing_else_changes():
+    simulation, even = (Simulation(scene(*names, size_px=64)) for names in (["textured_background"], []))
+    frames, plain = ([s.frame(i) for i in range(4)] for s in (simulation, even))
+    same = [simulation.materials.index(name) for name in even.materials]
+    wall = np.logical_and.reduce([frame.material_weights[..., -1] == 1.0 for frame in plain])
+    assert wall.mean() > 0.3
+    for frame, without in zip(frames, plain, strict=True):
+        np.testing.assert_array_equal(frame.material_weights.sum(axis=-1), 1.0)
+        np.testing.assert_array_equal(frame.counts[wall], frames[0].counts[wall])
+        np.testing.assert_array_equal(frame.coverage, without.coverage)
+        full = without.material_weights[..., -1] == 0.0
+        np.testing.assert_array_equal(frame.material_weights[full][:, same], without.material_weights[full])
+    # All three materials are there, and the wall's own is gone.
+    shares = frames[0].material_weights[wall].mean(axis=0)
+    for name in surroundings.TexturedBackground.materials:
+        assert shares[simulation.materials.index(name)] > 0.05
+    assert shares[-1] == 0.0
+    half = Simulation(scene("{textured_background: {contrast: 0.5}}", size_px=64)).frame(0)
+    np.testing.assert_allclose(half.material_weights[wall][:, -1], 0.5, atol=1e-3)
+    # A larger image shows the same wall.
+    large = Simulation(scene("textured_background", size_px=128)).frame(0).material_weights
+    pooled = large.reshape(64, 2, 64, 2, -1).mean(axis=(1, 3))
+    assert np.abs(pooled - frames[0].material_weights)[wall].mean() < 0.02
+
+
+def test_structure_from_motion_would_lock_on_to_the_background():
+    """Of the features that match between two frames, most have not moved."""
+    still = {}
+    for names in (["textured_background"], []):
+        simulation = Simulation(scene(*names, name="pear", frames=24, size_px=160, bands=12))
+        pictures = [
+            pseudo_rgb(f.light.radiance(), simulation.wavelengths_nm)
+            for f in (simulation.frame(0), simulation.frame(1))
+        ]
+        sift = cv2.SIFT_create()
+        (points, marks), (later, later_marks) = (sift.detectAndCompute(picture, None) for picture in pictures)
+        matches = [
+            best
+            for best, second in cv2.BFMatcher().knnMatch(marks, later_marks, k=2)
+            if best.distance < 0.75 * second.distance
+        ]
+        shift = np.array([np.subtract(later[m.trainIdx].pt, points[m.queryIdx].pt) for m in matches])
+        still[bool(names)] = np.linalg.norm(shift, axis=1) < 0.5
+    assert still[True].sum() > 30
+    assert still[True].mean() > 0.5 > 0.3 > still[False].mean()
+
+
+# --- off is off -----------------------------------------------------------------------------------------------------
+
+
+def raise_in(monkeypatch, classes):
+    def stop(self, *_):
+        raise AssertionError(f"{self.name} was not named")
+
+    for cls in classes:
+        for method in ("replan", "offset_m", "deform", "cover", "spectra", "factor"):
+            if method in vars(cls):
+                monkeypatch.setattr(cls, method, stop)
+
+
+def files(session):
+    return {path.relative_to(session): path.read_bytes() for path in sorted(session.rglob("*")) if path.is_file()}
+
+
+def test_a_session_without_effects_is_one_of_a_build_without_them(tmp_path, monkeypatch):
+    raise_in(monkeypatch, OURS)
+    with_effects = files(simulate_session(scene(), tmp_path / "a", False))
+    monkeypatch.setattr(effects, "EFFECTS", {})
+    assert files(simulate_session(scene(), tmp_path / "b", False)) == with_effects
+    simulation = Simulation(scene())
+    frame = simulation.frame(1)
+    expected = frame.material_weights @ (simulation.endmembers * white(simulation)).astype(np.float32)
+    expected += simulation.scene.sensor.dark_level
+    np.testing.assert_array_equal(frame.counts, np.rint(expected))
+
+
+@pytest.mark.parametrize("named", OURS, ids=lambda cls: cls.name)
+def test_no_effect_runs_that_is_not_named(named, monkeypatch):
+    raise_in(monkeypatch, [cls for cls in OURS if cls is not named])
+    small = {"name": "pear" if named is ageing.Drying else "cylinder", "frames": 3, "size_px": 16, "bands": 3}
+    simulation, even = Simulation(scene(named.name, **small)), Simulation(scene(**small))
+    # And what is named runs: it changes the frames or their number.
+    last = len(simulation.captures) - 1
+    assert last != 2 or (simulation.frame(last).counts != even.frame(last).counts).any()
+
+
+@pytest.mark.parametrize(
+    "neutral",
+    [
+        "{angle_jitter: {spread_deg: 0}}",
+        "{axis_tilt: {tilt_deg: 0}}",
+        "{wobble: {amplitude_deg: 0}}",
+        "{off_centre: {shift_m: 0}}",
+        "{missing_frames: {count: 0}}",
+        "{repeated_frames: {count: 0}}",
+        "{deformation: {shrink_percent: 0}}",
+        "{textured_background: {contrast: 0}}",
+        "{drying: {water_loss: 0}}",
+        "{lamp_drift: {percent: 0}}",
+        "{illumination_falloff: {edge_loss: 0}}",
+    ],
+)
+def test_an_effect_of_no_strength_changes_no_count(neutral):
+    frames = [Simulation(scene(*names, size_px=24)).frame(3) for names in ([neutral], [])]
+    np.testing.assert_array_equal(frames[0].counts, frames[1].counts)

@@ -1,0 +1,88 @@
+"""Meshes of the simulator against closed forms, and the shapes that are made of them."""
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate import shapes
+from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
+
+
+def sphere(radius_m: float, rings: int = 200, segments: int = 200) -> Mesh:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, rings)
+    profile = radius_m * np.stack([np.cos(latitude), np.sin(latitude)], axis=-1)
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, segments)
+
+
+def test_sphere_has_its_area_and_volume():
+    mesh = sphere(0.04)
+    assert mesh.is_watertight()
+    np.testing.assert_allclose(mesh.area_m2(), 4 * np.pi * 0.04**2, rtol=1e-3)
+    np.testing.assert_allclose(mesh.volume_m3(), 4 / 3 * np.pi * 0.04**3, rtol=1e-3)
+
+
+def test_cylinder_has_the_area_and_volume_of_its_polygonal_prism():
+    n, r, h = 60, 0.045, 0.07
+    mesh = cylinder(2 * r, h, segments=n)
+    base = n / 2 * r**2 * np.sin(2 * np.pi / n)
+    assert mesh.is_watertight()
+    np.testing.assert_allclose(mesh.volume_m3(), base * h, rtol=1e-12)
+    np.testing.assert_allclose(mesh.area_m2(), 2 * base + n * 2 * r * np.sin(np.pi / n) * h, rtol=1e-12)
+
+
+def test_volume_does_not_depend_on_place():
+    mesh = sphere(0.03)
+    np.testing.assert_allclose(mesh.moved(np.array([1.0, -2.0, 3.0])).volume_m3(), mesh.volume_m3(), rtol=1e-6)
+
+
+def test_a_hole_and_a_flipped_triangle_are_not_watertight():
+    mesh = sphere(0.03, 12, 12)
+    assert not Mesh(mesh.vertices, mesh.triangles[1:]).is_watertight()
+    flipped = mesh.triangles.copy()
+    flipped[5] = flipped[5, ::-1]
+    assert not Mesh(mesh.vertices, flipped).is_watertight()
+
+
+def test_quads_face_their_corners_order():
+    square = quads(np.array([[[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]]], float))
+    assert square.area_m2() == pytest.approx(6.0)
+    a, b, c = square.vertices[square.triangles[0]]
+    assert np.cross(b - a, c - a)[2] > 0
+
+
+@pytest.mark.parametrize("profile", [[(0.1, 0), (1, 1), (0, 2)], [(0, 0), (0, 1), (0, 2)], [(0, 0), (0, 1)]])
+def test_revolve_refuses_a_profile_that_cannot_close(profile):
+    with pytest.raises(ValueError, match="axis"):
+        revolve(np.array(profile, float), 8)
+
+
+@pytest.mark.parametrize(
+    ("make", "height_m", "volume_ml", "radius_m"),
+    [
+        (shapes.pear, 0.10, (110, 200), 0.040),
+        (shapes.apple, 0.075, (130, 230), 0.043),
+        (shapes.maize, 0.16, (170, 300), 0.03),
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 7])
+def test_shapes_are_closed_stand_on_zero_and_have_real_sizes(make, height_m, volume_ml, radius_m, seed):
+    shape = make(height_m, np.random.default_rng(seed))
+    low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
+    assert shape.mesh.is_watertight()
+    assert volume_ml[0] < shape.mesh.volume_m3() * 1e6 < volume_ml[1]
+    np.testing.assert_allclose([low[2], high[2]], [0.0, height_m], atol=1e-6)
+    assert np.hypot(*shape.mesh.vertices[:, :2].T).max() < radius_m
+    # It rests on an area: some of its lowest vertices share one plane.
+    assert (shape.mesh.vertices[:, 2] < 1e-9).sum() > 100
+
+
+def test_maize_kernels_are_relief_and_not_paint():
+    shape = shapes.maize(0.16, np.random.default_rng(0))
+    assert shape.kernel is not None
+    assert shape.groove is not None
+    x, y, z = shape.mesh.vertices.T
+    ring = np.abs(z - 0.048) < 0.0026  # within one kernel pitch
+    radius = np.hypot(x, y)[ring]
+    assert radius[shape.groove[ring] < 0.01].mean() - radius[shape.groove[ring] > 0.9].mean() > 0.0008
+    assert len(np.unique(shape.kernel[shape.stem < 0.5])) > 250

@@ -1,0 +1,132 @@
+"""Scene files: the shipped ones load, and bad ones are refused in one sentence."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate import assemble
+from hsi_sc_nerf.simulate.effects import EFFECTS
+from hsi_sc_nerf.simulate.scene import SHIPPED_SCENES, load_scene, override, parse_scene
+from hsi_sc_nerf.simulate.target import marker_layout
+
+GOOD = """
+object: {shape: apple, height_m: 0.07}
+camera: {elevation_deg: 20, distance_m: 0.5, aim_height_m: 0.05}
+turntable: {disc_diameter_m: 0.205}
+markers: {side_m: 0.036}
+"""
+
+
+@pytest.mark.parametrize("name", SHIPPED_SCENES)
+def test_shipped_scenes_have_the_papers_target(name):
+    scene = load_scene(name)
+    assert scene.name == name
+    assert (scene.turntable.frames, scene.camera.size_px, scene.sensor.bands) == (36, 128, 204)
+    assert (scene.container.diameter_m, scene.container.height_m) == (0.09, 0.07)
+    assert (scene.markers.on_container, scene.markers.on_disc) == (6, 8)
+
+
+@pytest.mark.parametrize("name", SHIPPED_SCENES)
+def test_nothing_that_turns_leaves_the_image(name):
+    scene = override(load_scene(name), size_px=64)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
+    for pose in assemble.frame_plan(scene).camera_to_world[::6]:
+        weights, _ = renderer.render(assemble.intrinsics(scene.camera), pose, 1)
+        chamber = weights[..., -1]
+        for edge in (chamber[0], chamber[-1], chamber[:, 0], chamber[:, -1]):
+            assert (edge == 1.0).all()
+
+
+def test_a_scene_file_fills_in_defaults_and_takes_its_name_from_the_file(tmp_path):
+    path = tmp_path / "my_apple.yaml"
+    path.write_text(GOOD)
+    scene = load_scene(path)
+    assert scene.name == "my_apple"
+    assert scene.camera.field_of_view_deg == 31.0
+    assert isinstance(scene.camera.elevation_deg, float)
+    assert scene.effects == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (GOOD + "colour: red\n", "colour is not a known key"),
+        (GOOD.replace("height_m: 0.07", "height_m: 0.07, glow: 1"), "object.glow is not a known key"),
+        (GOOD.replace("apple", "banana"), "object.shape is 'banana', but must be one of pear, apple, maize"),
+        (GOOD.replace("0.07", "tall"), "object.height_m is 'tall', but must be a number"),
+        (GOOD.replace("0.07", "true"), "object.height_m is True, but must be a number"),
+        (GOOD.replace("0.07", "7"), "object.height_m is 7, but must lie between"),
+        (GOOD.replace("0.07", ".nan"), "object.height_m is nan, but must lie between"),
+        (GOOD + "sensor: {bands: 20.5}\n", "sensor.bands is 20.5, but must be a whole number"),
+        (GOOD.replace("shape: apple, ", ""), "object.shape is missing"),
+        (GOOD.replace("markers: {side_m: 0.036}", "markers: 3"), "markers must hold"),
+        (GOOD + "effects: [noise]\n", "effect 'noise' is unknown"),
+        (GOOD + "effects: noise\n", "effects is 'noise', but must be a list"),
+        (GOOD + "name: ../elsewhere\n", "name is '../elsewhere', but"),
+        ("object: [", "not valid YAML"),
+        ("", "the file must hold"),
+    ],
+)
+def test_bad_scene_files_get_one_sentence(text, sentence):
+    with pytest.raises(InputError) as caught:
+        parse_scene(text, source="scene.yaml", name="scene")
+    message = str(caught.value)
+    assert message.startswith("scene.yaml: ")
+    assert sentence in message
+    assert "\n" not in message
+
+
+def test_a_scene_that_does_not_exist_is_named():
+    with pytest.raises(InputError, match=r"pineapple: neither a shipped scene .*pear, apple, maize"):
+        load_scene("pineapple")
+
+
+@pytest.mark.parametrize("wrong", [{"frames": 0}, {"size_px": 1}, {"bands": 0}, {"seed": -1}])
+def test_overrides_are_checked_as_well(wrong):
+    with pytest.raises(InputError, match="must lie between"):
+        override(load_scene("pear"), **wrong)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("side_m: 0.036", "side_m: 0.06", "do not fit around the container"),
+        ("disc_diameter_m: 0.205", "disc_diameter_m: 0.15", "do not fit on the disc"),
+        ("side_m: 0.036", "side_m: 0.036, dictionary: DICT_9X9", "is no ArUco dictionary"),
+        ("side_m: 0.036", "side_m: 0.004, on_disc: 50, on_container: 6", "has only 50 markers"),
+    ],
+)
+def test_markers_that_cannot_be_made_are_refused(old, new, sentence):
+    scene = parse_scene(GOOD.replace(old, new), source="scene.yaml", name="scene")
+    with pytest.raises(InputError, match=sentence):
+        marker_layout(scene.markers, scene.container, scene.turntable)
+
+
+def test_layout_is_square_planar_distinct_and_faces_outwards():
+    scene = load_scene("pear")
+    layout = marker_layout(scene.markers, scene.container, scene.turntable)
+    assert sorted(layout) == list(range(14))
+    for number, corners in layout.items():
+        sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+        np.testing.assert_allclose(sides, 0.036, rtol=1e-12)
+        # OpenCV's corners run clockwise for who looks at the marker, so this normal points away from the reader.
+        inwards = np.cross(corners[1] - corners[0], corners[2] - corners[1])
+        centre = corners.mean(axis=0)
+        if number < 6:
+            np.testing.assert_allclose(np.hypot(*centre[:2]), 0.0455, rtol=1e-12)
+            assert inwards[:2] @ centre[:2] < 0
+            assert inwards[2] == pytest.approx(0.0, abs=1e-15)
+        else:
+            np.testing.assert_allclose(corners[:, 2], 0.0, atol=1e-15)
+            assert inwards[2] < 0
+
+
+def test_every_effect_and_strength_is_documented():
+    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
+    for name, effect in EFFECTS.items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
+        for strength in dataclasses.fields(effect):
+            assert f"`{strength.name}` ({strength.default:g})" in row

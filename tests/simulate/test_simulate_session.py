@@ -1,0 +1,328 @@
+"""Sessions: pictures agree with their truth, counts with the materials, folders with the layout."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pytest
+import tyro
+
+from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.specim_iq import read_metadata
+from hsi_sc_nerf.cli.simulate import SimulateCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, project, turntable_camera_to_world
+from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate import assemble, own_mesh, session
+from hsi_sc_nerf.simulate.materials import endmembers
+from hsi_sc_nerf.simulate.mesh import revolve
+from hsi_sc_nerf.simulate.objects import OwnMesh
+from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.target import marker_layout
+from hsi_sc_nerf.simulate.truth import load_truth
+
+SMALL = {"frames": 3, "size_px": 48, "bands": 12}
+
+
+@pytest.fixture(scope="module")
+def small_session(tmp_path_factory):
+    return simulate_session(override(load_scene("apple"), **SMALL), tmp_path_factory.mktemp("s") / "apple", False)
+
+
+def counts(session_dir, capture, prefix=""):
+    return open_cube(session_dir / capture / "capture" / f"{prefix}{capture}.hdr").read().astype(float)
+
+
+def test_folder_is_as_the_instrument_leaves_it(small_session):
+    assert sorted(path.name for path in small_session.iterdir()) == [
+        "apple_000", "apple_001", "apple_002", "session.json", "truth", "white_reference",
+    ]  # fmt: skip
+    cube = open_cube(small_session / "apple_001" / "capture" / "apple_001.hdr")
+    assert cube.shape == (48, 48, 12)
+    assert cube.interleave == "bil"
+    assert cube.dtype == np.uint16
+    metadata = read_metadata(small_session / "apple_001" / "metadata" / "apple_001.xml")
+    assert metadata.integration_time_ms == cube.integration_time_ms == 10.0
+    assert not metadata.is_specim_iq
+    assert json.loads((small_session / "session.json").read_text()) == {
+        "object": "apple",
+        "nominal_step_deg": 120.0,
+        "direction": "ccw",
+        "marker_dictionary": "DICT_5X5_50",
+        "marker_side_m": 0.036,
+        "container_diameter_m": 0.09,
+        "container_height_m": 0.07,
+        "white_reference": "white_reference",
+        "image_rotation_deg": 0,
+    }
+
+
+def test_metadata_state_each_captures_exposure_and_how_images_lie(tmp_path):
+    effects = ["{image_rotation: {quarter_turns: 3}}", "{tarp_exposure: {exposure_factor: 0.3}}"]
+    scene = override(load_scene("apple"), frames=2, size_px=32, bands=4, effects=effects)
+    session = open_session(simulate_session(scene, tmp_path / "s", False))
+    assert (session.image_rotation_deg, session.quarter_turns) == (270, 1)
+    assert [frame.integration_time_ms for frame in session.frames] == [10.0, 10.0]
+    assert session.white.integration_time_ms == pytest.approx(3.0)
+    metadata = read_metadata(tmp_path / "s" / "white_reference" / "metadata" / "white_reference.xml")
+    assert metadata.integration_time_ms == session.white.integration_time_ms
+
+
+def test_calibrated_counts_are_the_true_reflectance_within_rounding(small_session):
+    truth = load_truth(small_session)
+    np.testing.assert_array_equal(
+        open_cube(small_session / "apple_000" / "capture" / "apple_000.hdr").wavelengths_nm, truth.wavelengths_nm
+    )
+    for capture in truth.captures:
+        dark = counts(small_session, capture, "DARKREF_").mean(axis=0)
+        white = np.median(counts(small_session, "white_reference"), axis=(0, 1)) - dark
+        reflectance = (counts(small_session, capture) - dark) / white
+        # Half a count in the sample, half a count in the white.
+        bound = 0.5 * (1.0 + reflectance) / white + 1e-4
+        assert (np.abs(reflectance - truth.reflectance(capture)) <= bound).all()
+
+
+def test_white_capture_is_mostly_tarp_with_a_dark_border(small_session):
+    white = counts(small_session, "white_reference")
+    dark = counts(small_session, "white_reference", "DARKREF_").mean(axis=(0, 1))
+    tarp = white[..., 6] == white[24, 24, 6]
+    assert 0.6 < tarp.mean() < 0.9
+    assert ((white[0, 0] - dark) < 0.2 * (white[24, 24] - dark)).all()
+
+
+def test_truth_comes_back_whole(small_session):
+    truth = load_truth(small_session)
+    scene = override(load_scene("apple"), **SMALL)
+    assert truth.object == "apple"
+    assert truth.intrinsics == assemble.intrinsics(scene.camera)
+    np.testing.assert_allclose(truth.angles_deg, [0.0, 120.0, 240.0])
+    for pose, angle in zip(truth.camera_to_world, truth.angles_deg, strict=True):
+        np.testing.assert_allclose(pose, turntable_camera_to_world(truth.camera_to_world[0], angle), atol=1e-12)
+    # The first camera looks at the axis from above the x axis.
+    np.testing.assert_allclose(truth.camera_to_world[0, 1, 3], 0.0, atol=1e-12)
+    assert truth.camera_to_world[0, 0, 3] > 0.3
+    layout = marker_layout(scene.markers, scene.container, scene.turntable)
+    assert truth.marker_layout.keys() == layout.keys()
+    np.testing.assert_allclose(truth.marker_layout[9], layout[9])
+    np.testing.assert_allclose(truth.endmembers, endmembers(truth.materials, truth.wavelengths_nm))
+    assert truth.mesh_path.is_file()
+    part = assemble.object_part(scene)
+    assert truth.volume_m3 == pytest.approx(part.mesh.volume_m3())
+    for capture in truth.captures:
+        np.testing.assert_array_equal(truth.material_weights(capture).sum(axis=-1), 1.0)
+        assert 0.05 < truth.object_coverage(capture).mean() < 0.3
+
+
+def test_mesh_on_disk_is_the_object_on_the_lid(small_session):
+    truth = load_truth(small_session)
+    ply = o3d.io.read_triangle_mesh(str(truth.mesh_path))
+    mesh = Mesh(np.asarray(ply.vertices), np.asarray(ply.triangles))
+    assert mesh.is_watertight()
+    assert mesh.volume_m3() == pytest.approx(truth.volume_m3, rel=1e-6)
+    assert mesh.area_m2() == pytest.approx(truth.area_m2, rel=1e-6)
+    assert mesh.vertices[:, 2].min() == pytest.approx(0.07)
+    assert ply.get_surface_area() == pytest.approx(truth.area_m2, rel=1e-6)
+
+
+def test_mesh_on_disk_carries_its_materials_and_serves_as_a_mesh_of_ones_own(small_session):
+    part = assemble.object_part(load_scene("apple"))
+    again = OwnMesh("mesh", load_truth(small_session).mesh_path, part.materials)
+    mesh, weights = own_mesh.load(again)
+    assert mesh.volume_m3() == pytest.approx(part.mesh.volume_m3(), rel=1e-6)
+    # Reading orders the vertices anew.
+    np.testing.assert_allclose(np.sort(weights, axis=0), np.sort(part.weights, axis=0), atol=1e-6)
+
+
+def test_object_weights_are_only_where_the_object_is(small_session):
+    truth = load_truth(small_session)
+    of_object = [truth.materials.index(name) for name in ("apple_skin", "apple_blush", "lenticel", "bruise", "stem")]
+    for capture in truth.captures:
+        np.testing.assert_allclose(
+            truth.material_weights(capture)[..., of_object].sum(axis=-1), truth.object_coverage(capture), atol=2e-3
+        )
+
+
+def unit_sphere() -> Mesh:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, 400)
+    profile = np.stack([np.cos(latitude), np.sin(latitude)], axis=-1)
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, 800)
+
+
+def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
+    intrinsics = PinholeIntrinsics(64, 64, 128.0, 128.0, 32.0, 32.0)
+    mesh = unit_sphere()
+    renderer = Renderer([Part(mesh, ("paper",), np.ones((len(mesh.vertices), 1)), is_object=True)])
+    _, coverage = renderer.render(intrinsics, look_at(np.array([6.0, 0.0, 0.0]), np.zeros(3)), 4)
+    # A sphere on the optical axis is a disc of radius f tan(asin(r / d)).
+    radius_px = 128.0 * np.tan(np.arcsin(1.0 / 6.0))
+    assert coverage.sum() == pytest.approx(np.pi * radius_px**2, rel=2e-3)
+
+
+def test_white_things_in_a_white_chamber_cannot_be_seen():
+    intrinsics = PinholeIntrinsics(32, 32, 64.0, 64.0, 16.0, 16.0)
+    mesh = unit_sphere()
+    shares = np.random.default_rng(0).dirichlet([1.0, 1.0], len(mesh.vertices))
+    renderer = Renderer([Part(mesh, ("a", "b"), shares)], chamber="c")
+    weights, _ = renderer.render(intrinsics, look_at(np.array([5.0, 2.0, 1.0]), np.zeros(3)), 3)
+    assert (weights[..., 0] > 0).any()
+    np.testing.assert_array_equal(weights @ np.full(3, 0.75, np.float32), 0.75)
+
+
+def test_rendering_in_pieces_changes_nothing(monkeypatch):
+    scene = override(load_scene("maize"), size_px=32)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
+    arguments = assemble.intrinsics(scene.camera), assemble.frame_plan(scene).camera_to_world[3], 2
+    whole = renderer.render(*arguments)
+    monkeypatch.setattr("hsi_sc_nerf.simulate.render.RAYS_AT_ONCE", 700)
+    pieces = renderer.render(*arguments)
+    np.testing.assert_array_equal(whole[0], pieces[0])
+    np.testing.assert_array_equal(whole[1], pieces[1])
+
+
+def test_exact_weights_sum_to_one_and_survive_float16():
+    weights = np.random.default_rng(1).dirichlet(np.full(11, 0.3), 2000).astype(np.float32)
+    exact = exact_weights(weights)
+    np.testing.assert_array_equal(exact.sum(axis=1), 1.0)
+    np.testing.assert_array_equal(exact.astype(np.float16).astype(np.float32), exact)
+    assert np.abs(exact - weights).max() < 11 / 2 / 2048
+
+
+def green_image(scene, renderer, pose):
+    weights, _ = renderer.render(assemble.intrinsics(scene.camera), pose, scene.camera.supersampling)
+    return (weights @ endmembers(renderer.materials, np.array([548.0])))[..., 0]
+
+
+def detect(image, enlarge):
+    """Marker corners in corner-origin pixels of ``image``, by number."""
+    enlarged = cv2.resize(image, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
+        np.clip(enlarged * 255, 0, 255).astype(np.uint8)
+    )
+    return {int(n): (c[0] + 0.5) / enlarge for n, c in zip(numbers.ravel(), corners, strict=True)}
+
+
+@pytest.mark.parametrize("name", ["pear", "maize"])
+def test_enough_markers_are_found_in_small_images(name):
+    scene = load_scene(name)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
+    found = [
+        len(detect(green_image(scene, renderer, p), 4)) for p in assemble.frame_plan(scene).camera_to_world[:12:2]
+    ]
+    assert min(found) >= 3
+    assert np.mean(found) >= 5
+
+
+def test_marker_corners_are_seen_where_truth_projects_them():
+    scene = override(load_scene("pear"), size_px=256)
+    renderer = assemble.build_renderer(scene, assemble.object_part(scene))
+    layout = marker_layout(scene.markers, scene.container, scene.turntable)
+    errors = []
+    for pose in assemble.frame_plan(scene).camera_to_world[[0, 4, 13]]:
+        for number, seen in detect(green_image(scene, renderer, pose), 2).items():
+            expected, _ = project(layout[number], pose, assemble.intrinsics(scene.camera))
+            errors.append(seen - expected)
+    errors = np.array(errors)
+    assert len(errors) >= 15
+    assert np.median(np.linalg.norm(errors, axis=-1)) < 0.25
+    # Pixel coordinates start at the corner: half a pixel of bias would be a wrong convention.
+    assert np.abs(np.median(errors, axis=(0, 1))).max() < 0.1
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_fruit(tmp_path, small_session):
+    scene = override(load_scene("apple"), **SMALL)
+    again = simulate_session(scene, tmp_path / "again", False)
+    files = sorted(path.relative_to(small_session) for path in small_session.rglob("*.raw"))
+    assert len(files) == 8
+    for file in files:
+        assert (again / file).read_bytes() == (small_session / file).read_bytes()
+    other = simulate_session(dataclasses.replace(scene, seed=scene.seed + 1), tmp_path / "other", False)
+    frame = next(file for file in files if file.name == "apple_000.raw")
+    assert (other / frame).read_bytes() != (small_session / frame).read_bytes()
+    assert load_truth(other).volume_m3 != load_truth(small_session).volume_m3
+
+
+def test_clockwise_turns_the_other_way(small_session):
+    scene = override(load_scene("apple"), **SMALL)
+    scene = dataclasses.replace(scene, turntable=dataclasses.replace(scene.turntable, direction="cw"))
+    np.testing.assert_allclose(assemble.frame_plan(scene).angles_deg, [0.0, -120.0, -240.0])
+    np.testing.assert_allclose(
+        assemble.frame_plan(scene).camera_to_world[1], load_truth(small_session).camera_to_world[2], atol=1e-12
+    )
+
+
+def test_command_line(tmp_path, capsys):
+    words = ["pear", str(tmp_path / "s"), "--frames", "2", "--size", "24", "--bands", "5", "--seed", "3"]
+    tyro.cli(SimulateCommand, args=words).main()
+    truth = load_truth(tmp_path / "s")
+    assert len(truth.captures) == 2
+    assert truth.reflectance("pear_001").shape == (24, 24, 5)
+    assert "2 frames of 24 x 24 pixels x 5 bands" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("keep")
+    with pytest.raises(InputError, match="not a simulated session"):
+        simulate_session(override(load_scene("pear"), **SMALL), tmp_path, False)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_an_earlier_simulated_session_is_replaced(tmp_path):
+    scene = override(load_scene("pear"), frames=2, size_px=16, bands=3)
+    simulate_session(scene, tmp_path / "s", False)
+    simulate_session(override(scene, frames=1), tmp_path / "s", False)
+    assert load_truth(tmp_path / "s").captures == ("pear_000",)
+    assert not (tmp_path / "s" / "pear_001").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+
+
+def test_a_run_without_space_leaves_nothing(tmp_path, monkeypatch):
+    def stop(*_):
+        raise OSError(28, "No space left")
+
+    monkeypatch.setattr(session.truth, "write_pixels", stop)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left\); free some space"):
+        simulate_session(override(load_scene("pear"), frames=1, size_px=16, bands=3), tmp_path / "s", False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_is_stopped_goes_on_with_what_is_missing(tmp_path, monkeypatch):
+    scene = override(load_scene("pear"), frames=4, size_px=16, bands=3)
+    whole = simulate_session(scene, tmp_path / "whole", False)
+    write_pixels, written = session.truth.write_pixels, []
+
+    def stop_at_the_third(session_dir, capture, frame):
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(capture)
+        write_pixels(session_dir, capture, frame)
+
+    monkeypatch.setattr(session.truth, "write_pixels", stop_at_the_third)
+    monkeypatch.setattr(session, "WORKERS", 1)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_session(scene, tmp_path / "s", False)
+    assert not (tmp_path / "s").exists()
+
+    later = []
+    monkeypatch.setattr(session.truth, "write_pixels", lambda *a: (later.append(a[1]), write_pixels(*a)))
+    simulate_session(scene, tmp_path / "s", False)
+    assert sorted(written + later) == ["pear_000", "pear_001", "pear_002", "pear_003"]
+    files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
+    assert files == sorted(p.relative_to(tmp_path / "s") for p in (tmp_path / "s").rglob("*") if p.is_file())
+    for file in files:
+        if file.suffix != ".npz":
+            assert (whole / file).read_bytes() == (tmp_path / "s" / file).read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s", "whole"]
+
+
+def test_a_folder_without_truth_is_named(tmp_path):
+    with pytest.raises(InputError, match="has no truth"):
+        load_truth(tmp_path)

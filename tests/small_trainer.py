@@ -1,0 +1,25 @@
+"""A trainer of the tiny dataset, set up for a few steps."""
+
+import copy
+
+from hsi_sc_nerf.config import hsi_sc_nerf
+
+STEPS = 6
+
+
+def trainer(tiny_dataset, folder, device="cpu", **changes):
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.pipeline.datamanager.data = tiny_dataset[0]
+    config.pipeline.datamanager.train_num_rays_per_batch = 64
+    model = config.pipeline.model
+    model.match_resolution = False
+    model.num_levels, model.log2_hashmap_size, model.max_res = 4, 10, 32
+    model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
+    config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
+    config.machine.device_type = device
+    config.max_num_iterations, config.evaluate_stages = STEPS, False
+    for key, value in changes.items():
+        setattr(config, key, value)
+    made = config.setup(local_rank=0, world_size=1)
+    made.setup()
+    return made

@@ -1,0 +1,341 @@
+import contextlib
+import math
+from copy import deepcopy
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
+from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerControl, ViewerElement
+from viser.transforms import SO3
+
+from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.plotting.false_colour import BLANK, angle_to_measured, coloured, frame_pixels
+from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
+from hsi_sc_nerf.viewer.panel import SpectralPanel
+from hsi_sc_nerf.viewer.picking import pick
+from hsi_sc_nerf.viewer.training_views import TrainingViews
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+LENS = PinholeIntrinsics(w=40, h=30, fl_x=50.0, fl_y=60.0, cx=19.0, cy=16.0)
+STRAIGHT = (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_colours_are_those_of_the_map_at_its_range(device):
+    values = torch.tensor([[0.5, 0.9015, 1.3], [torch.nan, -9.0, 9.0]], device=device)
+    table = matplotlib.colormaps["viridis"]
+    expected = [[table(0)[:3], table(128)[:3], table(255)[:3]], [BLANK, table(0)[:3], table(255)[:3]]]
+    np.testing.assert_allclose(coloured(values, (0.5, 1.3), "viridis").cpu(), expected, atol=1e-6)
+
+
+def rays_through(lens, lines, samples):
+    """OpenGL directions in the camera's frame through the middle of pixels."""
+    x = (samples + 0.5 - lens.cx) / lens.fl_x
+    y = (lines + 0.5 - lens.cy) / lens.fl_y
+    return torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rays_meet_the_pixels_that_they_were_made_from(device):
+    lines, samples = torch.meshgrid(torch.arange(-3, 33), torch.arange(-3, 43), indexing="ij")
+    rotation = torch.from_numpy(SO3.exp(np.array([0.3, -1.1, 2.0])).as_matrix()).float()
+    directions = 3.0 * rays_through(LENS, lines, samples) @ rotation.T
+    pixels, seen = frame_pixels(directions.to(device), rotation.to(device), LENS, STRAIGHT)
+    np.testing.assert_array_equal(pixels.cpu()[..., 0], lines)
+    np.testing.assert_array_equal(pixels.cpu()[..., 1], samples)
+    np.testing.assert_array_equal(seen.cpu(), (lines >= 0) & (lines < 30) & (samples >= 0) & (samples < 40))
+    assert not frame_pixels(-directions.to(device), rotation.to(device), LENS, STRAIGHT)[1].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_angle_to_measured_is_that_of_two_spectra_where_seen_and_valid(device):
+    angles = torch.linspace(0.0, 1.0, 6).reshape(2, 3)
+    rendered = torch.stack([angles.cos(), angles.sin(), torch.zeros(2, 3)], dim=-1)
+    seen = torch.tensor([[True, False, True], [True, True, False]])
+    measured = torch.tensor([2.0, 0.0, 0.0]).repeat(4, 1)
+    measured[1, 2], valid = 77.0, torch.ones(4, 3, dtype=torch.bool)
+    valid[1, 2] = False  # another band's number is no measurement
+    valid[2, :2] = False  # one band left: no angle
+    result = angle_to_measured(*(t.to(device) for t in (rendered, measured, valid, seen)))
+    np.testing.assert_allclose(result.cpu(), [[0.0, np.nan, 0.4], [np.nan, 0.8, np.nan]], atol=1e-6)
+
+
+def test_drawings_are_pictures_in_markdown():
+    wavelengths_nm = np.linspace(400.0, 1000.0, 7)
+    plot = spectra_plot(wavelengths_nm, {"rendered": np.full(7, 0.5), "measured": np.full(7, np.nan)}, "a point")
+    for png in (plot, colour_bar((0.0, 0.2), "magma", "angle")):
+        assert png.startswith(b"\x89PNG")
+        assert inline_image(png, "text").startswith("![text](data:image/png;base64,iVBOR")
+
+
+@pytest.fixture(scope="module")
+def pipeline(flagged_dataset):
+    from hsi_sc_nerf.config import hsi_sc_nerf
+
+    config = deepcopy(hsi_sc_nerf.config.pipeline)
+    config.datamanager.data = flagged_dataset
+    config.datamanager.dataparser.data = flagged_dataset
+    torch.manual_seed(0)
+    return config.setup(device="cpu", test_mode="test")
+
+
+class FakeServer:
+    """What the panel uses of viser's server: one browser, a scene, a panel of texts."""
+
+    def __init__(self):
+        self.camera = SimpleNamespace(aspect=1.5)
+        self.client = SimpleNamespace(camera=self.camera, atomic=contextlib.nullcontext)
+        self.pointer = None
+        self.points = {}
+        self.scene = SimpleNamespace(
+            on_pointer_event=lambda event_type: lambda callback: setattr(self, "pointer", (event_type, callback)),
+            remove_pointer_callback=lambda: setattr(self, "pointer", None),
+            add_icosphere=lambda name, **sphere: self.points.update({name: sphere}),
+        )
+        self.opened = []
+        self.gui = SimpleNamespace(add_markdown=lambda content, image_root: SimpleNamespace(content=content))
+
+    def on_client_connect(self, callback):
+        self.opened.append(callback)
+
+    def get_clients(self):
+        return {0: self.client}
+
+    def moved_camera(self, size=(24, 36)):
+        """The camera that nerfstudio's viewer makes of the browser's."""
+        turn = SO3(self.camera.wxyz) @ SO3.from_x_radians(np.pi)
+        pose = np.concatenate([turn.as_matrix(), self.camera.position[:, None] / 10.0], axis=1)
+        state = CameraState(
+            fov=self.camera.fov,
+            aspect=size[1] / size[0],
+            c2w=torch.from_numpy(pose),
+            camera_type=CameraType.PERSPECTIVE,
+        )
+        return get_camera(state, size[0])
+
+
+@pytest.fixture
+def attached(pipeline):
+    """A panel, its browser, and the viewer that both belong to."""
+    model = pipeline.model
+    panel = SpectralPanel(model.wavelengths_nm, model.num_train_data)
+    server = FakeServer()
+    viewer = SimpleNamespace(
+        pipeline=pipeline,
+        viser_server=server,
+        train_lock=None,
+        get_model=lambda: model,
+        control_panel=SimpleNamespace(output_render="spectral_angle", split=False),
+    )
+    found = [path for path, _ in parse_object(panel, ViewerElement, "panel")]
+    names = ("band", "composite", "index", "legend", "measured_view", "picking", "spectrum")
+    assert found == [f"panel/{name}" for name in names]
+    for _, control in parse_object(panel, ViewerControl, "panel"):
+        control._setup(viewer)
+    model.eval()
+    return panel, server, viewer
+
+
+def truth_of(pipeline, view):
+    return unpack(pipeline.datamanager.train_dataset.frames[view].cube())
+
+
+def rendered_as(spectral):
+    """A stand-in for nerfstudio's rendering that remembers the camera and gives these spectra."""
+
+    def render(camera):
+        render.camera = camera
+        image = torch.from_numpy(spectral)
+        return {"rgb": 2.0 * image[..., :3], "spectral": image, "depth": torch.ones(*image.shape[:2], 1)}
+
+    return render
+
+
+def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
+    panel, server, _ = attached
+    frame = pipeline.datamanager.train_dataset.cameras[2:3]
+    spectral = np.full((4, 4, 12), 0.5, np.float32)
+    assert set(panel.render(frame, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
+    panel.measured_view.cb_hook(SimpleNamespace(value=1))
+    alone = SpectralPanel(panel.wavelengths_nm, 9)
+    assert set(alone.render(server.moved_camera(), rendered_as(spectral))) == {"rgb", "spectral", "depth"}
+    assert not list(panel.parameters())
+    assert not panel.state_dict()
+
+
+def test_a_viewer_gets_pictures_of_one_or_three_channels(attached, pipeline):
+    panel, server, _ = attached
+    panel.measured_view.cb_hook(SimpleNamespace(value=4))
+    camera = server.moved_camera()
+    outputs = panel.render(camera, pipeline.model.get_outputs_for_camera)
+    assert list(outputs)[:5] == ["rgb", "band", "composite", "index", "spectral_angle"]
+    assert "spectral" not in outputs
+    for image in outputs.values():
+        assert image.shape[:2] == (24, 36)
+        assert image.shape[2] in (1, 3)
+        assert image.isfinite().all()
+    for name in ("rgb", "composite", "index", "spectral_angle"):
+        assert outputs[name].shape[2] == 3
+        assert 0.0 <= outputs[name].min() <= outputs[name].max() <= 1.0
+
+
+def test_controls_choose_band_composite_and_index(attached):
+    panel, server, _ = attached
+    panel.legend.install(server)
+    panel.measured_view.cb_hook(SimpleNamespace(value=0))
+    spectral = np.random.default_rng(0).uniform(0.05, 0.9, (24, 36, 12)).astype(np.float32)
+
+    def nearest(nm):
+        return spectral[..., np.abs(panel.wavelengths_nm - nm).argmin()]
+
+    for nm, name, index in ((450.0, "pear", "NDVI"), (960.0, "CIR", "water index")):
+        panel.band.value, panel.composite.value, panel.index.value = nm, name, index
+        panel.composite.cb_hook(panel.composite)
+        outputs = panel.render(server.moved_camera(), rendered_as(spectral))
+        np.testing.assert_array_equal(outputs["band"][..., 0], nearest(nm))
+        expected = np.stack([nearest(nm) for nm in COMPOSITES[name].wavelengths_nm], -1)
+        np.testing.assert_array_equal(outputs["composite"], expected)
+        for told in (name, index, "{:g}, {:g}, {:g} nm".format(*COMPOSITES[name].wavelengths_nm)):
+            assert told in panel.legend.gui_handle.content
+        assert not set(panel.legend.gui_handle.content) & set("<{")  # the browser reads them as code
+    values = nearest(900.0) / nearest(970.0)
+    expected = matplotlib.colormaps["viridis"]((values - 0.9) / 0.4)
+    np.testing.assert_allclose(outputs["index"], expected[..., :3], atol=0.02)
+
+
+def test_what_the_bands_do_not_reach_is_not_offered():
+    visible = SpectralPanel(np.arange(400.0, 701.0, 5.0), 9)
+    assert visible.composite.options == ["pseudo-RGB", "maize visible"]
+    assert visible.index is None
+    near_infrared = SpectralPanel(np.arange(750.0, 1001.0, 5.0), 9)
+    assert near_infrared.composite is None
+    assert near_infrared.index.options == ["water index"]
+
+
+@pytest.mark.parametrize("view", [0, 5])
+def test_the_camera_stands_where_a_view_was_taken_and_sees_all_of_it(attached, pipeline, view):
+    panel, server, _ = attached
+    panel.measured_view.cb_hook(SimpleNamespace(value=view))
+    frame = pipeline.datamanager.train_dataset.cameras[view]
+    camera = server.moved_camera()
+    np.testing.assert_allclose(camera.camera_to_worlds[0], frame.camera_to_worlds, atol=1e-5)
+    render = rendered_as(np.full((24, 36, 12), 0.5, np.float32))
+    panel.render(camera, render)
+    for name in (FRAME_INDEX, CAMERA_ROTATION):  # what makes the model refine the pose and see the chamber
+        np.testing.assert_array_equal(render.camera.metadata[name][0], frame.metadata[name])
+    measured, _, seen = TrainingViews(pipeline.datamanager.train_dataset).measured(
+        view, camera.generate_rays(camera_indices=0, keep_shape=True).directions
+    )
+    # The window is half as wide again as high: the frame fills its height.
+    assert seen[:, 6:30].all()
+    assert not seen[:, :6].any()
+    assert not seen[:, 30:].any()
+    assert measured.shape == (24 * 24, 12)
+    aspect = 0.5
+    half = math.tan(TrainingViews(pipeline.datamanager.train_dataset).vertical_fov(view, aspect) / 2.0)
+    assert half * aspect == pytest.approx(float(frame.width / 2 / frame.fx))
+
+
+def test_a_browser_that_opens_stands_at_the_first_view_and_turns_around_the_object(attached, pipeline):
+    _, server, _ = attached
+    (opened,) = server.opened
+    opened(server.client)
+    frame = pipeline.datamanager.train_dataset.cameras[0]
+    np.testing.assert_allclose(server.moved_camera().camera_to_worlds[0], frame.camera_to_worlds, atol=1e-5)
+    ahead = torch.from_numpy((server.camera.look_at - server.camera.position) / 10.0).float()
+    torch.testing.assert_close(ahead / ahead.norm(), -frame.camera_to_worlds[:, 2], rtol=0, atol=1e-5)
+    middle = pipeline.datamanager.train_dataset.metadata["object_box"].mean(0)
+    looked_at = frame.camera_to_worlds[:, 3] + ahead
+    # The nearest point of the optical axis.
+    assert (middle - looked_at) @ ahead == pytest.approx(0.0, abs=1e-4)
+
+
+def test_the_angle_is_zero_for_the_measured_view_and_blank_elsewhere(attached, pipeline):
+    panel, server, viewer = attached
+    panel.measured_view.cb_hook(SimpleNamespace(value=3))
+    reflectance, valid = truth_of(pipeline, 3)
+    size = reflectance.shape[0]
+    camera = server.moved_camera((size, round(size * 1.5)))
+    margin = size // 4
+    spectral = np.pad(0.7 * reflectance, ((0, 0), (margin, margin), (0, 0)), constant_values=0.1)
+    # Half of the picture has spectra that are turned by a right angle.
+    spectral[: size // 2, :, ::2] = 0.0
+    turned = np.where(np.arange(12) % 2 == 0, 0.0, 1.0)
+    a = np.where(valid, reflectance, 0.0)
+    with np.errstate(invalid="ignore"):
+        cosine = (a * a * turned).sum(-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(a * turned, axis=-1))
+    angles = np.where(np.arange(size)[:, None] < size // 2, np.arccos(np.clip(cosine, 0, 1)), 0.0)
+    table = matplotlib.colormaps["magma"]
+    expected = table(angles / 0.2)[..., :3]
+    expected[valid.sum(-1) < 2] = BLANK
+    picture = panel.render(camera, rendered_as(spectral))["spectral_angle"].numpy()
+    np.testing.assert_allclose(picture[:, margin:-margin], expected, atol=0.03)
+    np.testing.assert_allclose(picture[:, :margin], np.broadcast_to(BLANK, (size, margin, 3)), atol=1e-6)
+
+    viewer.control_panel.output_render = "rgb"  # not asked for, not computed
+    np.testing.assert_allclose(panel.render(camera, rendered_as(spectral))["spectral_angle"][..., 0], BLANK[0])
+    viewer.control_panel = SimpleNamespace(output_render="rgb", split=True, split_output_render="spectral_angle")
+    np.testing.assert_array_equal(panel.render(camera, rendered_as(spectral))["spectral_angle"], picture)
+    server.camera.position = server.camera.position + np.array([0.02, 0.0, 0.0])
+    moved = server.moved_camera((size, round(size * 1.5)))
+    np.testing.assert_allclose(panel.render(moved, rendered_as(spectral))["spectral_angle"][..., 0], BLANK[0])
+    assert FRAME_INDEX not in moved.metadata
+
+
+def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline, monkeypatch):
+    panel, server, _ = attached
+    panel.spectrum.install(server)
+    view, line, sample = 2, 60, 50
+    panel.measured_view.cb_hook(SimpleNamespace(value=view))
+    panel.picking.cb_hook(SimpleNamespace(value=True))
+    event_type, _ = server.pointer
+    assert event_type == "click"
+    dataset = pipeline.datamanager.train_dataset
+    frame = dataset.cameras[view : view + 1]
+    coords = torch.tensor([line + 0.5, sample + 0.5])
+    ray = frame.generate_rays(camera_indices=0, coords=coords)
+    drawn = {}
+    monkeypatch.setattr(
+        "hsi_sc_nerf.viewer.panel.spectra_plot",
+        lambda wavelengths_nm, spectra, title: drawn.update(spectra, title=title) or b"",
+    )
+    origin = tuple(frame.camera_to_worlds[0, :3, 3].tolist())
+    panel.show_spectrum(ViewerClick(origin, tuple((3.0 * ray.directions).flatten().tolist()), (0.5, 0.5)))
+
+    reflectance, valid = truth_of(pipeline, view)
+    expected = np.where(valid[line, sample], reflectance[line, sample], np.nan)
+    np.testing.assert_array_equal(drawn["measured"], expected)
+    outputs = pipeline.model.get_outputs_for_camera_ray_bundle(ray.reshape((1, 1)))
+    np.testing.assert_allclose(drawn["rendered"], outputs["spectral"][0, 0], atol=1e-5)
+    told = panel.spectrum.gui_handle.content
+    assert f"rad to {dataset.frames[view].capture}" in told
+    assert f"opacity {outputs['accumulation'].item():.2f}" in told
+    # The point is on the ray, in millimetres of the object frame.
+    point = ray.origins.flatten() + ray.directions.flatten() * outputs["depth"].flatten()
+    parsed = pipeline.datamanager.train_dataparser_outputs
+    homogeneous = torch.eye(4)
+    homogeneous[:3] = parsed.dataparser_transform
+    in_metres = torch.linalg.inv(homogeneous) @ torch.cat([point / parsed.dataparser_scale, torch.ones(1)])
+    assert drawn["title"] == "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*(in_metres[:3] * 1000).tolist())
+    np.testing.assert_allclose(server.points["/picked_point"]["position"], 10.0 * point, rtol=1e-4)
+
+    drawn.clear()
+    panel.show_spectrum(ViewerClick((origin[0] + 0.1, *origin[1:]), (0.0, 0.0, 1.0), (0.5, 0.5)))
+    assert set(drawn) == {"rendered", "title"}
+    panel.picking.cb_hook(SimpleNamespace(value=False))
+    assert server.pointer is None
+
+
+def test_a_picked_ray_leaves_a_training_model_training(pipeline):
+    pipeline.model.train()
+    point = pick(pipeline.model, torch.tensor([3.0, 0.0, 1.0]), torch.tensor([-3.0, 0.0, -1.0]), {})
+    assert pipeline.model.training
+    assert point.spectrum.shape == (12,)
+    assert not point.spectrum.requires_grad

@@ -1,0 +1,84 @@
+"""The viewer in a real browser, before a ball of one spectrum."""
+
+import io
+import re
+import threading
+
+import ball_run
+import capture_factory as factory
+import numpy as np
+import pytest
+from headless_browser import launch, needs_browser
+from PIL import Image
+
+WINDOW = {"width": 900, "height": 700}
+ON_THE_BALL = (300, 345)  # pixels of the window from its upper left; the panel is at the right
+
+
+@pytest.fixture
+def address(tmp_path):
+    """Where `ns-viewer` would serve a run whose model is the ball."""
+    from nerfstudio.utils.eval_utils import eval_setup
+    from nerfstudio.viewer.viewer import Viewer
+
+    from hsi_sc_nerf.models.trained_run import TrainedRun
+
+    data = ball_run.write_ball_dataset(tmp_path / "data")
+    config, pipeline, _, step = eval_setup(ball_run.write_untrained_run(data, tmp_path / "runs"), test_mode="test")
+    ball_run.fill_with_ball(TrainedRun(pipeline.model, pipeline.datamanager))
+    viewer = Viewer(
+        config.viewer,
+        log_filename=tmp_path / "runs" / "viewer.log",
+        datapath=data,
+        pipeline=pipeline,
+        train_lock=threading.Lock(),
+    )
+    viewer.init_scene(pipeline.datamanager.train_dataset, "completed", pipeline.datamanager.eval_dataset)
+    viewer.update_scene(step)
+    yield re.search(r"http://\S+", viewer.viewer_info[0])[0].replace("0.0.0.0", "localhost")
+    viewer.viser_server.stop()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_pictures_and_spectra_of_a_ball(address):
+    """It opens before the object; composites have their colours; a click tells place and opacity."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
+    with sync_api.sync_playwright() as playwright:
+        browser = launch(playwright)
+        page = browser.new_page(viewport=WINDOW)
+        page.set_default_timeout(120_000)
+        page.goto(address, wait_until="domcontentloaded")
+        page.get_by_text("Hide Train Cams").click()
+
+        def shows(colour):
+            """Wait until the ball has a colour."""
+            for _ in range(240):
+                picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
+                found = picture[ON_THE_BALL[::-1]]
+                if np.abs(found - colour).max() <= 12:
+                    return True
+                page.wait_for_timeout(500)
+            pytest.fail(f"the ball is {found}, not {colour}")
+
+        def choose(label, name):
+            page.get_by_label(label, exact=True).click()
+            page.get_by_role("option", name=name, exact=True).click()
+
+        low, high = 255 * factory.PLANT.min(), 255 * factory.PLANT.max()
+        assert shows([low, low, low])
+        choose("Output type", "composite")
+        choose("Composite", "CIR")
+        assert shows([high, low, low])
+        page.get_by_label("Click for spectrum").check()
+        answer = page.get_by_text(re.compile(r"x -?[\d.]+, y .* mm, opacity"))
+        for _ in range(60):  # the browser listens to clicks only when the server has told it to
+            page.mouse.click(*ON_THE_BALL)
+            page.wait_for_timeout(1000)
+            if answer.count():
+                break
+        told = answer.inner_text(timeout=5000)
+        place, opacity = np.array(re.findall(r"-?[\d.]+", told)[:3], float), re.search(r"opacity ([\d.]+)", told)[1]
+        assert np.linalg.norm(place / 1000.0 - factory.SPHERE_CENTRE_M) == pytest.approx(0.04, abs=0.002)
+        assert float(opacity) > 0.98
+        browser.close()
