@@ -7,30 +7,34 @@ The pages on commands and settings are made from the code's own help texts.
 from __future__ import annotations
 
 import ast
+import contextlib
 import csv
 import dataclasses
 import inspect
+import io
 import os
 import re
-import subprocess
-import sys
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+import tyro
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from hsi_sc_nerf.cli.main import Commands
+
 RESULTS = Path(__file__).parent / "results"
 SOURCE_COLUMNS = ("commit", "seed", "machine")
-_TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
+TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Put the results' tables into a page."""
-    return _TABLE.sub(lambda match: results_table(match.group(1)), markdown)
+    return TABLE.sub(lambda match: results_table(match.group(1)), markdown)
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
@@ -60,38 +64,55 @@ def results_table(name: str, folder: Path = RESULTS) -> str:
     return "\n".join([*lines, "", f"*`benchmarks/results/{name}.csv`: {told}.*"])
 
 
+def readme_table(folder: Path = RESULTS) -> str:
+    """The README's table: held-out views by ours and the published method in equal time; the paper's figures."""
+    with (folder / "beyond_the_paper.csv").open(encoding="utf-8", newline="") as file:
+        _, *rows = list(csv.reader(file))
+    titles = ["object", "method", "SAM, rad", "RMSE", "SSIM", "PSNR, dB", "F-score of what is seen at 2 mm, %"]
+    methods = {
+        "paper, its own fruit": "printed in the paper, real fruit",
+        "paper": "published method",
+        "ours": "ours",
+    }
+    lines = [titles, ["---"] * len(titles)]
+    lines += [[row[0], methods[row[1]], *row[3:7], row[11]] for row in rows if row[1] in methods]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
 def commands_page() -> str:
     """The help texts of all commands."""
     parts = [
         "# Commands",
-        "Each text is what the command's `--help` prints. `ns-train`, `ns-eval`, `ns-export` and `ns-viewer` are nerfstudio's.",
+        "Each text is what the command's `--help` prints. The commands `ns-...` are nerfstudio's.",
     ]
-    for command in ("", *_command_names()):
+    for command in ("", *command_names()):
         title = f"hsi-sc-nerf {command}".strip()
-        words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", *([command] if command else []), "--help"]
-        text = _printed(words)
-        parts.append(f"## `{title}`\n\n```text\n{text}\n```")
+        parts.append(f"## `{title}`\n\n```text\n{help_text(command)}\n```")
     return "\n\n".join(parts) + "\n"
 
 
-def _command_names() -> list[str]:
+def command_names() -> list[str]:
     """The commands, in the order in which the help lists them."""
-    text = _printed([sys.executable, "-m", "hsi_sc_nerf.cli.main", "--help"])
-    match = re.search(r"\{([a-z,]+)\}", text)
-    if match is None:
-        raise PluginError("hsi-sc-nerf --help lists no commands")
-    return match.group(1).split(",")
+    return [get_args(command)[1].name for command in get_args(Commands)]
 
 
-def _printed(words: list[str]) -> str:
-    result = subprocess.run(words, capture_output=True, text=True, env=_plain_terminal())
-    if result.returncode != 0:
-        raise PluginError(f"{' '.join(words)} failed: {result.stderr[-500:]}")
-    return re.sub(r"\x1b\[[0-9;]*m", "", result.stdout).rstrip()
+def help_text(command: str) -> str:
+    """What ``hsi-sc-nerf COMMAND --help`` prints, 110 characters wide and without colours."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit), _plain_terminal():
+        tyro.cli(Commands, prog="hsi-sc-nerf", args=[*([command] if command else []), "--help"])  # type: ignore[call-overload]
+    return re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
 
 
-def _plain_terminal() -> dict[str, str]:
-    return os.environ | {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb", "PYTHONWARNINGS": "ignore"}
+@contextlib.contextmanager
+def _plain_terminal() -> Iterator[None]:
+    before = dict(os.environ)
+    os.environ.update(COLUMNS="110", NO_COLOR="1", TERM="dumb")
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def settings_page() -> str:
@@ -101,7 +122,7 @@ def settings_page() -> str:
     config = hsi_sc_nerf.config
     parts = [
         "# Training settings",
-        "Settings of `ns-train hsi-sc-nerf` that this package defines. nerfstudio's own stand in `ns-train hsi-sc-nerf --help`.",
+        "Settings of `ns-train hsi-sc-nerf` that this package defines; its `--help` lists nerfstudio's as well.",
     ]
     groups = {
         "": config,
@@ -113,8 +134,9 @@ def settings_page() -> str:
         "pipeline.model.camera-optimizer": config.pipeline.model.camera_optimizer,
     }
     for prefix, settings in groups.items():
+        dotted = f"{prefix}." if prefix else ""
         rows = [
-            f"| `--{f'{prefix}.' if prefix else ''}{name.replace('_', '-')}` | `{_short(getattr(settings, name))}` | {text} |"
+            f"| `--{dotted}{name.replace('_', '-')}` | `{_short(getattr(settings, name))}` | {text} |"
             for name, text in documented_fields(type(settings)).items()
         ]
         if rows:
