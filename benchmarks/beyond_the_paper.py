@@ -25,9 +25,8 @@ from rich.table import Table
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.machine import describe_machine
-from hsi_sc_nerf.benchmark.results import TrainedRun, describe_in_words
-from hsi_sc_nerf.benchmark.run import HeldOutViews
-from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.results import describe_in_words
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock, HeldOutViews
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
@@ -97,7 +96,7 @@ class BeyondThePaper:
         if self.page is not None:
             write_table(self.page, "beyond the paper", TITLES, rows, self._caption())
 
-    def _train(self, name: str, folder: Path) -> list[TrainedRun]:
+    def _train(self, name: str, folder: Path) -> list[BenchmarkRun]:
         for session, effects in (("session", (*NOISE, *SHADING)), ("noise-free", SHADING)):
             scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=effects)
             if not (folder / session).exists():
@@ -114,7 +113,7 @@ class BeyondThePaper:
         )
         return train_all([named_configuration(known) for known in self.configurations], command)
 
-    def _judged(self, folder: Path, run: TrainedRun) -> dict[str, float]:
+    def _judged(self, folder: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
         trained = folder / "runs" / run.name
         kept = trained / "judged.json"
@@ -190,7 +189,7 @@ TITLES = [
 ]
 
 
-def object_rows(name: str, runs: Sequence[TrainedRun], judged: Sequence[Mapping[str, float]]) -> list[list[str]]:
+def object_rows(name: str, runs: Sequence[BenchmarkRun], judged: Sequence[Mapping[str, float]]) -> list[list[str]]:
     """The paper's row, one for each run, and what the noise and the views would allow."""
     printed: Mapping[str, float] = PAPER.get(name, {})
     cells = [f"{printed[metric]:.{digits}f}" if metric in printed else "-" for metric, (_, digits) in METRICS.items()]

@@ -26,16 +26,7 @@ from hsi_sc_nerf.benchmark.configurations import (
     training_config,
 )
 from hsi_sc_nerf.benchmark.machine import available_cores, describe_machine
-from hsi_sc_nerf.benchmark.results import (
-    TABLE_WIDTH,
-    TrainedRun,
-    screen_table,
-    write_csv,
-    write_page,
-    write_results,
-)
-from hsi_sc_nerf.benchmark.run import Checkpoint, Job
-from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock, Job
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.errors import InputError
@@ -84,15 +75,17 @@ class BenchmarkCommand:
             InputError: a name, a word, a number or the data cannot be used, or a run failed.
         """
         chosen = [*map(named_configuration, self.configurations), *map(own_configuration, self.sets)]
+        from hsi_sc_nerf.benchmark.results import TABLE_WIDTH, results_table
+
         runs = train_all(chosen, self)
         console = Console()
         # Broken numbers cannot be read: rather let the terminal wrap.
         console.width = max(console.width, TABLE_WIDTH)
-        console.print(screen_table(runs))
+        console.print(results_table(runs))
         console.print(f"Everything, and the picture: {escape(str(self.output_dir / 'benchmark.md'))}", soft_wrap=True)
 
 
-def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[TrainedRun]:
+def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[BenchmarkRun]:
     """Train the configurations that are not finished and write the results of all after each.
 
     Raises:
@@ -131,10 +124,10 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     return _runs(jobs, contents)
 
 
-def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[TrainedRun]:
+def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[BenchmarkRun]:
     """Those that are finished."""
     return [
-        TrainedRun(
+        BenchmarkRun(
             name,
             job.method,
             job.words,
@@ -237,8 +230,8 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
     return content if wanted.items() <= content.items() else None
 
 
-def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
-    from hsi_sc_nerf.benchmark.plot import draw_accuracy_and_time
+def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
+    from hsi_sc_nerf.benchmark import results
 
     settings = {
         "data": command.data.name,
@@ -250,7 +243,7 @@ def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[
         "threads": command.threads or available_cores(),
     }
     out = command.output_dir / "benchmark"
-    write_csv(out.with_suffix(".csv"), runs)
-    write_results(out.with_suffix(".json"), runs, settings, machine)
-    write_page(out.with_suffix(".md"), runs, settings, machine)
-    draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)
+    results.write_csv(out.with_suffix(".csv"), runs)
+    results.write_results(out.with_suffix(".json"), runs, settings, machine)
+    results.write_page(out.with_suffix(".md"), runs, settings, machine)
+    results.draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)
