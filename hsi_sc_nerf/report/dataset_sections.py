@@ -13,9 +13,8 @@ from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.report.blocks import Block, Figure, Folded, Missing, Section, Table, Warnings
 from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
-from hsi_sc_nerf.report.embed import embedded_file
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, Warnings, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
 _DIRECTIONS = {"ccw": "counter-clockwise", "cw": "clockwise"}
