@@ -29,15 +29,17 @@ from hsi_sc_nerf.benchmark.results import describe_in_words
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock, HeldOutViews
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
-from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
+from hsi_sc_nerf.evaluation.comparison import CompareConfig
+from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
-from hsi_sc_nerf.evaluation.threshold_curves import score_at
+from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.scores.processing import score_processing
+from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -165,13 +167,14 @@ def cloud_scores(config: Path, folder: Path, output_dir: Path) -> dict[str, floa
     options = ["--output-dir", str(output_dir), "--num-points", str(CLOUD_POINTS)]
     run_step("export", [*export, *options], output_dir / "export.log")
     scores = {}
+    cloud = Surface(read_surface(output_dir / "point_cloud.ply")[0])
     for name, whole in (("whole", True), ("seen", False)):
-        compared = compare(
-            output_dir / "point_cloud.ply",
-            folder / "session",
-            CompareConfig(distances="points", whole_reference=whole),
-        )
-        score = score_at(compared.to_reference_m, compared.to_cloud_m, paper.F_SCORE_THRESHOLD_M)
+        reference = true_reference(folder / "session", CompareConfig(whole_reference=whole))
+        points_m = reference.surface.points_m
+        counted_m = points_m if reference.seen is None else points_m[reference.seen]
+        # Distances between points are the paper's.
+        distances = Surface(points_m).distances_m(cloud.points_m), cloud.distances_m(counted_m)
+        score = score_at(*distances, paper.F_SCORE_THRESHOLD_M)
         scores |= {f"{name}_{figure}": value for figure, value in asdict(score).items()}
     return scores
 

@@ -29,7 +29,7 @@ Clock = Literal["wall", "cpu"]
 # The first steps of a stage build caches and tables.
 _WARM_UP_STEPS = 2
 _REHEARSAL_ITERATIONS = 20
-_REHEARSAL_SHARE = 0.05
+_REHEARSAL_FRACTION = 0.05
 _RENDERING_SPEEDS = ("num_rays_per_sec", "fps")
 
 
@@ -45,7 +45,7 @@ class Job:
         iterations: length of the run; None: find out how many fit into ``train_seconds``, and train nothing.
         train_seconds: time to fill; None where ``iterations`` is given.
         clock: what ``train_seconds`` are of.
-        checkpoints: shares of the run at which it is evaluated, beside the stages' ends.
+        checkpoints: fractions of the run at which it is evaluated, beside the stages' ends.
         threads: CPU threads.
         held_out_views: how many held-out views are evaluated, evenly spread; None for all.
     """
@@ -211,7 +211,7 @@ def rehearse(job: Job) -> dict[str, Any]:
     """
     assert job.train_seconds is not None
     seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS)
-    longer = int(_REHEARSAL_SHARE * job.train_seconds / seconds)
+    longer = int(_REHEARSAL_FRACTION * job.train_seconds / seconds)
     if longer > _REHEARSAL_ITERATIONS:
         seconds = _rehearsed_seconds(job, longer)
     return {"iterations": max(1, round(job.train_seconds / seconds)), "iteration_seconds": seconds}
@@ -236,15 +236,15 @@ def _rehearsed_seconds(job: Job, iterations: int) -> float:
     return mean_iteration_seconds(times, [stage.end for stage in trainer.plan.stages])
 
 
-def checkpoint_iterations(shares: Sequence[float], stage_ends: Sequence[int]) -> tuple[int, ...]:
-    """Numbers of done iterations at which a run is evaluated: these shares of it, and the end of every stage.
+def checkpoint_iterations(fractions: Sequence[float], stage_ends: Sequence[int]) -> tuple[int, ...]:
+    """Numbers of done iterations at which a run is evaluated: these fractions of it, and the end of every stage.
 
     Args:
-        shares: of the whole run, in (0, 1].
+        fractions: of the whole run, in (0, 1].
         stage_ends: iterations done at the end of each stage; the last is the run's length.
     """
     total = stage_ends[-1]
-    return tuple(sorted({*stage_ends, *(max(1, round(share * total)) for share in shares)}))
+    return tuple(sorted({*stage_ends, *(max(1, round(fraction * total)) for fraction in fractions)}))
 
 
 def mean_iteration_seconds(times: Sequence[float], stage_ends: Sequence[int]) -> float:

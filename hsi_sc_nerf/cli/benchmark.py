@@ -62,7 +62,7 @@ class BenchmarkCommand:
     iterations: int | None = None
     """The same number of iterations for each configuration instead of the same time."""
     checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
-    """Shares of a run at which held-out views are evaluated; the end of each stage always is."""
+    """Fractions of a run at which held-out views are evaluated; the end of each stage always is."""
     held_out_views: int | None = None
     """Evaluate this many of the held-out views, evenly spread, instead of all."""
     threads: int | None = None
@@ -158,8 +158,8 @@ def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -
     for option, value in given.items():
         if value is not None and value <= 0:
             raise InputError(f"{option} is {value}; it must be more than 0.")
-    if not all(0 < share <= 1 for share in command.checkpoints):
-        raise InputError(f"--checkpoints are shares of a run, more than 0 and at most 1, not {command.checkpoints}.")
+    if not all(0 < fraction <= 1 for fraction in command.checkpoints):
+        raise InputError(f"--checkpoints are fractions of a run, above 0 and at most 1, not {command.checkpoints}.")
     for configuration in configurations:
         training_config(configuration.method, (*split_words(command.common), *configuration.words))
 
@@ -238,7 +238,7 @@ def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dic
         "length": f"{command.iterations} iterations"
         if command.iterations
         else f"{command.train_seconds:g} s ({command.clock})",
-        "checkpoints": ", ".join(f"{share:g}" for share in command.checkpoints),
+        "checkpoints": ", ".join(f"{fraction:g}" for fraction in command.checkpoints),
         "held-out views": command.held_out_views or "all",
         "threads": command.threads or available_cores(),
     }

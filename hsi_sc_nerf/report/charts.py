@@ -18,6 +18,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from hsi_sc_nerf.plotting.figures import STYLE, new_figure
 
@@ -105,6 +106,8 @@ def line_chart(
         low, high = _value_range(np.concatenate(values), from_zero, logarithmic)
         if logarithmic:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(low, high)
         for index, curve in enumerate(curves):
             colour = _SERIES[(index if curve.colour is None else curve.colour) % len(_SERIES)]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
 
 PLACES = 4
-# Radius of a place, as a share of a view's width: 8 pixels of the SPECIM IQ's 512.
+# Radius of a place, as a fraction of a view's width: 8 pixels of the SPECIM IQ's 512.
 _PLACE_RADIUS = 1.0 / 64.0
 
 

@@ -40,7 +40,9 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path | None
     """
     title = "Precision and recall"
     if comparison is None:
-        return Section("comparison", title, [Missing("The geometry was not compared with a reference.", _COMPARE_COMMAND)])
+        return Section(
+            "comparison", title, [Missing("The geometry was not compared with a reference.", _COMPARE_COMMAND)]
+        )
     try:
         blocks = _blocks(comparison)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -82,7 +84,7 @@ def _blocks(comparison: Mapping[str, Any]) -> list[Block]:
     ]
     return [
         Table(
-            "Precision: share of the cloud within the threshold of the reference. Recall: the converse.",
+            "Precision: fraction of the cloud within the threshold of the reference. Recall: the converse.",
             ("", *_CURVES.values()),
             score_rows,
         ),

@@ -20,8 +20,8 @@ _CORRECTIONS = {
     "Train Metrics Dict/camera_opt_rotation_deg": "rotation of the camera",
     "Train Metrics Dict/camera_opt_angle_max_deg": "largest of the table's angles",
 }
-# Terms of the loss that never reach this share of its largest value say nothing.
-_LEAST_SHARE = 1e-5
+# Terms of the loss that never reach this fraction of the largest are not drawn.
+_SMALLEST_FRACTION = 1e-5
 _PSNR = {
     "Train Metrics Dict/psnr": "training rays",
     "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
@@ -85,7 +85,7 @@ def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
     """Curves of the tags that were logged, but for those that stay tiny beside the largest."""
     found = {name: scalars[tag] for tag, name in tags.items() if tag in scalars}
     heights = {name: np.nanmax(np.abs(values), initial=0.0) for name, (_, values) in found.items()}
-    least = _LEAST_SHARE * max(heights.values(), default=0.0)
+    least = _SMALLEST_FRACTION * max(heights.values(), default=0.0)
     return [Curve(name, *shortened(*curve)) for name, curve in found.items() if heights[name] > least]
 
 

@@ -165,7 +165,7 @@ def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
         edges,
         100.0 * counts / len(angles),
         x_label="spectral angle (rad)",
-        y_label="share of pixels (%)",
+        y_label="fraction of pixels (%)",
         alt="Histogram of the spectral angle over the object's pixels",
         marks={"mean": float(angles.mean())},
     )
