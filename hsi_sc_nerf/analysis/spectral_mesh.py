@@ -42,7 +42,7 @@ class SpectralMesh:
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
-        """Each vertex's share of the surface."""
+        """Surface area of each vertex."""
         return vertex_areas_m2(self.mesh)
 
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.validity import cleared, has_angle
+from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, select_pixels, spectral_angle, widen
 
 # Root mean square reflectance below which a spectrum has no usable direction. A count of the packed cubes is 2e-5.

@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh, open_edges
-from hsi_sc_nerf.analysis.regions import PickedRegion, region_spectrum
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
-from hsi_sc_nerf.analysis.traits import classified
+from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
@@ -76,7 +75,7 @@ def test_only_the_base_was_not_seen(measured_apple):
 def test_spectra_of_spots_are_within_two_percent(ideal_apple, measured_apple):
     high = np.flatnonzero(ideal_apple.seen & (ideal_apple.mesh.vertices[:, 2] > STAND_M + 0.01))
     for vertex in np.random.default_rng(0).choice(high, 8):
-        spot = PickedRegion("spot", tuple(ideal_apple.mesh.vertices[vertex].tolist()), 0.005)
+        spot = RegionOfInterest("spot", tuple(ideal_apple.mesh.vertices[vertex].tolist()), 0.005)
         measured, true = (region_spectrum("spot", one, spot.of(one)) for one in (measured_apple, ideal_apple))
         assert relative_rms(measured.mean, true.mean) < 0.02
 

@@ -17,12 +17,9 @@ from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report import build
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.comparison_section import comparison_section
-from hsi_sc_nerf.report.places import inner_places, place_spectra
-from hsi_sc_nerf.report.rendering import HeldOutView
-from hsi_sc_nerf.report.scores import score_view
-from hsi_sc_nerf.report.settings import settings_section
-from hsi_sc_nerf.report.traits_section import trait_rows, traits_section
+from hsi_sc_nerf.report.held_out_views import HeldOutView, inner_places, place_spectra, score_view
+from hsi_sc_nerf.report.result_sections import comparison_section, trait_rows, traits_section
+from hsi_sc_nerf.report.run_sections import settings_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 SECTIONS = ["object", "views", "bands", "spectra", "comparison", "traits", "training"]
