@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Num, UInt8, UInt16
 from hsi_sc_nerf.calibration.line_pictures import PictureBands
 from hsi_sc_nerf.calibration.pixel_counts import Tally
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, pack_counts
-from hsi_sc_nerf.capture.cube_lines import CubeLines
-from hsi_sc_nerf.capture.envi import Cube, open_cube
+from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
