@@ -23,13 +23,13 @@ from hsi_sc_nerf.analysis.regions import PickedRegion, region_spectrum
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import classified
-from hsi_sc_nerf.benchmark.results import markdown_table
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.tables import markdown_table
 
 EVERY_KTH_CAMERA = 5
 ROI_RADIUS_M = 0.005

@@ -12,7 +12,6 @@ from plyfile import PlyData, PlyElement
 from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
-from hsi_sc_nerf.benchmark.results import markdown_table
 from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.comparison_pictures import (
     colour_limit_m,
@@ -22,6 +21,7 @@ from hsi_sc_nerf.evaluation.comparison_pictures import (
 )
 from hsi_sc_nerf.evaluation.threshold_curves import distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.tables import markdown_table, screen_table
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _DISTANCE_TITLES = ["distance, mm", "mean", "median", "RMS", "95th percentile", "largest"]
@@ -53,16 +53,10 @@ def distance_rows(comparison: Comparison) -> list[list[str]]:
 
 def screen_tables(comparison: Comparison) -> list[Table]:
     """The tables for a terminal."""
-    tables = []
-    for titles, rows in (
-        (_SCORE_TITLES, score_rows(comparison)),
-        (_DISTANCE_TITLES, distance_rows(comparison)),
-    ):
-        shown = Table(*titles)
-        for row in rows:
-            shown.add_row(*row)
-        tables.append(shown)
-    return tables
+    return [
+        screen_table(_SCORE_TITLES, score_rows(comparison)),
+        screen_table(_DISTANCE_TITLES, distance_rows(comparison)),
+    ]
 
 
 def summary(comparison: Comparison) -> dict[str, Any]:

@@ -25,13 +25,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.plotting.false_colour import (
-    ANGLE_COLOURS,
-    ANGLE_DRAWN_RAD,
-    INDEX_COLOURS,
-    angle_to_measured,
-    coloured,
-)
+from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
@@ -39,7 +33,7 @@ from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
 from hsi_sc_nerf.viewer.picking import PickedPoint, pick
-from hsi_sc_nerf.viewer.training_views import TrainingViews
+from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
