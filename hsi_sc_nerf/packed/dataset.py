@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 
 TRANSFORMS_NAME = "transforms.json"
 

@@ -17,12 +17,12 @@ from hsi_sc_nerf.packed.cube import (
     LARGEST_REFLECTANCE,
     REFLECTANCE_SCALE,
     PixelFlag,
+    ReflectanceUncertainty,
     pack,
     unpack,
     write_packed_cube,
 )
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 from hsi_sc_nerf.processing.frames import border_spectrum
 
 WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
