@@ -52,14 +52,14 @@ class Cube(EnviHeader):
         return np.ascontiguousarray(self.memmap(), dtype=self.dtype.newbyteorder("="))
 
 
-def open_cube(header_path: Path, wavelengths_nm: Float[np.ndarray, "bands"] | None = None) -> Cube:
-    """Open the ENVI pair that ``header_path`` describes.
+def open_cube(header: Path | EnviHeader, wavelengths_nm: Float[np.ndarray, "bands"] | None = None) -> Cube:
+    """Open an ENVI pair.
 
     The data file has the header's name with one of ENVI's usual endings or none. Any interleave, real data type, byte
     order (little endian by default) and header offset is read; wavelengths may be in nm or micrometres.
 
     Args:
-        header_path: the header.
+        header: path of the header, or the header itself if it was read before.
         wavelengths_nm: band centres, used if the header lists none.
 
     Raises:
@@ -71,11 +71,8 @@ def open_cube(header_path: Path, wavelengths_nm: Float[np.ndarray, "bands"] | No
         >>> cube.shape, cube.wavelengths_nm[[0, -1]]
         >>> spectrum = cube.memmap()[256, 256]  # reads this pixel only
     """
-    return cube_of(read_header(Path(header_path)), wavelengths_nm)
-
-
-def cube_of(header: EnviHeader, wavelengths_nm: Float[np.ndarray, "bands"] | None = None) -> Cube:
-    """The cube of a header that was read before; otherwise like `open_cube`."""
+    if not isinstance(header, EnviHeader):
+        header = read_header(Path(header))
     if header.wavelengths_nm is not None:
         wavelengths_nm = header.wavelengths_nm
     if wavelengths_nm is None:
@@ -106,10 +103,9 @@ def write_cube(
     wavelengths_nm: Shaped[np.ndarray, "bands"] | None,
     interleave: str = "bil",
     data_suffix: str = ".raw",
-    byte_order: str = "little",
     extra_header: dict[str, Any] | None = None,
 ) -> None:
-    """Write an ENVI pair. Both files appear whole or not at all, the data file first.
+    """Write an ENVI pair, little endian. Both files appear whole or not at all, the data file first.
 
     Args:
         header_path: the header, ending in ``.hdr``.
@@ -117,7 +113,6 @@ def write_cube(
         wavelengths_nm: band centres; None for bands that are no wavelengths (a map).
         interleave: "bil", "bip" or "bsq".
         data_suffix: ending of the data file, which is written beside the header.
-        byte_order: "little" or "big".
         extra_header: further fields of the header.
 
     Raises:
@@ -131,13 +126,13 @@ def write_cube(
         if len(wavelengths_nm) != cube.shape[2]:
             raise ValueError(f"{len(wavelengths_nm)} wavelengths for {cube.shape[2]} bands")
     stored = np.ascontiguousarray(cube.transpose(_AXES[interleave]))
-    stored = stored.astype(stored.dtype.newbyteorder(">" if byte_order == "big" else "<"), copy=False)
+    stored = stored.astype(stored.dtype.newbyteorder("<"), copy=False)
     header = {
         **dict(zip(("lines", "samples", "bands"), cube.shape, strict=True)),
         "header offset": 0,
         "data type": envi.dtype_to_envi[cube.dtype.char],
         "interleave": interleave,
-        "byte order": 1 if byte_order == "big" else 0,
+        "byte order": 0,
         **spectral,
         **(extra_header or {}),
     }

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.capture.envi import Cube, cube_of
+from hsi_sc_nerf.capture.envi import Cube, open_cube
 from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.capture.layout import CaptureFiles, find_captures, holds_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
@@ -221,7 +221,7 @@ def _open_cubes(headers: Iterable[Path], info: SessionInfo, root: Path) -> dict[
         if header.wavelengths_nm is not None:
             by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
     return {
-        path: cube_of(header, by_band_count.get(header.shape[2]) if listed is None else listed)
+        path: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
         for path, header in read.items()
     }
 

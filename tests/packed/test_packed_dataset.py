@@ -112,7 +112,7 @@ def test_flags(dataset):
     assert flags.dtype == np.uint8
     np.testing.assert_array_equal(flags == PixelFlag.SATURATED, np.eye(4, 5, dtype=bool))
     dataset.frames[0].flags_path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture of flags"):
+    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture"):
         dataset.frames[0].flags()
 
 
