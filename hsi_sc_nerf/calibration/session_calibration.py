@@ -24,13 +24,14 @@ from hsi_sc_nerf.calibration.lamp_drift import (
 from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
 from hsi_sc_nerf.calibration.panel import read_panel
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.calibration.white_reference import (
-    Roi,
-    White,
-    WhiteReference,
-    column_white,
-    tarp_roi,
-    white_reference,
+from hsi_sc_nerf.calibration.white_reference import Roi, White, WhiteReference, tarp_roi
+from hsi_sc_nerf.calibration.white_source import (
+    WhiteSource,
+    exposure_ratio,
+    measure_whites,
+    white_cubes,
+    white_exposure_ratio,
+    white_source,
 )
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
@@ -39,8 +40,6 @@ from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE, ReflectanceUncertainty
 
 DEFECT_FRAMES, DEFECT_LINES = 6, 4
 """Frames, evenly spread, and lines of each that are searched for defects and saturation."""
-
-WhiteSource = Literal["tarp", "capture", "target", "product"]
 
 
 @dataclass(frozen=True)
@@ -113,40 +112,8 @@ def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCal
             f"--calibration.bounds {low:g} {high:g}: reflectance is kept from 0 to {LARGEST_REFLECTANCE:.4g}; give "
             "two ascending numbers within that."
         )
-    source = white_source(session, config)
+    source = white_source(session, config.white_source, config.roi)
     return _from_products(session, config) if source == "product" else _from_counts(session, source, config)
-
-
-def white_source(session: Session, config: CalibrationConfig) -> WhiteSource:
-    """The source of white of the settings, or the first that the session has.
-
-    Raises:
-        InputError: the session does not have it.
-    """
-    available: dict[WhiteSource, bool] = {
-        "tarp": session.white is not None and session.has_counts,
-        "capture": session.has_own_whites,
-        "product": session.has_products,
-        "target": session.has_counts,
-    }
-    source = config.white_source
-    if source == "auto":
-        # open_session refuses sessions without any of the first three.
-        return next(source for source, is_available in available.items() if is_available)
-    if not available[source]:
-        missing = {
-            "tarp": "has no capture of a white tarp",
-            "capture": "does not have a WHITEREF cube with every capture",
-            "product": "does not have a REFLECTANCE cube of every frame",
-            "target": "does not have raw counts of every frame",
-        }[source]
-        raise InputError(f"{session.path}: {missing}; choose another --calibration.white-source, or auto.")
-    if source == "target" and config.roi is None:
-        raise InputError(
-            f"{session.path}: where the white target is in the frames is not known; give its place with "
-            "--calibration.roi."
-        )
-    return source
 
 
 def _from_products(session: Session, config: CalibrationConfig) -> SessionCalibration:
@@ -183,7 +150,7 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     lines, samples, bands = first.shape
     darks = _dark_spectra(captures)
     defects = _defects(session, source, config)
-    whites = _whites(session, source, config, defects)
+    whites = measure_whites(session, source, config.roi, defects)
     panel = np.ones(bands)
     panel_path = config.panel or session.panel_reflectance_path
     if panel_path is not None:
@@ -192,7 +159,7 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
 
     survey = survey_lines(lines)
     saturated = defects.saturation_counts
-    exposures = np.array([_exposure_ratio(capture, captures[0]) for capture in captures])
+    exposures = np.array([exposure_ratio(capture, captures[0]) for capture in captures])
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
         cube = captures[frame].cube
@@ -225,7 +192,7 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     frames = []
     for number, capture in enumerate(captures):
         white = whites[number % len(whites)]
-        gain = panel * _white_exposure_ratio(session, source, capture) / white.spectrum
+        gain = panel * white_exposure_ratio(session, source, capture) / white.spectrum
         if drift_factor is not None:
             gain = gain / drift_factor[number]
         # A sample without a white of its own cannot be calibrated.
@@ -277,47 +244,6 @@ def _dark_spectra(captures: Sequence[Capture]) -> list[Float[np.ndarray, "column
     return [read[capture.dark] for capture in captures]
 
 
-def _whites(session: Session, source: WhiteSource, config: CalibrationConfig, defects: Defects) -> list[White]:
-    """One white for all frames, or one for each."""
-    if source == "tarp":
-        assert session.white is not None
-        return [white_reference(session.white, config.roi, defects)]
-    if source == "target":
-        return [white_reference(capture, config.roi, defects) for capture in session.frames]
-    samples = session.frames[0].cube.shape[1]
-    return [
-        column_white(capture.white, capture.white_dark, samples, defects)
-        for capture in session.frames
-        if capture.white is not None
-    ]
-
-
-def _white_cubes(session: Session, source: WhiteSource) -> tuple[Cube, Cube | None]:
-    """Counts and dark counts of the first white."""
-    capture = session.white if source == "tarp" else session.frames[0]
-    assert capture is not None
-    white, dark = (capture.white, capture.white_dark) if source == "capture" else (capture.cube, capture.dark)
-    assert white is not None
-    return white, dark
-
-
-def _exposure_ratio(capture: Capture, other: Capture) -> float:
-    """Ratio of two captures' integration times; 1 if one is unknown."""
-    if capture.integration_time_ms is None or other.integration_time_ms is None:
-        return 1.0
-    return capture.integration_time_ms / other.integration_time_ms
-
-
-def _white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture) -> float:
-    """Ratio of the white's integration time to the sample's; 1 if one is unknown."""
-    if source == "tarp":
-        assert session.white is not None
-        return _exposure_ratio(session.white, capture)
-    if source == "target" or capture.white_integration_time_ms is None or capture.integration_time_ms is None:
-        return 1.0
-    return capture.white_integration_time_ms / capture.integration_time_ms
-
-
 def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -> Defects:
     """Defects found on the lines that cross the white and on some lines of some frames."""
     captures = session.frames
@@ -326,7 +252,7 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     rows = np.unique(np.linspace(0, lines - 1, DEFECT_LINES + 2).round().astype(int)[1:-1])
     of_frames = [_readings(captures[number].cube, captures[number].dark, rows) for number in numbers]
     good_bands = np.logical_and.reduce([capture.cube.good_bands for capture in captures])
-    cube, dark = _white_cubes(session, source)
+    cube, dark = white_cubes(session, source)
     roi = None if source == "capture" else config.roi
     if source == "tarp" and roi is None:
         assert session.white is not None
@@ -345,7 +271,7 @@ def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> R
 
 
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:
-    cube, dark = _white_cubes(session, source)
+    cube, dark = white_cubes(session, source)
     region = np.ones(cube.shape[:2], bool)
     if isinstance(white, WhiteReference):
         x0, y0, x1, y1 = white.roi
@@ -374,7 +300,7 @@ def _uncertainty(
     panel: Float[np.ndarray, "bands"],
     kept: Int[np.ndarray, "kept"],
 ) -> ReflectanceUncertainty:
-    capture, dark = session.frames[0], _white_cubes(session, source)[1]
+    capture, dark = session.frames[0], white_cubes(session, source)[1]
     spectrum = white.mean_spectrum()
     # Bad bands take no part in their neighbours' average, so any finite number will do.
     spectrum = np.interp(np.arange(len(spectrum)), kept, spectrum[kept])
@@ -387,6 +313,6 @@ def _uncertainty(
         frame_dark_readings=0 if capture.dark is None else capture.dark.shape[0],
         white_dark_readings=0 if dark is None else dark.shape[0] * int(columns),
         panel_reflectance=panel,
-        integration_ratio=_white_exposure_ratio(session, source, capture),
+        integration_ratio=white_exposure_ratio(session, source, capture),
     )
     return ReflectanceUncertainty(everywhere.constant[kept], everywhere.linear[kept], everywhere.quadratic[kept])
