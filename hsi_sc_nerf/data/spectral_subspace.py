@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE, ReflectanceUncertainty
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 FEWEST_SPECTRA = 64
 """Below this, neither noise nor rank can be told."""

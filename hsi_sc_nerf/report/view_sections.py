@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from markupsafe import Markup
 
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
 from hsi_sc_nerf.report.held_out_views import (

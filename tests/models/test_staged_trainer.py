@@ -7,7 +7,7 @@ from small_trainer import STEPS, trainer
 
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
-from hsi_sc_nerf.packed.pixels import RIM_PX
+from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
@@ -21,7 +21,7 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 
     def next_train(step):
         rays, batch = original(step)
-        beside = sum(0 < from_object[f][line, sample] < RIM_PX + 1 for f, line, sample in batch["indices"].tolist())
+        beside = sum(0 < from_object[f][line, sample] < BOUNDARY_PX + 1 for f, line, sample in batch["indices"].tolist())
         seen.append((made.pipeline.model.camera_optimizer.frozen, int(batch["mask"].sum()), beside))
         return rays, batch
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.noise import NoiseModel
-from hsi_sc_nerf.calibration.pictures import uncertainty_picture
-from hsi_sc_nerf.packed.uncertainty import (
-    ReflectanceUncertainty,
-    reflectance_uncertainty,
-    typical_uncertainty,
-)
+from hsi_sc_nerf.calibration.noise import NoiseModel, reflectance_uncertainty
+from hsi_sc_nerf.calibration.report import draw_uncertainty
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
 from hsi_sc_nerf.simulate.effects.stages import ReadoutContext
 
@@ -71,9 +67,9 @@ def test_agrees_with_repeated_exposures(white_lines, columns, dark_lines):
     expected = uncertainty.standard_deviation(np.broadcast_to(np.array(LEVELS)[:, None], (len(LEVELS), BANDS)))
     # What the exposures have in common is known from these alone: their number limits how well.
     common = uncertainty.quadratic * np.array(LEVELS)[:, None] ** 2 / expected**2
-    bar = 0.05 if white_lines > 1 else 0.12
+    tolerance = 0.05 if white_lines > 1 else 0.12
     assert (common.max() > 0.3) == (white_lines == 1)
-    np.testing.assert_allclose(spread, expected, rtol=bar)
+    np.testing.assert_allclose(spread, expected, rtol=tolerance)
     assert np.abs(np.log(spread / expected)).mean() < 0.05
 
 
@@ -93,10 +89,10 @@ def test_standard_deviation_is_the_root_of_a_parabola():
     uncertainty = ReflectanceUncertainty(np.array([1e-4]), np.array([2e-4]), np.array([3e-4]))
     reflectance = np.array([[-0.2], [0.0], [1.0]])
     np.testing.assert_allclose(uncertainty.standard_deviation(reflectance)[:, 0] ** 2, [1e-4, 1e-4, 6e-4])
-    np.testing.assert_allclose(typical_uncertainty(uncertainty, np.array([0.5])), np.sqrt(2.75e-4))
+    np.testing.assert_allclose(uncertainty.standard_deviation(np.array([0.5])), np.sqrt(2.75e-4))
 
 
 def test_picture(tmp_path):
     uncertainty = ReflectanceUncertainty(*(np.full(5, value) for value in (1e-5, 2e-5, 1e-9)))
-    uncertainty_picture(tmp_path / "uncertainty.png", uncertainty, np.linspace(400.0, 1000.0, 5))
+    draw_uncertainty(tmp_path / "uncertainty.png", uncertainty, np.linspace(400.0, 1000.0, 5))
     assert (tmp_path / "uncertainty.png").stat().st_size > 5000
