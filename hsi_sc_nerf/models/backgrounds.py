@@ -1,88 +1,82 @@
-"""The chamber behind the turntable: a picture that stands still in the camera's frame, looked up by rays.
+"""What a ray sees where the object lets light through: the chamber, which stands still with the camera.
 
-The object turns and the camera does not, so that what the object lets through is at the same place of every frame.
-In the object's frame, in which the field lives, it goes round with the camera: no field of the object can hold it.
+The object turns before a fixed camera, so the chamber behind it is at the same pixels of every frame. In the object's
+frame, in which the field lives, the chamber moves with the camera, and no field of the object can represent it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hsi_sc_nerf.data.static_background import estimate_static_background
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
-CORRECTION_CELLS = 32
-"""Cells of a learned correction along the picture's longer side. A step of Adam visits every value, hit by a ray or
-not: on one core 40 ms for 128 x 128 cells of 204 bands, 1 ms for 32 x 32."""
-_LOGIT_MARGIN = 1e-3
-"""Reflectance of a learned background keeps this far from 0 and 1, where a sigmoid has no slope."""
+BackgroundKind = Literal["last-sample", "spectrum", "image"]
 
 
-def in_camera_frame(
-    directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"]
-) -> Float[Tensor, "*rays 3"]:
-    """Directions in the camera's axes, ``R^T d``; rotations are camera-to-world, row by row.
-
-    A sum, not a product of matrices: automatic mixed precision would halve the latter's digits, and with them the
-    picture's sharpness.
-    """
-    return (rotations.unflatten(-1, (3, 3)) * directions[..., :, None]).sum(dim=-2)
-
-
-def image_coordinates(
-    directions: Float[Tensor, "*rays 3"], intrinsics: PinholeIntrinsics, distortion: tuple[float, float, float, float]
-) -> tuple[Float[Tensor, "*rays 2"], Bool[Tensor, "*rays"]]:
-    """Pixel coordinates (x, y; from the image's corner) of directions in the camera's frame, OpenGL axes.
-
-    Lens distortion is OpenCV's (k1, k2, p1, p2). It is a polynomial that holds within the image; directions far
-    outside it may land anywhere.
-
-    Returns:
-        The coordinates, and which directions look forward; the coordinates of the others mean nothing.
-    """
-    forward = directions[..., 2] < 0.0
-    depth = torch.where(forward, -directions[..., 2], 1.0)
-    x, y = directions[..., 0] / depth, -directions[..., 1] / depth
-    k1, k2, p1, p2 = distortion
-    squared = x * x + y * y
-    radial = 1.0 + squared * (k1 + squared * k2)
-    distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x)
-    distorted_y = y * radial + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y)
-    pixels = [intrinsics.fl_x * distorted_x + intrinsics.cx, intrinsics.fl_y * distorted_y + intrinsics.cy]
-    return torch.stack(pixels, dim=-1), forward
-
-
-def bilinear(
-    image: Float[Tensor, "lines samples bands"], places: Float[Tensor, "*rays 2"]
-) -> Float[Tensor, "*rays bands"]:
-    """Spectra of an image at places (x, y) in cells from its corner, bilinear between the cells' centres.
-
-    Beyond the centres of the outermost cells it goes on as it is there.
-    """
-    lines, samples, bands = image.shape
-    # grid_sample counts from -1 to 1 from border to border.
-    grid = 2.0 * places.reshape(1, 1, -1, 2) / places.new_tensor([samples, lines]) - 1.0
-    spectra = functional.grid_sample(
-        image.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return spectra[0, :, 0].T.reshape(*places.shape[:-1], bands)
-
-
-class CameraBackground(nn.Module):
-    """The chamber's spectrum behind a ray, from the ray's direction in the camera's frame.
-
-    A learned background is the sigmoid of the picture's logit plus a coarser correction (`CORRECTION_CELLS`), which
-    starts at 0: it stays within 0 and 1, begins as the picture, and keeps the picture's detail.
+def make_background(
+    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]
+) -> BackgroundSpectrum | BackgroundImage | None:
+    """The background of a dataset; None for "last-sample", which has none.
 
     Args:
-        image: the chamber's picture, reflectance.
+        kind: how the chamber is represented.
+        dataset: camera, and the chamber's median spectrum.
+        frames: training frames, from which the picture of the chamber is taken.
+    """
+    if kind == "last-sample":
+        return None
+    spectrum = torch.from_numpy(dataset.background_reflectance).float()
+    if kind == "spectrum":
+        return BackgroundSpectrum(spectrum)
+    picture = estimate_static_background(dataset, frames)
+    k1, k2, p1, p2 = dataset.distortion.tolist()
+    return BackgroundImage(
+        torch.from_numpy(picture.image),
+        cell_px=picture.cell_px,
+        intrinsics=dataset.intrinsics,
+        distortion=(k1, k2, p1, p2),
+        spectrum=spectrum,
+    )
+
+
+class BackgroundSpectrum(nn.Module):
+    """One spectrum behind every ray.
+
+    Args:
+        spectrum: reflectance.
+    """
+
+    spectrum: Tensor
+
+    def __init__(self, spectrum: Float[Tensor, "bands"]) -> None:
+        super().__init__()
+        self.register_buffer("spectrum", spectrum)
+
+    def forward(
+        self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
+    ) -> Float[Tensor, "*rays bands"]:
+        """Reflectance behind rays; ``rotations`` are not used."""
+        return self.spectrum.expand(*directions.shape[:-1], -1)
+
+
+class BackgroundImage(nn.Module):
+    """A picture of the chamber, looked up by the rays' directions in the camera's frame.
+
+    Args:
+        image: reflectance.
         cell_px: side of the picture's cells, pixels of the camera's image.
         intrinsics: of the camera.
         distortion: k1, k2, p1, p2 (OpenCV).
-        spectrum: what rays see that belong to no camera before the turntable (a viewer's), or look backwards.
-        learnable: whether there is a correction to learn.
+        spectrum: background of rays without a camera (a viewer's), and of those that point backwards.
     """
 
     image: Tensor
@@ -95,7 +89,6 @@ class CameraBackground(nn.Module):
         intrinsics: PinholeIntrinsics,
         distortion: tuple[float, float, float, float],
         spectrum: Float[Tensor, "bands"],
-        learnable: bool = False,
     ) -> None:
         super().__init__()
         self.cell_px = cell_px
@@ -103,12 +96,6 @@ class CameraBackground(nn.Module):
         self.distortion = distortion
         self.register_buffer("image", image)
         self.register_buffer("spectrum", spectrum)
-        self.correction: nn.Parameter | None = None
-        if learnable:
-            lines, samples, bands = image.shape
-            self._cells_per_correction = max(1.0, max(lines, samples) / CORRECTION_CELLS)
-            size = (-(-side // self._cells_per_correction) for side in (lines, samples))
-            self.correction = nn.Parameter(torch.zeros(*map(int, size), bands))
 
     def forward(
         self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
@@ -116,15 +103,26 @@ class CameraBackground(nn.Module):
         """Reflectance of the chamber behind rays.
 
         Args:
-            directions: of the rays, as measured: before any refinement of the poses has turned them.
-            rotations: camera-to-world rotations of the rays as measured, row by row; None for rays that carry none.
+            directions: of the rays as measured, before the pose refinement.
+            rotations: camera-to-world rotations as measured, row by row; None for rays without a camera.
         """
         if rotations is None:
             return self.spectrum.expand(*directions.shape[:-1], -1)
         pixels, forward = image_coordinates(in_camera_frame(directions, rotations), self.intrinsics, self.distortion)
-        places = pixels / self.cell_px
-        spectra = bilinear(self.image, places)
-        if self.correction is not None:
-            logit = torch.logit(spectra, eps=_LOGIT_MARGIN)
-            spectra = torch.sigmoid(logit + bilinear(self.correction, places / self._cells_per_correction))
-        return torch.where(forward[..., None], spectra, self.spectrum)
+        return torch.where(forward[..., None], interpolate_image(self.image, pixels / self.cell_px), self.spectrum)
+
+
+def interpolate_image(
+    image: Float[Tensor, "lines samples bands"], positions: Float[Tensor, "*rays 2"]
+) -> Float[Tensor, "*rays bands"]:
+    """Spectra of an image at positions (x, y; cells from its corner), bilinear between the cells' centres.
+
+    Beyond the centres of the outermost cells, the image is continued by their values.
+    """
+    lines, samples, bands = image.shape
+    # grid_sample counts from -1 to 1 from border to border.
+    grid = 2.0 * positions.reshape(1, 1, -1, 2) / positions.new_tensor([samples, lines]) - 1.0
+    spectra = functional.grid_sample(
+        image.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return spectra[0, :, 0].T.reshape(*positions.shape[:-1], bands)

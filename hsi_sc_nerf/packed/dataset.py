@@ -107,6 +107,7 @@ class PackedDataset:
         uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
         typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
         fingerprint: of the session and the settings that this was made from.
+        pose_method: how the poses were measured ("markers", "colmap", "angles"); None if that is not known.
     """
 
     root: Path
@@ -126,6 +127,7 @@ class PackedDataset:
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     fingerprint: str | None = None
+    pose_method: str | None = None
 
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
@@ -197,6 +199,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "object_box_m": dataset.object_box_m.tolist(),
         "container": None if dataset.container is None else asdict(dataset.container),
         "fingerprint": dataset.fingerprint,
+        "pose_method": dataset.pose_method,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
         "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
         "background_reflectance": dataset.background_reflectance.tolist(),
@@ -281,4 +284,5 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
             for frame in content["frames"]
         ),
         fingerprint=content.get("fingerprint"),
+        pose_method=content.get("pose_method"),
     )
