@@ -37,7 +37,7 @@ def _wrap_main(module: types.ModuleType) -> None:
     def main(self: Any) -> None:
         """Export point cloud."""
         from hsi_sc_nerf.export.spectral_export import export_spectral_point_cloud
-        from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
+        from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 
         config = yaml.load(self.load_config.read_text(), Loader=yaml.Loader)
         if isinstance(config, TrainerConfig) and isinstance(config.pipeline.model, SpectralModelConfig):

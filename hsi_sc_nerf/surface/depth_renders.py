@@ -68,7 +68,7 @@ def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tens
 
     A model without a background fills the rest of a ray with what the ray met last, which is the object's already.
     """
-    behind = model.spectra_behind(rays)  # before the model corrects the rays
+    behind = model.background_spectrum(rays)  # before the model corrects the rays
     outputs = model(rays)
     spectra, opacity = outputs["spectral"], outputs["accumulation"]
     if model.background is not None:

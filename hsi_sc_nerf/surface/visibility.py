@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.models.camera_background import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 
 MIN_COSINE = 0.17
 """Faces that a camera sees at more than 80 degrees from their normal are smeared over its pixels: not seen."""

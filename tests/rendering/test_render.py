@@ -12,8 +12,8 @@ from PIL import Image
 from hsi_sc_nerf.cli.render import RenderCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import pixel_rays
+from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
 from hsi_sc_nerf.models import trained_run
-from hsi_sc_nerf.models.camera_background import in_camera_frame
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.cubes import RenderedView, write_view
 from hsi_sc_nerf.rendering.pictures import find_look

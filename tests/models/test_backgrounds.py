@@ -6,13 +6,8 @@ import pytest
 import torch
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.models.camera_background import (
-    CORRECTION_CELLS,
-    CameraBackground,
-    bilinear,
-    image_coordinates,
-    in_camera_frame,
-)
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.models.backgrounds import BackgroundImage, BackgroundSpectrum, interpolate_image
 
 LENS = PinholeIntrinsics(60, 40, 80.0, 85.0, 31.0, 18.5)
 STRAIGHT = (0.0, 0.0, 0.0, 0.0)
@@ -34,8 +29,8 @@ def rays_of_frame(angle_deg, pixels):
     return torch.from_numpy(directions).float(), torch.from_numpy(rotations).float()
 
 
-def background(image, cell_px=1, distortion=STRAIGHT, learnable=False):
-    return CameraBackground(image, cell_px, LENS, distortion, SPECTRUM, learnable)
+def background(image, cell_px=1, distortion=STRAIGHT):
+    return BackgroundImage(image, cell_px, LENS, distortion, SPECTRUM)
 
 
 def random_image(lines=LENS.h, samples=LENS.w):
@@ -90,10 +85,10 @@ def test_rays_of_a_distorted_camera_find_their_own_pixel():
 
 def test_bilinear_between_centres_and_held_beyond_them():
     image = torch.tensor([[0.0, 1.0], [2.0, 3.0]])[..., None]
-    places = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.0, 1.0], [0.5, 1.25], [-3.0, 0.0], [9.0, 9.0]])
+    positions = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.0, 1.0], [0.5, 1.25], [-3.0, 0.0], [9.0, 9.0]])
     expected = torch.tensor([0.0, 0.5, 1.5, 1.5, 0.0, 3.0])
-    torch.testing.assert_close(bilinear(image, places)[:, 0], expected)
-    torch.testing.assert_close(bilinear(image, places.view(2, 3, 2))[..., 0], expected.view(2, 3))
+    torch.testing.assert_close(interpolate_image(image, positions)[:, 0], expected)
+    torch.testing.assert_close(interpolate_image(image, positions.view(2, 3, 2))[..., 0], expected.view(2, 3))
 
 
 def test_a_coarse_picture_of_a_ramp():
@@ -115,66 +110,13 @@ def test_viewers_and_backward_rays_see_the_median_spectrum():
     torch.testing.assert_close(module(sideways, identity), SPECTRUM.expand(2, 3))
 
 
-def test_nothing_to_learn_unless_asked_for():
+def test_nothing_is_learned_and_the_picture_is_saved():
     assert not list(background(random_image()).parameters())
     assert set(background(random_image()).state_dict()) == {"image", "spectrum"}
 
 
-def test_a_learnable_background_begins_as_the_picture_and_stays_in_range():
-    image = random_image()
-    image[0, 0] = torch.tensor([0.0, 1.0, 1.2])
-    module = background(image, learnable=True)
-    directions, rotations = rays_of_frame(0.0, pixel_centres())
-    torch.testing.assert_close(module(directions, rotations), image.clamp(1e-3, 1 - 1e-3), atol=3e-4, rtol=0)
-    for value in (50.0, -50.0):
-        torch.nn.init.constant_(module.correction, value)
-        seen = module(directions, rotations)
-        assert ((seen >= 0) & (seen <= 1)).all()
-
-
-def test_the_correction_lies_over_the_picture():
-    module = background(torch.full((40, 60, 3), 0.4), learnable=True)
-    lines, samples, _ = module.correction.shape
-    with torch.no_grad():
-        module.correction[lines // 2 :, samples // 2 :, 1] = 2.0
-    directions, rotations = rays_of_frame(0.0, pixel_centres())
-    raised = torch.sigmoid(torch.logit(torch.tensor(0.4)) + 2.0)
-    seen = module(directions, rotations).detach()
-    torch.testing.assert_close(seen[23:, 33:, 1], raised.expand(17, 27))
-    for part in (seen[:17], seen[:, :27], seen[..., [0, 2]]):
-        torch.testing.assert_close(part, torch.full_like(part, 0.4))
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("lr", [1e-2, 1e-3])
-def test_a_learned_background_approaches_what_rays_see(device, lr):
-    target = (0.2 + 0.5 * torch.linspace(0, 1, 60)[None, :, None] * torch.tensor([1.0, 0.5, 0.2])).expand(40, 60, 3)
-    module = background(torch.full((40, 60, 3), 0.4), learnable=True).to(device)
-    assert max(module.correction.shape[:2]) <= CORRECTION_CELLS
-    directions, rotations = (rays.to(device) for rays in rays_of_frame(0.0, pixel_centres()[::2, ::2]))
-    target = target[::2, ::2].to(device)
-    optimiser = torch.optim.Adam(module.parameters(), lr=lr, eps=1e-15)
-    errors = []
-    for _ in range(100):
-        loss = (module(directions, rotations) - target).square().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        errors.append(float(loss))
-    assert errors[-1] < (0.05 if lr == 1e-2 else 0.85) * errors[0]
-    assert max(errors) == errors[0]
-
-
-def test_freezing_and_resuming():
-    module = background(random_image(), learnable=True)
-    directions, rotations = rays_of_frame(0.0, pixel_centres())
-    torch.nn.init.constant_(module.correction, 0.3)
-    before = module(directions, rotations)
-    module.requires_grad_(False)
-    assert not module(directions, rotations).requires_grad
-    torch.testing.assert_close(module(directions, rotations), before)
-    module.requires_grad_(True)
-    assert module(directions, rotations).requires_grad
-    resumed = background(torch.zeros(40, 60, 3), learnable=True)
-    resumed.load_state_dict(module.state_dict())
-    torch.testing.assert_close(resumed(directions, rotations), before)
+def test_one_spectrum_behind_every_ray():
+    spectrum = torch.tensor([0.7, 0.8])
+    behind = BackgroundSpectrum(spectrum)(torch.rand(4, 6, 3), None)
+    assert behind.shape == (4, 6, 2)
+    torch.testing.assert_close(behind[3, 5], spectrum)

@@ -12,10 +12,12 @@ from hsi_sc_nerf.geometry.camera import look_at, rotation_about_z, rotation_angl
 from hsi_sc_nerf.models.pose_refinement import (
     CAMERA_ROTATION,
     FRAME_INDEX,
+    NoRefinement,
     PoseRefinementConfig,
+    TurntableRefinement,
     held_out_interpolation,
+    visible_twists,
 )
-from hsi_sc_nerf.models.turntable_refinement import visible_twists
 
 AXIS_ORIGIN = np.array([0.0, 0.0, -0.4])
 FIRST = look_at(np.array([2.0, 0.3, 0.9]), np.array([0.0, 0.0, 0.1]))
@@ -64,8 +66,9 @@ def rays_of(poses, frame):
     return cameras(poses, [frame]).generate_rays(camera_indices=0, keep_shape=True)
 
 
-def refinement(poses, train, mode="turntable"):
+def refinement(poses, train, mode="turntable", pose_method=None):
     return PoseRefinementConfig(mode=mode).setup(
+        pose_method=pose_method,
         num_cameras=len(train),
         device="cpu",
         camera_to_world=poses[0],
@@ -81,6 +84,14 @@ def learn_something(learned, size=0.05):
         for parameter in learned.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * size)
     return learned
+
+
+@pytest.mark.parametrize(
+    ("pose_method", "kind"),
+    [("markers", NoRefinement), ("colmap", TurntableRefinement), (None, TurntableRefinement)],
+)
+def test_by_default_all_poses_but_those_from_markers_are_refined(pose_method, kind):
+    assert type(refinement(session(), TRAIN, PoseRefinementConfig().mode, pose_method)) is kind
 
 
 def test_twists_that_change_no_image_are_left_out():
@@ -282,7 +293,7 @@ def recover(true_poses, given_poses):
 
 
 def pose_errors(true_poses, poses):
-    """Largest errors of the poses relative to the first frame's, up to scale: degrees, share of the distance."""
+    """Largest errors of the poses relative to the first frame's, up to scale: degrees, fraction of the distance."""
     true_motion, motion = np.linalg.inv(true_poses[0]) @ true_poses[1:], np.linalg.inv(poses[0]) @ poses[1:]
     scale = np.linalg.norm(true_motion[:, :3, 3]) / np.linalg.norm(motion[:, :3, 3])
     shifts = np.linalg.norm(true_motion[:, :3, 3] - scale * motion[:, :3, 3], axis=1)
