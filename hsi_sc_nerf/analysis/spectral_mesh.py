@@ -86,15 +86,6 @@ def with_spectra(
     return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen)
 
 
-def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Unit normal of each vertex: the mean of its triangles', weighted by area."""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
-    doubled = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    corner = mesh.triangles.ravel()
-    total = np.stack([np.bincount(corner, column, minlength=len(mesh.vertices)) for column in doubled.T], axis=-1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
 def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
     """Write the mesh as a spectral PLY whose points are the vertices, followed by the triangles.
 
@@ -113,7 +104,7 @@ def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndar
             write_spectral_ply(
                 vertices,
                 mesh.vertices.astype(np.float32),
-                vertex_normals(mesh).astype(np.float32),
+                mesh.vertex_normals().astype(np.float32),
                 colours,
                 surface.spectra,
                 surface.wavelengths_nm,
