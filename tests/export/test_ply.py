@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export import ply
-from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, stream
+from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_ply_stream, write_spectral_ply
 
 WAVELENGTHS = np.array([397.32, 400.2, 650.0, 1003.58])
 
@@ -29,11 +29,10 @@ def header(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("chunk", [7, 50, 1000])
-def test_round_trip(tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ply, "CHUNK_POINTS", chunk)
+def test_round_trip(tmp_path: Path, chunk: int) -> None:
     written, path = cloud(), tmp_path / "cloud.ply"
     extra = {"opacity": np.linspace(0, 1, 50, dtype=np.float32), "views": np.arange(50)}
-    write_spectral_ply(path, **written, wavelengths_nm=WAVELENGTHS, extra=extra)
+    write_ply_stream(path, stream(SpectralCloud(*written.values(), WAVELENGTHS, extra), chunk))
     read = read_spectral_ply(path)
     np.testing.assert_array_equal(read.points, written["points_m"])
     np.testing.assert_array_equal(read.normals, written["normals"])
@@ -144,14 +143,14 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, change: dict, messag
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda content: content[:-1], "bytes where its header promises"),
-        (lambda content: b"PK" + content, "not a PLY"),
-        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "little-endian"),
+        (lambda content: content[:-1], "early end-of-file"),
+        (lambda content: b"PK" + content, "no readable PLY"),
+        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "no readable PLY"),
         (lambda content: content.replace(b"float nz", b"float curvature"), "no nz"),
         (lambda content: content.replace(b"scalar_", b"band_"), "spectral bands"),
-        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "header"),
-        (lambda content: content.split(b"end_header")[0], "header"),
-        (lambda content: b"", "not a PLY"),
+        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "no readable PLY"),
+        (lambda content: content.split(b"end_header")[0], "no readable PLY"),
+        (lambda content: b"", "no readable PLY"),
     ],
 )
 def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, spoil, message: str) -> None:

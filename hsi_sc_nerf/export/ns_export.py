@@ -1,8 +1,8 @@
-"""``ns-export pointcloud`` with spectra for runs of hsi-sc-nerf; every other method's export stays as it is.
+"""Make ``ns-export pointcloud`` export spectra for runs of hsi-sc-nerf; other methods export as before.
 
-nerfstudio's exporter has no extension point, and it imports its plugins while it is itself half imported. So the one
-method that matters, ``ExportPointCloud.main``, is wrapped as soon as its module is complete: at once if it already
-is, when its first name is asked for if it is being imported, and after its import if that is still to come.
+nerfstudio's exporter has no extension point, and imports its plugins while it is being imported itself. So
+``ExportPointCloud.main`` is wrapped as soon as the exporter's module is complete: at once if it is, at the first use
+of its names if it is being imported, or after its import if that is still to come.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _EXPORTER = "nerfstudio.scripts.exporter"
 
 
 def extend_export_point_cloud() -> None:
-    """Arrange for ``ExportPointCloud.main`` to export spectra for hsi-sc-nerf runs."""
+    """Let ``ExportPointCloud.main`` export spectra for hsi-sc-nerf runs."""
     module = sys.modules.get(_EXPORTER)
     if module is None:
         sys.meta_path.insert(0, _ExporterFinder())
@@ -49,7 +49,7 @@ def _wrap_main(module: types.ModuleType) -> None:
 
 
 class _ExporterBeingImported(types.ModuleType):
-    """The exporter while it is being imported: wraps ``main`` when the finished module is first used."""
+    """The exporter during its import: wraps ``main`` at the first use of the complete module."""
 
     def __getattribute__(self, name: str) -> Any:
         if name in ("entrypoint", "ExportPointCloud"):
@@ -61,7 +61,7 @@ class _ExporterBeingImported(types.ModuleType):
 
 
 class _ExporterFinder(importlib.abc.MetaPathFinder):
-    """Wraps ``main`` after the exporter's import, then is gone."""
+    """Wraps ``main`` after the exporter's import, and removes itself."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None

@@ -6,7 +6,7 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.export import nerfstudio_adapter as adapter
+from hsi_sc_nerf.export import ns_export as adapter
 
 
 def fake_exporter(calls):
