@@ -5,26 +5,17 @@ from __future__ import annotations
 import math
 from types import TracebackType
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TextColumn
 
 from hsi_sc_nerf.models.stages import Stage
+from hsi_sc_nerf.progress import timed_progress
 
 
 class TrainingProgress:
     """Stage, steps, PSNR of the batches and time left; use it as a context."""
 
     def __init__(self, total_steps: int, first_step: int) -> None:
-        self._progress = Progress(
-            TextColumn("[bold]{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[quality]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
+        self._progress = timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}"))
         self._task = self._progress.add_task("training", total=total_steps, completed=first_step, quality="")
         self._smoothed_psnr: float | None = None
 
