@@ -22,7 +22,7 @@ import numpy as np
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
-from hsi_sc_nerf.export.ply import band_property_names, write_ply_stream
+from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
@@ -55,7 +55,12 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
         PosixPath('out/point_cloud.nc')
     """
     path = require_format(path_without_suffix, file_format, len(cloud.wavelengths_nm), len(cloud.extra_names))
-    writers = {"ply": write_ply_stream, "las": _write_las, "netcdf": _write_netcdf, "zarr": _write_zarr}
+    writers: dict[CloudFormat, Callable[[Path, CloudStream], None]] = {
+        "ply": write_spectral_ply,
+        "las": _write_las,
+        "netcdf": _write_netcdf,
+        "zarr": _write_zarr,
+    }
     writers[file_format](path, cloud)
     return path
 

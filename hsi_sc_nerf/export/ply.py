@@ -8,11 +8,10 @@ fields), and the extra columns. A million points of 204 bands take 843 MB.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int
 from numpy.lib.recfunctions import structured_to_unstructured
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
@@ -26,52 +25,38 @@ _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
 
 
 def write_spectral_ply(
-    path: Path,
-    points_m: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    colours: UInt8[np.ndarray, "n 3"],
-    spectra: Float[np.ndarray, "n bands"],
-    wavelengths_nm: Float[np.ndarray, "bands"],
-    extra: Mapping[str, Float[np.ndarray, "n"]] | None = None,
+    path: Path | str, cloud: SpectralCloud | CloudStream, triangles: Int[np.ndarray, "t 3"] | None = None
 ) -> None:
-    """Write a spectral point cloud, whole or not at all.
+    """Write a spectral point cloud, or a mesh with spectra at its vertices, whole or not at all.
+
+    A stream is written chunk by chunk; plyfile would need all points at once.
 
     Args:
         path: the PLY file; an existing one is replaced.
-        points_m: positions in metres.
-        normals: unit normals.
-        colours: pseudo-RGB.
-        spectra: reflectance of each point.
-        wavelengths_nm: band centres.
-        extra: more columns by property name (one word), written as float after the bands.
+        cloud: the points.
+        triangles: indices of three points each, counter-clockwise seen from outside.
 
     Raises:
         InputError: the file cannot be written, for instance because the disk is full.
-        ValueError: the arrays' shapes do not fit together, two wavelengths are equal, or a name is taken.
+        ValueError: the arrays' shapes do not fit together, two wavelengths are equal, or the name of an extra column
+            is taken or has several words.
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")
-        >>> arrays = cloud.points, cloud.normals, cloud.colours, cloud.spectra, cloud.wavelengths_nm
-        >>> write_spectral_ply("copy.ply", *arrays, extra=cloud.extra)
+        >>> write_spectral_ply("copy.ply", cloud)
     """
-    cloud = SpectralCloud(points_m, normals, colours, spectra, wavelengths_nm, dict(extra or {}))
-    write_ply_stream(Path(path), stream(cloud))
-
-
-def write_ply_stream(path: Path, cloud: CloudStream) -> None:
-    """Write a cloud chunk by chunk, whole or not at all; plyfile would need all points at once.
-
-    Raises:
-        InputError: the file cannot be written, for instance because the disk is full.
-        ValueError: the chunks do not fit together, two wavelengths are equal, or an extra column's name is taken.
-    """
+    if isinstance(cloud, SpectralCloud):
+        cloud = stream(cloud)
     band_names = band_property_names(cloud.wavelengths_nm)
     names = [*_GEOMETRY, *_COLOUR, *band_names, *cloud.extra_names]
     if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
         raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
     properties = (f"property {'uchar' if name in _COLOUR else 'float'} {name}" for name in names)
-    start = ("ply", "format binary_little_endian 1.0", f"element vertex {cloud.count}")
-    header = "\n".join([*start, *properties, "end_header", ""])
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {cloud.count}", *properties]
+    faces = np.empty(0 if triangles is None else len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    if triangles is not None:
+        faces["count"], faces["corners"] = 3, triangles
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     layout = np.dtype(
         [
             ("points", "<f4", 3),
@@ -81,8 +66,8 @@ def write_ply_stream(path: Path, cloud: CloudStream) -> None:
             ("extra", "<f4", len(cloud.extra_names)),
         ]
     )
-    with atomic_write(path) as (temporary,), temporary.open("wb") as file:
-        file.write(header.encode("ascii"))
+    with atomic_write(Path(path)) as (temporary,), temporary.open("wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
         for _, chunk in cloud.placed():
             rows = np.empty(len(chunk), layout)
             rows["points"], rows["normals"], rows["colours"] = chunk.points, chunk.normals, chunk.colours
@@ -90,6 +75,7 @@ def write_ply_stream(path: Path, cloud: CloudStream) -> None:
             for index, values in enumerate(chunk.extra.values()):
                 rows["extra"][:, index] = values
             rows.tofile(file)
+        faces.tofile(file)
 
 
 def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[str]:

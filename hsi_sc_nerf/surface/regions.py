@@ -14,11 +14,12 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.visual_hull import silhouette_counts
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
 
 MIN_MASK_FRACTION = 0.8
-"""Fraction of the frames whose picture holds a point that must show it on the object: a few masks may be wrong."""
+"""A point must be in the mask in this fraction of the frames that have it in the image: a few masks may be wrong."""
 MASK_MARGIN_PX = 2
 """Masks are widened by this for the visual hull: boundaries are uncertain by a pixel or two."""
 
@@ -96,12 +97,8 @@ def visual_hull_region(renders: DepthRenders) -> Region:
 
     def contains(points: np.ndarray, _: np.ndarray) -> np.ndarray:
         positions = torch.from_numpy(points).float().to(masks.device)
-        in_picture, on_object = torch.zeros(2, len(points), device=masks.device)
-        for frame, mask in enumerate(masks):
-            inside, pixels = renders.pixels_of(frame, positions)
-            in_picture += inside
-            on_object += inside & mask[pixels[:, 1], pixels[:, 0]]
-        return (on_object >= MIN_MASK_FRACTION * in_picture).cpu().numpy()
+        in_image, in_mask = silhouette_counts(positions, masks, renders.pixels_of)
+        return (in_mask >= MIN_MASK_FRACTION * in_image).cpu().numpy()
 
     return Region(contains)
 
