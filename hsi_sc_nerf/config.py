@@ -13,7 +13,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataManagerConfig
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
-from hsi_sc_nerf.export.nerfstudio_adapter import extend_export_point_cloud
+from hsi_sc_nerf.export.ns_export import extend_export_point_cloud
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig

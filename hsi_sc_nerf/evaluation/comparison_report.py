@@ -184,7 +184,8 @@ def _alignment_sentences(alignment: dict[str, Any]) -> str:
     return (
         f"The cloud was aligned by {methods[alignment['method']]}: turned by {alignment['turn_deg']:.2f} degrees, "
         f"scaled by {alignment['scale']:.5f}. RMS after ICP: {rms}, of the "
-        f"{100 * alignment['matched_fraction']:.1f} % of its points within {1000 * alignment['within_m']:.2f} mm.{ambiguous}"
+        f"{100 * alignment['matched_fraction']:.1f} % of its points within {1000 * alignment['within_m']:.2f} mm."
+        f"{ambiguous}"
     )
 
 

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
 
 from hsi_sc_nerf.models.stages import Stage
+from hsi_sc_nerf.progress import timed_progress
 
 # Metrics of the paper's table.
 _SUMMARY = {"sam": "SAM {:.4f} rad", "rmse": "RMSE {:.4f}", "ssim": "SSIM {:.3f}", "psnr": "PSNR {:.1f} dB"}
@@ -67,16 +67,7 @@ class TrainingProgress:
     """Progress bar with stage, steps, PSNR of the batches and time left, as a context manager."""
 
     def __init__(self, total_steps: int, first_step: int) -> None:
-        self._progress = Progress(
-            TextColumn("[bold]{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[quality]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
+        self._progress = timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}"))
         self._task = self._progress.add_task("training", total=total_steps, completed=first_step, quality="")
         self._smoothed_psnr: float | None = None
 

@@ -1,6 +1,7 @@
 """Traits of a simulated apple with a bruise, whose truth is known; and the whole command."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
@@ -105,7 +107,7 @@ def small_cloud(path):
     weights = np.eye(2)[(mesh.vertices[:, 1] > 0.0).astype(int)]
     true = TrueSurface(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
     cloud = true.cloud(6000, eyes_around(), 0.0)
-    write_spectral_ply(path, cloud.points, cloud.normals, cloud.colours, cloud.spectra, NM)
+    write_spectral_ply(path, replace(cloud, extra={}))
     return true
 
 
@@ -172,7 +174,8 @@ def test_a_library_that_does_not_fit_is_refused_before_the_work(tmp_path, monkey
     monkeypatch.setattr("hsi_sc_nerf.analysis.poisson.closed_mesh", None)
     nothing = np.zeros((2, 3))
     spectra = np.ones((2, len(NM[bands])))
-    write_spectral_ply(tmp_path / "cloud.ply", nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    cloud = SpectralCloud(nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    write_spectral_ply(tmp_path / "cloud.ply", cloud)
     (tmp_path / "library.csv").write_text("nm,a\n450,0.1\n900,0.2\n")
     with pytest.raises(InputError, match=says):
         TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", library=tmp_path / "library.csv").main()

@@ -72,10 +72,7 @@ def ball(wavelengths_nm, count=4000):
 def run(flagged_dataset, tmp_path, monkeypatch):
     """A run's folder with a cloud; its model is not opened, its views are not rendered."""
     dataset = replace(open_packed(flagged_dataset), object_name=HOSTILE)
-    cloud = ball(dataset.wavelengths_nm)
-    write_spectral_ply(
-        tmp_path / "point_cloud.ply", cloud.points, cloud.normals, cloud.colours, cloud.spectra, cloud.wavelengths_nm
-    )
+    write_spectral_ply(tmp_path / "point_cloud.ply", ball(dataset.wavelengths_nm))
     views = [held_out_view(dataset, index) for index in (2, 7)]
     opened = SimpleNamespace(dataset=dataset, manager=SimpleNamespace(eval_dataset=views))
     monkeypatch.setattr(build, "_opened", lambda folder: opened)

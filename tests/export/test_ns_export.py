@@ -1,4 +1,3 @@
-import importlib
 import sys
 import types
 
@@ -6,7 +5,7 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.export import nerfstudio_adapter as adapter
+from hsi_sc_nerf.export import ns_export as adapter
 
 
 def fake_exporter(calls):
@@ -59,13 +58,3 @@ def test_a_module_under_import_is_wrapped_once_complete(tmp_path, monkeypatch):
     assert type(module) is types.ModuleType
     module.ExportPointCloud(config_file(tmp_path, hsi_sc_nerf.config)).main()
     assert calls == ["spectral"]
-
-
-def test_a_later_import_is_wrapped(monkeypatch):
-    monkeypatch.delitem(sys.modules, adapter._EXPORTER, raising=False)
-    others = [finder for finder in sys.meta_path if not isinstance(finder, adapter._ExporterFinder)]
-    monkeypatch.setattr(sys, "meta_path", others)
-    adapter.extend_export_point_cloud()
-    module = importlib.import_module(adapter._EXPORTER)
-    assert module.ExportPointCloud.main.__module__ == adapter.__name__
-    assert not any(isinstance(finder, adapter._ExporterFinder) for finder in sys.meta_path)

@@ -4,8 +4,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hsi_sc_nerf.surface.crossing import opacity_crossing_depth
-from hsi_sc_nerf.surface.depth_renders import SURFACE_OPACITY, surface_along
+from hsi_sc_nerf.surface.surface_depth import SURFACE_OPACITY, opacity_crossing_depth, surface_depth
 
 
 @pytest.mark.parametrize("level", [0.1, 0.25, 0.5, 0.9])
@@ -41,7 +40,7 @@ def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, no
     angle = math.radians(angle_deg)
     directions = torch.tensor([[math.sin(angle), 0.0, -math.cos(angle)]])
     origins, cosines = -2.0 * directions, -directions[:, 2:]
-    depth, opacity = surface_along(
+    depth, opacity = surface_depth(
         soft_ground, origins, directions, torch.full((1, 1), 2.02), cosines if normal_is_known else None
     )
     below = -(origins + depth * directions)[0, 2].item()

@@ -14,16 +14,9 @@ from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.surface.depth_renders import (
-    SEARCH_DEPTH,
-    SEARCH_STEPS,
-    camera_rays,
-    look_from_cameras,
-    refined_poses,
-    render_object,
-)
-from hsi_sc_nerf.surface.point_cloud import sample_surface_points
-from hsi_sc_nerf.surface.visibility import MIN_COSINE
+from hsi_sc_nerf.surface.depth_renders import refined_poses, render_depth_maps
+from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, SEARCH_DEPTH, SEARCH_STEPS, camera_rays, render_object
+from hsi_sc_nerf.surface.surface_points import sample_surface_points
 
 POINTS = 4000
 STEP = 2 * SEARCH_DEPTH / SEARCH_STEPS  # of the search for the surface, whose hits are in the middle of a step
@@ -38,6 +31,13 @@ def run(tmp_path_factory):
 def cloud(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("cloud")
     return read_spectral_ply(export_cloud(run, folder, CloudOptions(num_points=POINTS, remove_outliers=False)))
+
+
+def surface_points(run, count: int, **options):
+    manager = run.manager
+    cameras, masks = manager.train_dataset.cameras, manager.train_pixel_sampler.masks
+    renders = render_depth_maps(run.model, cameras, masks, 4096, **options)
+    return sample_surface_points(run.model, renders, count, 4096, np.array([[-0.6] * 3, [0.6] * 3]))
 
 
 def frontal_cosine(points: np.ndarray) -> np.ndarray:
@@ -59,24 +59,20 @@ def test_poses_are_the_refined_ones(run):
     np.testing.assert_allclose(refined.numpy(), POSES, atol=1e-6)
 
 
-def test_points_lie_on_the_surface_and_each_frame_sees_them_where_it_says(run):
-    manager = run.manager
-    box = torch.tensor([[-0.6] * 3, [0.6] * 3])
-    found = sample_surface_points(
-        run.model, manager.train_dataset.cameras, manager.train_pixel_sampler.masks, POINTS, 4096, box
-    )
+def test_points_lie_on_the_surface_and_at_their_image_coordinates(run):
+    found = surface_points(run, POINTS)
     assert len(found) == POINTS
     np.testing.assert_allclose(np.linalg.norm(found.points, axis=1), RADIUS, atol=STEP)
-    facing = (found.facing * found.points).sum(axis=1) / RADIUS
+    facing = (found.mesh_normals * found.points).sum(axis=1) / RADIUS
     assert facing.mean() > 0.98
     assert np.quantile(facing, 0.01) > 0.9  # the mesh is of 33 voxels, and rougher where it ends
     for frame in range(FRAMES):
         mine = found.frames == frame
-        places, _ = project(found.points[mine], POSES[frame], LENS)
-        np.testing.assert_allclose(found.places[mine], places, atol=0.1)
+        xy_px, _ = project(found.points[mine], POSES[frame], LENS)
+        np.testing.assert_allclose(found.xy_px[mine], xy_px, atol=0.1)
 
 
-def test_without_a_background_the_rest_of_a_ray_is_the_objects_too(run, monkeypatch):
+def test_without_a_background_nothing_is_removed_from_a_spectrum(run, monkeypatch):
     cameras = run.manager.train_dataset.cameras
 
     def centre_ray():
@@ -143,14 +139,14 @@ def test_regions_keep_what_lies_in_them_and_the_number_of_points(run, tmp_path):
 
 @pytest.fixture
 def tried(monkeypatch):
-    """How many places each attempt tries."""
+    """Number of candidates of each batch."""
     counts = []
 
     def counted(vertices, triangles, count, seed):
         counts.append(count)
         return sample_surface(vertices, triangles, count, seed)
 
-    monkeypatch.setattr("hsi_sc_nerf.surface.even_points.sample_surface", counted)
+    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points.sample_surface", counted)
     return counts
 
 
@@ -163,8 +159,8 @@ def test_a_small_region_is_searched_only_near_it(run, tmp_path, tried):
 
 
 def test_a_region_with_hardly_any_surface_gives_what_it_has(run, tmp_path, tried, monkeypatch, capsys):
-    monkeypatch.setattr("hsi_sc_nerf.surface.even_points._LARGEST_ATTEMPT", 2000)
-    monkeypatch.setattr("hsi_sc_nerf.surface.even_points._TRIES_A_POINT", 10)
+    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points._MAX_BATCH", 2000)
+    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points._MAX_CANDIDATES", 10)
     box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)
     options = CloudOptions(num_points=2000, roi_box=box, remove_outliers=False)
     count = len(read_spectral_ply(export_cloud(run, tmp_path, options)))
@@ -181,13 +177,13 @@ def test_a_few_points_are_no_outliers_and_a_cloud_is_never_empty(run, tmp_path, 
     assert not (tmp_path / "none").exists()
 
 
-def test_what_cannot_be_written_is_refused_before_the_model_is_asked(run, tmp_path, monkeypatch):
+def test_clouds_that_cannot_be_written_are_refused_before_rendering(run, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "hsi_sc_nerf.export.spectral_export.look_from_cameras", lambda *_: pytest.fail("the model was asked")
+        "hsi_sc_nerf.export.spectral_export.render_depth_maps", lambda *_: pytest.fail("the model was rendered")
     )
     with pytest.raises(InputError, match="holds no mask of a training frame"):
         export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
-    monkeypatch.setattr("hsi_sc_nerf.export.las.MAX_DIMENSIONS", 10)
+    monkeypatch.setattr("hsi_sc_nerf.export.formats.LAS_MAX_DIMENSIONS", 10)
     (tmp_path / "point_cloud.zarr").mkdir()
     for file_format, message in (("las", "LAS has room for 2 bands"), ("zarr", "is no Zarr folder")):
         pytest.importorskip({"las": "laspy"}.get(file_format, file_format))
@@ -207,15 +203,15 @@ def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path):
     cv2.imwrite(str(tmp_path / "roi" / "ball_003.png"), painted)
     options = CloudOptions(num_points=500, remove_outliers=False, roi_masks=tmp_path / "roi")
     points = run.to_scene(read_spectral_ply(export_cloud(run, tmp_path, options)).points)
-    places, _ = project(points, POSES[3], LENS)
+    xy_px, _ = project(points, POSES[3], LENS)
     assert len(points) == 500
-    assert places[:, 0].max() < LENS.w / 2 + 0.1
+    assert xy_px[:, 0].max() < LENS.w / 2 + 0.1
     assert ((POSES[3][:3, 3] - points) * points).sum(axis=1).min() > 0
     with pytest.raises(InputError, match=r"holds no mask of a training frame.*ball_000\.png"):
         export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
 
 
-def test_the_turntable_stays_when_it_is_asked_for(run, tmp_path):
+def test_keep_turntable_keeps_the_turntable(run, tmp_path):
     """The object's box and mask cut the ball to its upper half; without them all of it is there."""
     cut = known_run(tmp_path / "cut")
     cut.dataset.object_box_m[0, 2] = 0.06
@@ -246,7 +242,7 @@ def test_nerfstudios_options_work(run, tmp_path):
         exported(rgb_output_name="spectral")
 
 
-def test_a_model_without_an_object_is_said_so(run, tmp_path):
+def test_a_model_without_an_object_is_refused(run, tmp_path):
     class Empty(BallModel):
         def __call__(self, rays):
             outputs = super().__call__(rays)
@@ -259,11 +255,10 @@ def test_a_model_without_an_object_is_said_so(run, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_large_frames_share_depths_between_pixels(run, monkeypatch):
-    monkeypatch.setattr("hsi_sc_nerf.surface.depth_renders.DEPTH_RAYS", 1000)
+def test_large_frames_share_depths_between_pixels(run):
     cameras, masks = run.manager.train_dataset.cameras, run.manager.train_pixel_sampler.masks
-    seen = look_from_cameras(run.model, cameras, masks, 4096)
-    assert seen.maps.cell_px > 1
-    assert seen.maps.depths.isfinite().sum() < 1500
-    found = sample_surface_points(run.model, cameras, masks, 500, 4096, torch.tensor([[-0.6] * 3, [0.6] * 3]))
+    renders = render_depth_maps(run.model, cameras, masks, 4096, max_rays=1000)
+    assert renders.cell_px > 1
+    assert renders.depths.isfinite().sum() < 1500
+    found = surface_points(run, 500, max_rays=1000)
     np.testing.assert_allclose(np.linalg.norm(found.points, axis=1), RADIUS, atol=STEP)

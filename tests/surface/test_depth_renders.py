@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
-from hsi_sc_nerf.surface.silhouettes import silhouettes, within_silhouettes
-from hsi_sc_nerf.surface.visibility import MIN_COSINE, DepthMaps, most_frontal
+from hsi_sc_nerf.surface.depth_renders import DepthRenders
+from hsi_sc_nerf.surface.regions import visual_hull_region
+from hsi_sc_nerf.surface.surface_depth import MIN_COSINE
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 LENS = PinholeIntrinsics(64, 48, 80.0, 79.0, 33.0, 25.0)
@@ -26,16 +27,16 @@ def distance_to_balls(pose: np.ndarray, cell_px: int, balls: list[tuple[np.ndarr
     return depth
 
 
-def ball_maps(device: str, balls: list[tuple[np.ndarray, float]], cell_px: int = 1) -> DepthMaps:
+def ball_renders(device: str, balls: list[tuple[np.ndarray, float]], cell_px: int = 1) -> DepthRenders:
     depths = np.stack([distance_to_balls(pose, cell_px, balls) for pose in POSES])
-    return DepthMaps(
+    return DepthRenders(
         camera_to_world=torch.from_numpy(POSES).float().to(device),
         intrinsics=LENS,
         distortion=(0.0, 0.0, 0.0, 0.0),
         depths=torch.from_numpy(depths).float().to(device),
         cell_px=cell_px,
         masks=torch.ones(len(POSES), LENS.h, LENS.w, dtype=torch.bool, device=device),
-        tolerance=0.02,
+        points=np.zeros((0, 3)),
     )
 
 
@@ -53,8 +54,8 @@ def cosines(points: torch.Tensor) -> np.ndarray:
 @pytest.mark.parametrize("cell_px", [1, 3])
 def test_a_ball_is_seen_where_it_faces_the_camera(device: str, cell_px: int) -> None:
     points = on_unit_ball(2000, device)
-    maps = ball_maps(device, [(np.zeros(3), 1.0)], cell_px)
-    seen = torch.stack([view.visible for view in maps.seen(points, points)]).cpu().numpy()
+    renders = ball_renders(device, [(np.zeros(3), 1.0)], cell_px)
+    seen = torch.stack([view.visible for view in renders.views(points, points)]).cpu().numpy()
     np.testing.assert_array_equal(seen, cosines(points) > MIN_COSINE)
     assert 0.2 < seen.mean() < 0.6
 
@@ -62,8 +63,8 @@ def test_a_ball_is_seen_where_it_faces_the_camera(device: str, cell_px: int) -> 
 @pytest.mark.parametrize("device", DEVICES)
 def test_what_stands_before_it_hides_it(device: str) -> None:
     points = on_unit_ball(2000, device)
-    maps = ball_maps(device, [(np.zeros(3), 1.0), (SECOND_BALL, 0.3)])
-    seen = torch.stack([view.visible for view in maps.seen(points, points)]).cpu().numpy()
+    renders = ball_renders(device, [(np.zeros(3), 1.0), (SECOND_BALL, 0.3)])
+    seen = torch.stack([view.visible for view in renders.views(points, points)]).cpu().numpy()
     eye = POSES[0, :3, 3]
     to_points = points.cpu().numpy() - eye
     directions = to_points / np.linalg.norm(to_points, axis=1, keepdims=True)
@@ -77,50 +78,50 @@ def test_what_stands_before_it_hides_it(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_places_are_those_of_the_projection_and_outside_nothing_is_seen(device: str) -> None:
+def test_image_coordinates_are_the_projection_and_nothing_outside_is_seen(device: str) -> None:
     points = 3.0 * on_unit_ball(500, device)
-    maps = ball_maps(device, [])
-    for pose, view in zip(POSES, maps.seen(points, points / 3.0), strict=True):
-        places, depth = project(points.cpu().numpy().astype(float), pose, LENS)
+    renders = ball_renders(device, [])
+    for pose, view in zip(POSES, renders.views(points, points / 3.0), strict=True):
+        xy_px, depth = project(points.cpu().numpy().astype(float), pose, LENS)
         front = depth > 0.1
-        np.testing.assert_allclose(view.places.cpu().numpy()[front], places[front], rtol=1e-4, atol=1e-2)
-        inside = front & (places > 0).all(axis=1) & (places < (LENS.w, LENS.h)).all(axis=1)
+        np.testing.assert_allclose(view.xy_px.cpu().numpy()[front], xy_px[front], rtol=1e-4, atol=1e-2)
+        inside = front & (xy_px > 0).all(axis=1) & (xy_px < (LENS.w, LENS.h)).all(axis=1)
         assert not view.visible.cpu().numpy()[~inside].any()
         assert 0 < inside.sum() < front.sum()
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_nothing_is_seen_outside_the_mask(device: str) -> None:
-    maps = ball_maps(device, [(np.zeros(3), 1.0)])
-    maps.masks[:, :, : LENS.w // 2] = False
+    renders = ball_renders(device, [(np.zeros(3), 1.0)])
+    renders.masks[:, :, : LENS.w // 2] = False
     points = on_unit_ball(1000, device)
-    for view in maps.seen(points, points):
+    for view in renders.views(points, points):
         assert view.visible.any()
-        assert (view.places[view.visible][:, 0] >= LENS.w // 2).all()
+        assert (view.xy_px[view.visible][:, 0] >= LENS.w // 2).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_the_most_frontal_frame_is_chosen(device: str) -> None:
+def test_the_most_frontal_frame_is_selected(device: str) -> None:
     points = on_unit_ball(1000, device)
-    frames, places, how_frontal = most_frontal(ball_maps(device, [(np.zeros(3), 1.0)]), points, points)
+    frames, xy_px, frontal_cosines = ball_renders(device, [(np.zeros(3), 1.0)]).most_frontal(points, points)
     expected = np.where(cosines(points).max(axis=0) > MIN_COSINE, cosines(points).argmax(axis=0), -1)
     np.testing.assert_array_equal(frames.cpu().numpy(), expected)
     largest = cosines(points).max(axis=0).clip(MIN_COSINE)
-    np.testing.assert_allclose(how_frontal.cpu().numpy(), largest, atol=1e-5)
+    np.testing.assert_allclose(frontal_cosines.cpu().numpy(), largest, atol=1e-5)
     for frame, pose in enumerate(POSES):
         mine = expected == frame
         projected, _ = project(points.cpu().numpy()[mine].astype(float), pose, LENS)
-        np.testing.assert_allclose(places.cpu().numpy()[mine], projected, atol=1e-2)
+        np.testing.assert_allclose(xy_px.cpu().numpy()[mine], projected, atol=1e-2)
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_what_some_frames_show_beside_the_object_is_not_the_objects(device: str) -> None:
-    maps = ball_maps(device, [(np.zeros(3), 1.0)])
-    maps.masks[:] = torch.isfinite(maps.depths)
-    outlines = silhouettes(maps.masks)
-    points = on_unit_ball(500, device)
-    assert within_silhouettes(maps, outlines, points).all()
-    assert within_silhouettes(maps, outlines, 0.3 * points).all()
+def test_points_beside_the_object_in_some_frames_are_outside_the_visual_hull(device: str) -> None:
+    renders = ball_renders(device, [(np.zeros(3), 1.0)])
+    renders.masks[:] = torch.isfinite(renders.depths)
+    hull = visual_hull_region(renders)
+    points = on_unit_ball(500, device).cpu().numpy()
+    assert hull.contains(points, points).all()
+    assert hull.contains(0.3 * points, points).all()
     # Before and behind the ball in the first and the last frame, beside it in the one between them.
-    beside = torch.tensor([1.35, 0.0, 0.0], device=device) + 0.05 * points
-    assert not within_silhouettes(maps, outlines, beside).any()
+    beside = np.array([1.35, 0.0, 0.0]) + 0.05 * points
+    assert not hull.contains(beside, points).any()
