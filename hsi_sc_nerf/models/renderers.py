@@ -34,10 +34,10 @@ class SpectralRenderer(nn.Module):
         self, rgb: Float[Tensor, "*rays samples channels"], weights: Float[Tensor, "*rays samples 1"]
     ) -> Float[Tensor, "*rays channels"]:
         """Sum of the samples' channels (``rgb`` is nerfstudio's name for them), each with its weight."""
-        composited = torch.sum(weights * rgb, dim=-2)
-        if self.background == "last-sample":
-            composited = composited + (1.0 - torch.sum(weights, dim=-2)) * rgb[..., -1, :]
-        return composited
+        if self.background == "none":
+            return torch.sum(weights * rgb, dim=-2)
+        transmitted = 1.0 - torch.sum(weights, dim=-2)
+        return torch.sum(weights * rgb, dim=-2) + transmitted * rgb[..., -1, :]
 
 
 class BasisDecoder(nn.Module):
