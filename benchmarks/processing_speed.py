@@ -41,11 +41,9 @@ from hsi_sc_nerf.capture.envi import Cube, write_cube
 from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame
-from hsi_sc_nerf.processing.masks import MaskConfig
 
 COLUMNS = ["way", "frames", "workers", "a frame, ms", "of copying", "processor, ms", "of copying", "peak memory, MiB"]
 DARK_COUNTS, WHITE_COUNTS = 100, 3000
-MARKER_RANGE_NM = (450.0, 700.0)
 CALIBRATION_NAME = "calibration.pickle"
 
 Work = Callable[[int], None]
@@ -218,9 +216,6 @@ def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
             calibrations[i],
             FramePaths.of(output_dir, session.frames[i].name),
             "",
-            MaskConfig(),
-            pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
-            marker_range_nm=MARKER_RANGE_NM,
             buffer=own.buffer,
         )
 

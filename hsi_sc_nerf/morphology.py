@@ -1,10 +1,10 @@
-"""Regions of an image: morphology and connected components on boolean masks."""
+"""Regions of an image: morphology, connected components and outlines of boolean masks."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from scipy import ndimage
 
 
@@ -44,3 +44,13 @@ def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarra
 def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
     """The mask with everything that it encloses."""
     return ndimage.binary_fill_holes(mask)
+
+
+def draw_outline(
+    image: UInt8[np.ndarray, "lines samples 3"],
+    mask: Bool[np.ndarray, "lines samples"],
+    colour: tuple[int, int, int] = (255, 0, 200),
+) -> UInt8[np.ndarray, "lines samples 3"]:
+    """A copy of the image with the mask's outline drawn over it."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.ascontiguousarray(image).copy(), contours, -1, colour, 1)

@@ -106,6 +106,7 @@ class PackedDataset:
         fwhm_nm: full widths at half maximum of the bands; None where the session does not tell.
         uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
         typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
+        pose_method: how the poses were found: "markers", "colmap" or "angles"; None in datasets without it.
         fingerprint: of the session and the settings that this was made from.
     """
 
@@ -125,6 +126,7 @@ class PackedDataset:
     fwhm_nm: Float[np.ndarray, "bands"] | None = None
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
+    pose_method: str | None = None
     fingerprint: str | None = None
 
     @property
@@ -196,6 +198,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "scene_box_m": dataset.scene_box_m.tolist(),
         "object_box_m": dataset.object_box_m.tolist(),
         "container": None if dataset.container is None else asdict(dataset.container),
+        "pose_method": dataset.pose_method,
         "fingerprint": dataset.fingerprint,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
         "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
@@ -280,5 +283,6 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
             )
             for frame in content["frames"]
         ),
+        pose_method=content.get("pose_method"),
         fingerprint=content.get("fingerprint"),
     )

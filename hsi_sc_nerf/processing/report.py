@@ -1,13 +1,12 @@
-"""Pictures by which a user checks the calibration and the masks."""
+"""Pictures by which a user checks the calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -17,10 +16,10 @@ from hsi_sc_nerf.calibration.no_data import filled
 from hsi_sc_nerf.calibration.white_reference import White, WhiteReference
 from hsi_sc_nerf.calibration.white_steps import mean_over_columns, white_mask
 from hsi_sc_nerf.capture.envi import Cube
-from hsi_sc_nerf.files import atomic_write, write_png
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.morphology import draw_outline
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
 
-_OUTLINE_RGB = (255, 0, 200)
 PERCENTILE_STEP = 5.0
 """The percentile of the white's mask is shown beside others so far below and above, as in the paper (65, 70, 75)."""
 
@@ -52,7 +51,7 @@ def white_reference_picture(path: Path, cube: Cube, white: WhiteReference, rgb_n
     axes["deviation"].set_title(f"Deviation D from the mean spectrum\n{_deviations(white.deviation)}", fontsize=10)
     kept = np.zeros(image.shape[:2], dtype=bool)
     kept[y0:y1, x0:x1] = white.mask
-    axes["kept"].imshow(outlined(image, kept))
+    axes["kept"].imshow(draw_outline(image, kept))
     in_mask = white.deviation[white.mask]
     axes["kept"].set_title(f"Region kept: {white.pixels} pixels\n{_deviations(in_mask)}", fontsize=10)
     for name, step in {"lower": -PERCENTILE_STEP, "chosen": 0.0, "higher": PERCENTILE_STEP}.items():
@@ -119,41 +118,3 @@ def _figure(width: float, height: float) -> Figure:
 def _save(figure: Figure, path: Path) -> None:
     with atomic_write(path) as (temporary,):
         figure.savefig(temporary, dpi=100)
-
-
-def mask_picture(
-    path: Path,
-    images: Sequence[UInt8[np.ndarray, "h w 3"]],
-    masks: Sequence[Bool[np.ndarray, "h w"]],
-    names: Sequence[str],
-    *,
-    columns: int = 6,
-    tile_px: int = 240,
-) -> None:
-    """Draw a contact sheet: each frame's pseudo-RGB with its mask's outline and its name.
-
-    Raises:
-        InputError: the operating system refused to write.
-    """
-    tiles = []
-    for image, mask, name in zip(images, masks, names, strict=True):
-        scale = tile_px / image.shape[1]
-        size = (tile_px, round(image.shape[0] * scale))
-        interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
-        small = cv2.resize(np.ascontiguousarray(image), size, interpolation=interpolation)
-        tile = outlined(small, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
-        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
-        tiles.append(tile)
-    blank = np.full_like(tiles[0], 255)
-    rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
-    rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
-    write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
-
-
-def outlined(
-    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], colour: tuple[int, int, int] = _OUTLINE_RGB
-) -> UInt8[np.ndarray, "h w 3"]:
-    """A copy of the image with the mask's outline drawn over it."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.ascontiguousarray(image).copy(), contours, -1, colour, 1)
