@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, find_subspace, pixel_noise, sample_training_spectra
-from hsi_sc_nerf.data.static_background import estimate_static_background
+from hsi_sc_nerf.data.background_image import estimate_static_background
 from hsi_sc_nerf.fields.grid_size import GridSize, grid_for_resolution
 from hsi_sc_nerf.models.band_weights import inverse_variance_weights
 from hsi_sc_nerf.models.camera_background import CameraBackground
@@ -19,24 +18,6 @@ from hsi_sc_nerf.models.compositing import ChamberSpectrum
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 BackgroundKind = Literal["last-sample", "spectrum", "image", "learned-image"]
-
-
-def training_subspace(
-    dataset: PackedDataset, frames: Sequence[PackedFrame], rank: int | None = None
-) -> SpectralSubspace:
-    """The spectra of training pixels, half of them of the object, as a basis.
-
-    Args:
-        dataset: whose uncertainty is the noise floor; where it is not known, the spectra tell their noise themselves.
-        frames: training frames.
-        rank: of the basis; None for what stands out of the noise.
-
-    Raises:
-        InputError: hardly any pixel is free of flagged values.
-    """
-    spectra, valid = sample_training_spectra(frames)
-    noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
-    return find_subspace(spectra, noise, valid, rank=rank)
 
 
 def chamber_background(

@@ -23,7 +23,7 @@ from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 
 from hsi_sc_nerf.data.cameras import CAMERA_ROTATION
-from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace
+from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_angle_map,
@@ -36,7 +36,7 @@ from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
 from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
-from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid, training_subspace
+from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement
 from hsi_sc_nerf.models.spectral_config import SpectralModelConfig

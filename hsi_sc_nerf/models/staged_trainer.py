@@ -166,8 +166,8 @@ class StagedTrainer(Trainer):
 
     def _enter(self, stage: Stage) -> None:
         """Begin, or go on with, ``stage``."""
-        self.pipeline.datamanager.foreground_share = stage.config.foreground_share
-        self.pipeline.datamanager.rim_share = stage.config.rim_share
+        self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_share
+        self.pipeline.datamanager.boundary_ray_fraction = stage.config.rim_share
         weights: dict[str, Any] = stage.config.loss_weights()
         self._model.config = dataclasses.replace(cast(SpectralModelConfig, self.config.pipeline.model), **weights)
         self._stage = stage

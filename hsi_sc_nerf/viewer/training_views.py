@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.plotting.false_colour import frame_pixels
