@@ -23,8 +23,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.report import draw_calibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.session import open_session
-from hsi_sc_nerf.processing.calibrated_frames import pack_frames
-from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.scores.calibration import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -96,16 +95,7 @@ class CalibrationAccuracy:
         try:
             session = open_session(simulate_session(scene, folder / "session", progress=False))
             calibration = calibrate_session(session, config)
-            pack_frames(
-                session,
-                calibration,
-                folder / "packed",
-                MaskConfig(),
-                pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
-                marker_range_nm=(450.0, 700.0),
-                workers=2,
-                progress=False,
-            )
+            pack_frames(session, calibration, folder / "packed")
             if self.pictures is not None and effects:
                 draw_calibration(self.pictures, session, calibration, paper.PSEUDO_RGB_NM)
             return score_calibration(session, calibration, folder / "packed", load_truth(session.path))

@@ -1,10 +1,10 @@
-"""What a training batch costs to read: random pixels of a whole session, from several kinds of files, as a table.
+"""Time to read a training batch, random pixels of a whole session, from several kinds of files, as a table.
 
     uv run python benchmarks/pixel_fetch.py --frames 60
 
-Every way gives the same: the spectra of random pixels, anywhere in the session, as float32. "Cold" is read from the
-disk (the system was told to forget the files), "warm" from the system's cache; each is the median over batches of
-other pixels. Files of random numbers are made for it and deleted at the end.
+Every reader returns the same spectra as float32. "Cold" batches are read from the disk, after the system dropped the
+files from its cache; "warm" ones from the cache. Each time is the median over batches of different pixels. Files of
+random numbers are made and deleted at the end.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack_unflagged
 from hsi_sc_nerf.packed.pixels import PixelReader
 
 COLUMNS = ["read from", "cold, ms", "warm, ms", "warm, of float32 in RAM", "memory taken, MiB"]
-# Share of the free memory that the frames in RAM may take.
-RAM_SHARE = 0.7
+MAX_RAM_FRACTION = 0.7
+"""Fraction of the free memory that the frames in RAM may take."""
 
 Indices = Int[np.ndarray, "count 3"]
 Fetch = Callable[[Indices], Float[np.ndarray, "count bands"]]
@@ -42,7 +42,7 @@ Fetch = Callable[[Indices], Float[np.ndarray, "count bands"]]
 
 @dataclass(frozen=True)
 class PixelFetch:
-    """Measure how long the pixels of a training batch take to read."""
+    """Measure the time to read the pixels of a training batch."""
 
     frames: int = paper.FRAMES_PER_OBJECT
     """Frames of the session."""
@@ -55,7 +55,7 @@ class PixelFetch:
     repeats: int = 7
     """Batches whose median is taken."""
     folder: Path | None = None
-    """Where to make the files; the system's folder for temporary files if not given. A full session takes 13 GB."""
+    """Folder for the files; the system's temporary folder if not given. A full session takes 13 GB."""
     page: Path | None = None
     """Markdown page whose table (between the marks of this benchmark) is replaced."""
 
@@ -63,24 +63,25 @@ class PixelFetch:
         """Measure, print the table, write it into the page."""
         with tempfile.TemporaryDirectory(prefix="pixel-fetch-", dir=self.folder) as folder:
             raw, packed = self._make_files(Path(folder))
-            ways: dict[str, tuple[Sequence[Path], Callable[[], Fetch]]] = {
+            readers: dict[str, tuple[Sequence[Path], Callable[[], Fetch]]] = {
                 "raw BIL, SPy's read_pixel": (raw, lambda: _spy_pixels(raw)),
                 "raw BIL, SPy's memory map": (raw, lambda: _spy_maps(raw)),
-                "packed BIP, memory map": (packed, lambda: _maps(packed, give_back=False)),
-                "packed BIP, memory map given back": (packed, lambda: _maps(packed, give_back=True)),
+                "packed BIP, memory map": (packed, lambda: _maps(packed, release=False)),
+                "packed BIP, memory map released": (packed, lambda: _maps(packed, release=True)),
                 "packed BIP, by position (this package)": (packed, lambda: _by_position(packed)),
             }
             rows: dict[str, tuple[float | None, float, float]] = {
-                name: (self._cold(*way), *self._warm(*way)) for name, way in track(ways.items(), "from the disk")
+                name: (self._cold(*reader), *self._warm(*reader))
+                for name, reader in track(readers.items(), "reading")
             }
-            in_ram = min(self.frames, int(RAM_SHARE * _free_memory() / (4 * self.size**2 * self.bands)))
+            in_ram = min(self.frames, int(MAX_RAM_FRACTION * _free_memory() / (4 * self.size**2 * self.bands)))
             name = "float32 in RAM" + ("" if in_ram == self.frames else f" ({in_ram} frames: no memory for more)")
             ram_ms, taken = self._timed(_ram(packed[:in_ram]), in_ram)
             rows[name] = (None, ram_ms, taken)
         self._show([_cells(name, cold, warm, taken, ram_ms) for name, (cold, warm, taken) in rows.items()])
 
     def _make_files(self, folder: Path) -> tuple[list[Path], list[Path]]:
-        """Headers of a raw and a packed session: copies of one frame, which reading cannot tell from frames."""
+        """Headers of a raw and a packed session, made of copies of one frame."""
         shape = (self.size, self.size, self.bands)
         counts = np.random.default_rng(0).integers(0, FLAGGED, shape, dtype=np.uint16)
         wavelengths_nm = np.linspace(*paper.WAVELENGTH_RANGE_NM, self.bands)
@@ -94,23 +95,23 @@ class PixelFetch:
                 shutil.copyfile(_data(first), _data(other))
         return raw, packed
 
-    def _draw(self, rng: np.random.Generator, frames: int) -> Indices:
+    def _random_pixels(self, rng: np.random.Generator, frames: int) -> Indices:
         return rng.integers(0, (frames, self.size, self.size), (self.pixels, 3))
 
     def _cold(self, headers: Sequence[Path], opened: Callable[[], Fetch]) -> float | None:
-        """Median milliseconds a batch that nobody read before, or None where the system cannot be told to forget."""
+        """Median milliseconds a batch from the disk, or None where the system cannot drop files from its cache."""
         if not hasattr(os, "posix_fadvise"):
             return None
         rng = np.random.default_rng(1)
         seconds = []
         for _ in range(self.repeats):
             for header in headers:
-                _forget(_data(header))
-            fetch, indices = opened(), self._draw(rng, self.frames)
+                _drop_from_cache(_data(header))
+            fetch, indices = opened(), self._random_pixels(rng, self.frames)
             started = time.perf_counter()
             fetch(indices)
             seconds.append(time.perf_counter() - started)
-            del fetch  # what is mapped is not forgotten
+            del fetch  # mapped files are not dropped
         return 1000 * float(np.median(seconds))
 
     def _warm(self, headers: Sequence[Path], opened: Callable[[], Fetch]) -> tuple[float, float]:
@@ -121,12 +122,12 @@ class PixelFetch:
         return self._timed(opened(), self.frames)
 
     def _timed(self, fetch: Fetch, frames: int) -> tuple[float, float]:
-        """Median milliseconds a batch, and by how many MiB the process grew meanwhile."""
+        """Median milliseconds a batch, and the MiB by which the process grew."""
         rng = np.random.default_rng(2)
-        fetch(self._draw(rng, frames))
+        fetch(self._random_pixels(rng, frames))
         seconds, before = [], _resident_mib()
         for _ in range(self.repeats):
-            indices = self._draw(rng, frames)
+            indices = self._random_pixels(rng, frames)
             started = time.perf_counter()
             fetch(indices)
             seconds.append(time.perf_counter() - started)
@@ -156,8 +157,8 @@ def _spy_maps(headers: Sequence[Path]) -> Fetch:
     return _indexed([envi.open(str(header)).open_memmap(interleave="bip") for header in headers])
 
 
-def _maps(headers: Sequence[Path], give_back: bool) -> Fetch:
-    """Through memory maps of the packed cubes, whose pages are given back to the system after each batch or not."""
+def _maps(headers: Sequence[Path], release: bool) -> Fetch:
+    """Through memory maps of the packed cubes, whose pages are released after each batch or not."""
     maps, cubes = [], []
     for header in headers:
         cube = open_cube(header)
@@ -169,7 +170,7 @@ def _maps(headers: Sequence[Path], give_back: bool) -> Fetch:
 
     def fetch(indices: Indices) -> np.ndarray:
         spectra = indexed(indices)
-        if give_back:
+        if release:
             for pages in maps:
                 pages.madvise(mmap.MADV_DONTNEED)
         return spectra
@@ -184,7 +185,7 @@ def _by_position(headers: Sequence[Path]) -> Fetch:
 
 
 def _ram(headers: Sequence[Path]) -> Fetch:
-    """From arrays that hold everything."""
+    """From arrays in memory."""
     return _indexed([open_cube(header).read().astype(np.float32) / REFLECTANCE_SCALE for header in headers])
 
 
@@ -204,15 +205,15 @@ def _data(header: Path) -> Path:
     return header.with_suffix(".raw" if header.name.startswith("raw") else ".bip")
 
 
-def _forget(path: Path) -> None:
-    """Have the system drop what it keeps of a file in memory."""
+def _drop_from_cache(path: Path) -> None:
+    """Drop a file from the system's cache."""
     with path.open("rb") as file:
         os.fsync(file.fileno())  # only what is on the disk can be dropped
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def _memory_kib(file: str, field: str) -> int:
-    """A field of one of Linux's lists of memory; 0 on other systems."""
+    """A field of one of Linux's memory statistics; 0 on other systems."""
     path = Path(file)
     lines = path.read_text(encoding="ascii").splitlines() if path.is_file() else []
     return next((int(line.split()[1]) for line in lines if line.startswith(field)), 0)
@@ -223,7 +224,7 @@ def _resident_mib() -> float:
 
 
 def _free_memory() -> float:
-    """Bytes that can be had; half of the machine's memory where the system does not tell."""
+    """Free memory in bytes; half of the machine's memory where the system does not tell."""
     available = 1024 * _memory_kib("/proc/meminfo", "MemAvailable:")
     return available or 0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 

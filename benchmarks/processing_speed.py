@@ -1,13 +1,11 @@
-"""What processing a frame costs beside copying its raw file and beside SPy with numpy, as a table.
+"""Time to process a frame, compared with copying its raw file and with SPy and NumPy, as a table.
 
     uv run python benchmarks/processing_speed.py --page README.md
 
-Each way is a process of its own, which first reads its input files (so that they come from the system's memory), then
-works on one frame without the clock, for what is loaded once, then with it; it writes files that were not there. The
-ways take turns. Told are the medians over the rounds of the time and of its ratio to copying as many files one after
-the other in the same round; "processor" is the time that the processor spent, all workers together, of which other
-work on the machine changes less. Frames with the counts of a plausible camera are made for it and deleted at the end;
-or give a session of your own.
+Each method runs in a process of its own. It first reads its input files, so that they are in the system's cache, and
+processes one frame untimed, so that everything is loaded. The table shows medians over rounds of the time, and of its
+ratio to copying as many files in the same round. "Processor" is the processor time of all workers, which other work
+on the machine changes less. A session with plausible counts is made and deleted at the end, or give one of your own.
 """
 
 from __future__ import annotations
@@ -40,11 +38,18 @@ from hsi_sc_nerf.capture.envi import Cube, write_cube
 from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame
-from hsi_sc_nerf.processing.masks import MaskConfig
 
-COLUMNS = ["way", "frames", "workers", "a frame, ms", "of copying", "processor, ms", "of copying", "peak memory, MiB"]
+COLUMNS = [
+    "method",
+    "frames",
+    "workers",
+    "a frame, ms",
+    "of copying",
+    "processor, ms",
+    "of copying",
+    "peak memory, MiB",
+]
 DARK_COUNTS, WHITE_COUNTS = 100, 3000
-MARKER_RANGE_NM = (450.0, 700.0)
 CALIBRATION_NAME = "calibration.pickle"
 
 Work = Callable[[int], None]
@@ -52,26 +57,26 @@ Work = Callable[[int], None]
 
 @dataclass(frozen=True)
 class ProcessingSpeed:
-    """Measure what processing frames costs, beside copying their raw files and beside SPy with numpy."""
+    """Measure the time to process frames, compared with copying their raw files and with SPy and NumPy."""
 
     session: Path | None = None
-    """A session to process; one is made if not given."""
+    """Session to process; one is made if not given."""
     size: int = 512
-    """Width and height of the frames that are made, pixels."""
+    """Width and height of the made frames, pixels."""
     bands: int = paper.BANDS
-    """Bands of the frames that are made."""
+    """Bands of the made frames."""
     frames: int = 12
-    """Frames that are processed side by side."""
+    """Frames that are processed in parallel."""
     workers: int = 2
-    """How many side by side."""
+    """Workers that process them."""
     rounds: int = 3
-    """How often each way takes its turn."""
+    """Repeats of each method."""
     folder: Path | None = None
-    """Where to make files; the system's folder for temporary files if not given."""
+    """Folder for the files; the system's temporary folder if not given."""
     page: Path | None = None
     """Markdown page whose table (between the marks of this benchmark) is replaced."""
     figures: Path | None = None
-    """JSON file for the figures of all rounds."""
+    """JSON file for the measurements of all rounds."""
 
     def main(self) -> None:
         """Measure, print the table, write it into the page."""
@@ -86,11 +91,13 @@ class ProcessingSpeed:
             jobs = [("nothing", 0, 1), ("copy", 1, 1), ("process", 1, 1), ("spy", 1, 1)]
             jobs += [("copy", many, 1), ("copy", many, self.workers), ("process", many, self.workers)]
             rows: list[dict[str, Any]] = [
-                {"way": way, "frames": frames, "workers": workers, "rounds": []} for way, frames, workers in jobs
+                {"method": method, "frames": frames, "workers": workers, "rounds": []}
+                for method, frames, workers in jobs
             ]
             for _ in range(self.rounds):
                 for row in rows:
-                    row["rounds"].append(_run(row["way"], session, scratch, row["frames"], row["workers"]))
+                    cost = _run(row["method"], session, scratch, row["frames"], row["workers"])
+                    row["rounds"].append(cost)
         if self.figures is not None:
             self.figures.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         self._show(rows)
@@ -105,61 +112,60 @@ class ProcessingSpeed:
             write_table(self.page, "processing speed", COLUMNS, cells)
 
 
-WAYS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}
+METHODS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}
 
 
 def _cells(row: dict, rows: list[dict]) -> list[str]:
     peak = f"{np.median([r['peak_mib'] for r in row['rounds']]):.0f}"
-    if row["way"] == "nothing":
-        return [WAYS["nothing"], "", "", "", "", "", "", peak]
-    cells = [WAYS[row["way"]], str(row["frames"]), str(row["workers"])]
-    copy = next(
-        r for r in rows if r["way"] == "copy" and (r["frames"], r["workers"]) == (row["frames"], row["workers"])
-    )
-    for figure in ("milliseconds", "processor_milliseconds"):
-        own, copying = (np.array([r[figure] for r in rs["rounds"]]) for rs in (row, copy))
+    if row["method"] == "nothing":
+        return [METHODS["nothing"], "", "", "", "", "", "", peak]
+    cells = [METHODS[row["method"]], str(row["frames"]), str(row["workers"])]
+    same_job = (row["frames"], row["workers"])
+    copy = next(r for r in rows if r["method"] == "copy" and (r["frames"], r["workers"]) == same_job)
+    for key in ("milliseconds", "processor_milliseconds"):
+        own, copying = (np.array([r[key] for r in rs["rounds"]]) for rs in (row, copy))
         cells += [f"{np.median(own):.0f}", f"{np.median(own / copying):.1f}"]
     return [*cells, peak]
 
 
-def _run(way: str, session: Path, scratch: Path, frames: int, workers: int, **made: int) -> dict[str, float]:
-    """Times a frame and peak memory of one way, in a process of its own."""
+def _run(method: str, session: Path, scratch: Path, frames: int, workers: int, **made: int) -> dict[str, float]:
+    """Times a frame and peak memory of one method, in a process of its own."""
     log = scratch / "log"
-    options = {"way": way, "session": session, "scratch": scratch, "frames": frames, "workers": workers, **made}
-    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    cost = run_step(way, [sys.executable, __file__, *words], log)
+    options = {"method": method, "session": session, "scratch": scratch, "frames": frames, "workers": workers, **made}
+    arguments = [argument for name, value in options.items() for argument in (f"--{name}", str(value))]
+    cost = run_step(method, [sys.executable, __file__, *arguments], log)
     return {**json.loads(log.read_text(encoding="utf-8")), "peak_mib": cost.peak_memory_mib}
 
 
 @dataclass(frozen=True)
-class OneWay:
-    """Do one way's work and print its times a frame."""
+class OneMethod:
+    """Run one method and print its times a frame."""
 
-    way: str
-    """Which."""
+    method: str
+    """A key of ``METHODS``, or "make" or "calibrate"."""
     session: Path
-    """The frames."""
+    """Session to process."""
     scratch: Path
-    """For what is written; deleted at the end."""
+    """Folder for files, deleted at the end."""
     frames: int
-    """How many."""
+    """Frames to process."""
     workers: int
-    """How many side by side."""
+    """Workers that process them."""
     size: int = 512
-    """Of the frames that are made."""
+    """Width and height of the made frames, pixels."""
     bands: int = paper.BANDS
-    """Of the frames that are made."""
+    """Bands of the made frames."""
 
     def main(self) -> None:
-        """Warm up, do the work, print its times."""
+        """Warm up, process the frames, print the times."""
         times = {}
-        if self.way == "make":
+        if self.method == "make":
             _make_session(self.session, self.size, self.bands, self.frames)
-        elif self.way == "calibrate":
+        elif self.method == "calibrate":
             calibration = calibrate_session(open_session(self.session), CalibrationConfig())
             with (self.scratch / CALIBRATION_NAME).open("wb") as file:
                 pickle.dump((calibration.cubes, calibration.frames), file)
-        elif self.way != "nothing":
+        elif self.method != "nothing":
             times = self._timed()
         print(json.dumps(times))
 
@@ -170,8 +176,8 @@ class OneWay:
             with path.open("rb") as file:
                 while file.read(1 << 24):
                     pass
-        ways = {"copy": _copying, "process": _processing, "spy": _spy}
-        work = ways[self.way](session, self.scratch, output_dir)
+        methods = {"copy": _copying, "process": _processing, "spy": _spy}
+        work = methods[self.method](session, self.scratch, output_dir)
         with _fresh(output_dir):
             work(0)
         with _fresh(output_dir), ThreadPoolExecutor(self.workers) as pool:
@@ -217,9 +223,6 @@ def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
             calibrations[i],
             FramePaths.of(output_dir, session.frames[i].name),
             "",
-            MaskConfig(),
-            pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
-            marker_range_nm=MARKER_RANGE_NM,
             buffer=own.buffer,
         )
 
@@ -227,7 +230,7 @@ def _processing(session: Session, scratch: Path, output_dir: Path) -> Work:
 
 
 def _spy(session: Session, _: Path, output_dir: Path) -> Work:
-    """As SPy's manual would have it: (S - D) / (W - D), clipped, saved."""
+    """As in SPy's manual: (S - D) / (W - D), clipped and saved."""
     tarp = session.white
     if tarp is None:
         raise ValueError("a session without a white tarp")
@@ -250,7 +253,7 @@ def _central_spectrum(capture: Capture) -> np.ndarray:
 
 
 def _make_session(path: Path, size: int, bands: int, frames: int) -> None:
-    """A leaf before a gray wall under a lamp that is weak at both ends, in 12-bit counts with photon noise."""
+    """A leaf before a gray wall under a lamp with little light at both ends, in 12-bit counts with photon noise."""
     rng = np.random.default_rng(0)
     wavelengths_nm = np.linspace(*paper.WAVELENGTH_RANGE_NM, bands)
     lamp = WHITE_COUNTS * np.exp(-(((wavelengths_nm - 680.0) / 230.0) ** 2))
@@ -268,7 +271,7 @@ def _make_session(path: Path, size: int, bands: int, frames: int) -> None:
     write("white_reference", np.ones((size, size, 1)))
     on_leaf = np.hypot(x, 1.5 * y) < 0.25
     write("frame_000", np.where(on_leaf[..., None], leaf, 0.8))
-    # What is in a frame does not change what it costs.
+    # The time does not depend on a frame's content.
     for i in range(1, max(2, frames)):
         for stem in ("", "DARKREF_"):
             for suffix in (".hdr", ".raw"):
@@ -279,4 +282,4 @@ def _make_session(path: Path, size: int, bands: int, frames: int) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(OneWay if "--way" in sys.argv else ProcessingSpeed).main()
+    tyro.cli(OneMethod if "--method" in sys.argv else ProcessingSpeed).main()

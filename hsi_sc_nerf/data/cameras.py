@@ -1,4 +1,4 @@
-"""nerfstudio's cameras from poses and a lens, with what the model wants to know of each ray's camera.
+"""nerfstudio cameras from poses and intrinsics, with metadata that the model reads from each ray.
 
 nerfstudio imports this module while its own data managers are still being imported: it must not import them.
 """
@@ -13,14 +13,14 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 
 FRAME_INDEX = "frame_index"
-"""Camera metadata: which frame of the session a ray belongs to."""
+"""Camera metadata: index of the session's frame that a ray belongs to."""
 CAMERA_ROTATION = "camera_rotation"
 """Camera metadata: the nine elements of the camera-to-world rotation of a ray, row by row."""
 
 
 def pinhole_cameras(
     poses: Float[np.ndarray, "n 4 4"],
-    lens: PinholeIntrinsics,
+    intrinsics: PinholeIntrinsics,
     distortion: Float[np.ndarray, "4"],
     frames: Int[np.ndarray, "n"] | None = None,
 ) -> Cameras:
@@ -28,10 +28,10 @@ def pinhole_cameras(
 
     Args:
         poses: camera-to-world, OpenGL axes.
-        lens: of all of them.
+        intrinsics: of all cameras.
         distortion: k1, k2, p1, p2 (OpenCV).
-        frames: indices of the session's frames that were taken there, whose poses the model refines; None where there
-            are none, and the model takes the poses as they are.
+        frames: indices of the session's frames that were taken at these poses, which the model refines; None for
+            poses that belong to no frame and are not refined.
     """
     k1, k2, p1, p2 = distortion
     metadata = {CAMERA_ROTATION: torch.from_numpy(poses[:, :3, :3].reshape(-1, 9)).float()}
@@ -39,12 +39,12 @@ def pinhole_cameras(
         metadata[FRAME_INDEX] = torch.from_numpy(frames)[:, None].float()
     return Cameras(
         camera_to_worlds=torch.from_numpy(poses[:, :3]).float(),
-        fx=lens.fl_x,
-        fy=lens.fl_y,
-        cx=lens.cx,
-        cy=lens.cy,
-        width=lens.w,
-        height=lens.h,
+        fx=intrinsics.fl_x,
+        fy=intrinsics.fl_y,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        width=intrinsics.w,
+        height=intrinsics.h,
         distortion_params=torch.tensor([k1, k2, 0.0, 0.0, p1, p2]).float() if np.any(distortion) else None,
         camera_type=CameraType.PERSPECTIVE,
         metadata=metadata,

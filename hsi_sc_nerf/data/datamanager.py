@@ -1,4 +1,4 @@
-"""nerfstudio data manager: training rays with their spectra, read from the cubes on disk pixel by pixel."""
+"""nerfstudio data manager and dataset: training rays with their spectra, and whole held-out views."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Shaped
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
-from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
+from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler, spread_over
 
 
@@ -30,7 +33,7 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     """Rays of an evaluation step during training."""
     seed: int = 0
     """Seed of the random pixels."""
-    # Pixels are read from the cubes on disk one by one: these options of nerfstudio's have nothing to act on.
+    # Pixels are read from the cubes on disk one by one, so these options of nerfstudio have no effect.
     camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
     images_on_gpu: tyro.conf.Suppress[bool] = False
     masks_on_gpu: tyro.conf.Suppress[bool] = False
@@ -43,8 +46,34 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = (0,)
 
 
+class SpectralDataset(InputDataset):
+    """Frames of a packed dataset.
+
+    An item holds ``spectral`` (lines, samples, bands) beside ``image`` and ``mask`` and, where the dataset has
+    flagged values, ``valid`` (likewise, bool): which of them are measurements.
+    """
+
+    @property
+    def frames(self) -> list[PackedFrame]:
+        """The frames, in the cameras' order."""
+        return self._dataparser_outputs.metadata["frames"]
+
+    @property
+    def has_flagged(self) -> bool:
+        """Whether some of the dataset's values are not measurements."""
+        return self._dataparser_outputs.metadata["dataset"].flagged_values > 0
+
+    def get_metadata(self, data: dict) -> dict:
+        """The reflectance cube of the item."""
+        counts = self.frames[data["image_idx"]].cube()
+        if not self.has_flagged:
+            return {"spectral": torch.from_numpy(unpack_unflagged(counts))}
+        reflectance, valid = unpack(counts)
+        return {"spectral": torch.from_numpy(reflectance), "valid": torch.from_numpy(valid)}
+
+
 class SpectralDataManager(VanillaDataManager[SpectralDataset]):
-    """Random pixels of the cubes on disk; nothing is cached but the masks.
+    """Random pixels of the cubes on disk; only the masks are kept in memory.
 
     Attributes:
         foreground_ray_fraction: fraction of the training rays that hit the foreground; None for whole frames. The
@@ -58,29 +87,20 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     foreground_ray_fraction: float | None = None
     boundary_ray_fraction: float = 0.0
 
-    def _pixels(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
-        return PixelSampler(
-            PixelReader(frame.cube() for frame in dataset.frames),
-            np.stack([frame.mask() for frame in dataset.frames]),
-            num_rays_per_batch=num_rays,
-            seed=self.config.seed,
-            has_flagged=dataset.has_flagged,
-        )
-
     def setup_train(self) -> None:
         """Open the training cubes."""
-        self.train_pixel_sampler = self._pixels(self.train_dataset, self.config.train_num_rays_per_batch)
+        self.train_pixel_sampler = self._pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
 
     def setup_eval(self) -> None:
         """Open the held-out cubes."""
-        self.eval_pixel_sampler = self._pixels(self.eval_dataset, self.config.eval_num_rays_per_batch)
+        self.eval_pixel_sampler = self._pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
-        # A view in which the object was not found has nothing to be judged by: it would score as perfect.
-        judged = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
+        # A view without an object in its mask would score as perfect.
+        with_object = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
             input_dataset=self.eval_dataset,
-            image_indices=tuple(judged or range(len(self.eval_dataset))),  # type: ignore[arg-type]
+            image_indices=tuple(with_object or range(len(self.eval_dataset))),  # type: ignore[arg-type]
             device=self.device,
         )
         # Pictures in the logs show the same view every time, so that they can be compared.
@@ -89,7 +109,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         )
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The training batch of ``step``: always the same for the same step, stage and seed."""
+        """The training batch of ``step``: the same for the same step, stage and seed."""
         self.train_count += 1
         batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
         return self._with_rays(batch, self.train_ray_generator)
@@ -100,11 +120,22 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         return self._with_rays(self.eval_pixel_sampler.sample(step), self.eval_ray_generator)
 
     def fixed_eval_pixels(self, count: int = 4) -> tuple[RayBundle, dict]:
-        """Some pixels of the object in the first held-out view (of all of it, where it has none), always the same."""
+        """The same pixels of the object in the first held-out view each time; of all of it where it shows none."""
         mask = self.eval_pixel_sampler.masks[:1]
         indices = spread_over(mask if mask.any() else ~mask, count)
         return self._with_rays(self.eval_pixel_sampler.at(indices), self.eval_ray_generator)
 
-    def _with_rays(self, pixels: dict[str, np.ndarray], generator: RayGenerator) -> tuple[RayBundle, dict]:
+    def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
+        return PixelSampler(
+            PixelReader(frame.cube() for frame in dataset.frames),
+            np.stack([frame.mask() for frame in dataset.frames]),
+            num_rays_per_batch=num_rays,
+            seed=self.config.seed,
+            has_flagged=dataset.has_flagged,
+        )
+
+    def _with_rays(
+        self, pixels: dict[str, Shaped[np.ndarray, "rays ..."]], generator: RayGenerator
+    ) -> tuple[RayBundle, dict]:
         batch = {key: torch.from_numpy(value) for key, value in pixels.items()}
         return generator(batch["indices"]), batch

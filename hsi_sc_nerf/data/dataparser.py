@@ -1,4 +1,4 @@
-"""nerfstudio data parser: a packed dataset, or a raw session that is processed first, once.
+"""nerfstudio data parser of packed datasets and of raw sessions, which are processed first.
 
 nerfstudio imports this module while its own data managers are still being imported: it must not import them.
 """
@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
@@ -33,22 +34,17 @@ class SpectralDataParserConfig(DataParserConfig):
     data: Path = Path()
     """A dataset made by `hsi-sc-nerf process`, or a capture session, which is processed into a folder beside it."""
     train_split_fraction: float = paper.TRAIN_SPLIT_FRACTION
-    """Share of the frames to train on; the others, evenly spread, are held out for evaluation."""
+    """Fraction of the frames to train on; the others, evenly spread, are held out for evaluation."""
     scene: Literal["box", "cameras"] = "box"
-    """What fills the unit cube of the scene. box: everything that turns, and nothing else. cameras: the places that
-    the camera takes around the object, as nerfstudio scales scenes without bounds (the paper's preset)."""
+    """What fills the unit cube of the scene. box: everything that turns, and nothing else. cameras: the camera's
+    positions around the object, as nerfstudio scales scenes without bounds (the paper's preset)."""
     process: ProcessConfig = field(default_factory=ProcessConfig)
     """How to process a session."""
 
 
-def processed_dir(session_dir: Path) -> Path:
-    """Where a session given as ``--data`` is processed to."""
-    return session_dir.with_name(session_dir.name + "-processed")
-
-
 @dataclass
 class SpectralDataParser(DataParser):
-    """Turns a packed dataset into nerfstudio's cameras, boxes and file lists."""
+    """Converts a packed dataset into nerfstudio's cameras, boxes and file lists."""
 
     config: SpectralDataParserConfig
 
@@ -67,7 +63,7 @@ class SpectralDataParser(DataParser):
     def _outputs(self, dataset: PackedDataset, split: str) -> DataparserOutputs:
         num_frames = len(dataset.frames)
         train, held_out = split_frames(num_frames, self.config.train_split_fraction)
-        chosen = train if split == "train" else held_out
+        indices = train if split == "train" else held_out
         poses = dataset.camera_to_worlds
         if self.config.scene == "box":
             centre, scale = scene_scaling(dataset.scene_box_m)
@@ -77,24 +73,23 @@ class SpectralDataParser(DataParser):
             aabb = np.array([[-1.0] * 3, [1.0] * 3])
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
 
-        cameras = pinhole_cameras(poses[chosen], dataset.intrinsics, dataset.distortion, chosen)
+        cameras = pinhole_cameras(poses[indices], dataset.intrinsics, dataset.distortion, indices)
         transform = torch.eye(4)[:3]
         transform[:, 3] = -torch.from_numpy(centre)
         return DataparserOutputs(
-            image_filenames=[dataset.frames[i].image_path for i in chosen],
-            mask_filenames=[dataset.frames[i].mask_path for i in chosen],
+            image_filenames=[dataset.frames[i].image_path for i in indices],
+            mask_filenames=[dataset.frames[i].mask_path for i in indices],
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.from_numpy(aabb).float()),
             dataparser_transform=transform,
             dataparser_scale=scale,
             metadata={
                 "dataset": dataset,
-                "frames": [dataset.frames[i] for i in chosen],
-                "flagged_values": dataset.flagged_values,
+                "frames": [dataset.frames[i] for i in indices],
                 "wavelengths_nm": dataset.wavelengths_nm,
                 "rgb_bands": nearest_bands(dataset.wavelengths_nm, dataset.pseudo_rgb_nm).tolist(),
                 "object_box": torch.from_numpy((dataset.object_box_m - centre) * scale).float(),
-                # What the pose refinement needs to know of the turntable.
+                # For the pose refinement.
                 "turntable": {
                     "camera_to_world": poses[0],
                     "frame_indices": train,
@@ -105,13 +100,20 @@ class SpectralDataParser(DataParser):
         )
 
 
-def split_frames(num_frames: int, train_fraction: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of training and held-out frames, the latter spread evenly (nerfstudio's "fraction" split).
+def processed_dir(session_dir: Path) -> Path:
+    """Folder that a session given as ``--data`` is processed into."""
+    return session_dir.with_name(session_dir.name + "-processed")
 
-    A session of few frames still holds one out.
+
+def split_frames(
+    num_frames: int, train_fraction: float
+) -> tuple[Int[np.ndarray, "train"], Int[np.ndarray, "held_out"]]:
+    """Indices of training and held-out frames, the latter evenly spread (nerfstudio's "fraction" split).
+
+    At least one frame is held out.
 
     Raises:
-        InputError: the fraction is none, or no frame would be left on one of the two sides.
+        InputError: the fraction is not between 0 and 1, or there would be no training or no held-out frame.
     """
     if not 0.0 < train_fraction < 1.0:
         raise InputError(
@@ -127,7 +129,7 @@ def split_frames(num_frames: int, train_fraction: float) -> tuple[np.ndarray, np
     return train, held_out
 
 
-def scene_scaling(box_m: np.ndarray) -> tuple[np.ndarray, float]:
+def scene_scaling(box_m: Float[np.ndarray, "2 3"]) -> tuple[Float[np.ndarray, "3"], float]:
     """Centre (metres) and scale that bring a box into [-1, 1]^3, as nerfstudio's models expect."""
     low, high = box_m
     return (low + high) / 2.0, float(2.0 / (high - low).max())

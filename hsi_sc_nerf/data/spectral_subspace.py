@@ -1,8 +1,7 @@
-"""The few directions that hold the spectra of a session, found by singular values above the noise.
+"""Low-rank basis of a session's spectra, from the singular values above the noise.
 
-A sample of the field then needs a few coefficients instead of a value in every band, and the rank says what that
-costs. Spectra are taken as they are, without their mean: black is a spectrum too, and so is any mixture of spectra
-with weights below 1, which is what a ray collects.
+The field emits a few coefficients a sample instead of a value in every band. The mean is not subtracted, because a
+ray mixes spectra with weights whose sum is below 1.
 """
 
 from __future__ import annotations
@@ -19,14 +18,13 @@ from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE, ReflectanceUncertainty
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 
-FEWEST_SPECTRA = 64
-"""Below this, neither noise nor rank can be told."""
-NOISE_DRAWS = 3
-"""How often noise is simulated to find its largest singular value; more hardly move it."""
-NEIGHBOUR_BANDS = 12
-"""Bands on each side that predict a band where its noise is estimated from the spectra alone."""
-ROUNDING_NOISE = 1.0 / (REFLECTANCE_SCALE * np.sqrt(12.0))
-"""Standard deviation of what rounding to the packed cubes' numbers adds to a reflectance."""
+MIN_SPECTRA = 64
+"""Fewer spectra determine neither noise nor rank."""
+_NOISE_DRAWS = 3
+# Bands on each side that predict a band where its noise is estimated from the spectra alone.
+_NEIGHBOUR_BANDS = 12
+# Standard deviation of the error of rounding a reflectance to a packed cube's numbers.
+_ROUNDING_NOISE = 1.0 / (REFLECTANCE_SCALE * np.sqrt(12.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +66,11 @@ def training_subspace(
 
     Raises:
         InputError: too few pixels are free of flagged values.
+
+    Example:
+        >>> dataset = open_packed("apple_01-data")
+        >>> training_subspace(dataset, dataset.frames[:-1]).basis.shape
+        (204, 9)
     """
     spectra, valid = sample_training_spectra(frames)
     noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
@@ -82,108 +85,105 @@ def find_subspace(
     rank: int | None = None,
     max_rank: int = 16,
 ) -> SpectralSubspace:
-    """The subspace of spectra that stands out of their noise.
+    """The subspace of spectra above their noise.
 
-    Spectra are divided by the noise of their bands and by that of their rows. A direction counts if its singular
-    value exceeds the largest one of noise alone with the same standard deviations, which is simulated (parallel
-    analysis, Horn 1965; for even noise that is the edge of Marchenko and Pastur, ``sqrt(n) + sqrt(bands)``).
+    Spectra are divided by the noise of their bands and of their rows. A direction counts if its singular value
+    exceeds the largest one of simulated noise with the same standard deviations (parallel analysis, Horn 1965).
 
     Args:
         spectra: reflectance.
         noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
-        valid: which values are measurements; spectra with any other are left out. All without it.
-        rank: number of directions to take, whatever the noise.
-        max_rank: most directions to take otherwise.
+        valid: which values are measurements; spectra with any other are left out. All if not given.
+        rank: number of directions; None for those above the noise.
+        max_rank: largest number of directions above the noise that is taken.
 
     Raises:
-        InputError: too few spectra are whole, or the rank is not from 1 to the number of bands.
+        InputError: too few spectra have all bands, or the rank is not from 1 to the number of bands.
         ValueError: the noise is not above 0.
     """
-    whole = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
-    if whole.sum() < FEWEST_SPECTRA:
+    complete = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
+    if complete.sum() < MIN_SPECTRA:
         raise InputError(
-            f"only {whole.sum()} of {len(spectra)} sampled spectra are free of flagged values, and a spectral basis "
-            f"needs {FEWEST_SPECTRA}; calibration.json in the dataset counts the flags of each band: list the worst "
-            "bands as bad (bbl) in the headers and process again, or train with --pipeline.model.head direct."
+            f"only {complete.sum()} of {len(spectra)} sampled spectra are free of flagged values, and a spectral "
+            f"basis needs {MIN_SPECTRA}; calibration.json in the dataset counts the flags of each band: list the "
+            "worst bands as bad (bbl) in the headers and process again, or train with --pipeline.model.head direct."
         )
     bands = spectra.shape[1]
     if rank is not None and not 1 <= rank <= bands:
         raise InputError(f"a basis for spectra of {bands} bands has 1 to {bands} columns, not {rank}; choose a rank.")
-    sample = spectra[whole].astype(np.float64)
-    deviation = estimate_noise(sample) if noise is None else np.broadcast_to(noise, spectra.shape)[whole]
+    sample = spectra[complete].astype(np.float64)
+    deviation = estimate_noise(sample) if noise is None else np.broadcast_to(noise, spectra.shape)[complete]
     deviation = np.broadcast_to(deviation, sample.shape).astype(np.float64)
     if not (deviation > 0.0).all():
         raise ValueError("the standard deviation of the noise is not above 0 everywhere")
 
-    of_band = np.sqrt(np.mean(deviation**2, axis=0))
-    even = of_band * np.sqrt(np.mean((deviation / of_band) ** 2, axis=1, keepdims=True))
+    band_noise = np.sqrt(np.mean(deviation**2, axis=0))
+    noise_scale = band_noise * np.sqrt(np.mean((deviation / band_noise) ** 2, axis=1, keepdims=True))
     # The triangle of a QR decomposition has the singular values and directions of the whole.
-    _, singular, directions = np.linalg.svd(np.linalg.qr(sample / even, mode="r"))
-    above_noise = int((singular > _largest_of_noise(deviation / even)).sum())
+    _, singular, directions = np.linalg.svd(np.linalg.qr(sample / noise_scale, mode="r"))
+    above_noise = int((singular > _largest_noise_value(deviation / noise_scale)).sum())
     chosen = rank or max(1, min(above_noise, max_rank))
 
-    span, _ = np.linalg.qr((directions[:chosen] * of_band).T)
-    _, _, turn = np.linalg.svd(sample @ span, full_matrices=False)
-    basis = span @ turn.T
+    span, _ = np.linalg.qr((directions[:chosen] * band_noise).T)
+    _, _, rotation = np.linalg.svd(sample @ span, full_matrices=False)
+    basis = span @ rotation.T
     basis *= np.where((sample @ basis).sum(axis=0) < 0.0, -1.0, 1.0)
     return SpectralSubspace(basis, mean_spectrum=basis @ (basis.T @ sample.mean(axis=0)))
 
 
-def _largest_of_noise(deviation: Float[np.ndarray, "n bands"]) -> float:
-    """Largest singular value that noise of these standard deviations reaches."""
+def _largest_noise_value(deviation: Float[np.ndarray, "n bands"]) -> float:
+    """Largest singular value of simulated noise with these standard deviations."""
     rng = np.random.default_rng(0)
-    draws = [deviation * rng.standard_normal(deviation.shape) for _ in range(NOISE_DRAWS)]
+    draws = [deviation * rng.standard_normal(deviation.shape) for _ in range(_NOISE_DRAWS)]
     return float(max(np.sqrt(np.linalg.eigvalsh(draw.T @ draw)[-1]) for draw in draws))
 
 
 def estimate_noise(spectra: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "bands"]:
-    """Standard deviation of each band's noise, told from the spectra alone.
+    """Standard deviation of each band's noise, estimated from the spectra alone.
 
-    Each band is predicted from its neighbours by linear regression (Roger and Arnold 1996). What is left is its own
-    noise and, by the squares of the regression's coefficients, that of the neighbours: a linear system for the
-    variances. Noise that neighbouring bands share is not seen, and signal that one band has alone is taken for noise.
+    Each band is predicted from its neighbours by linear regression (Roger and Arnold 1996). The residual's variance
+    is the band's own noise plus the neighbours' noise weighted by the squared coefficients: a linear system for the
+    variances. Noise that neighbouring bands share is missed, and signal in a single band is taken for noise.
     """
     count, bands = spectra.shape
-    reach = max(1, min(NEIGHBOUR_BANDS, count // 8, (bands - 1) // 2))
+    reach = max(1, min(_NEIGHBOUR_BANDS, count // 8, (bands - 1) // 2))
     mixing = np.eye(bands)
-    left = np.empty(bands)
+    residual_variance = np.empty(bands)
     for band in range(bands):
         start = min(max(band - reach, 0), max(bands - 2 * reach - 1, 0))
         others = np.setdiff1d(np.arange(start, min(start + 2 * reach + 1, bands)), [band])
         weights, _, _, _ = np.linalg.lstsq(spectra[:, others], spectra[:, band], rcond=None)
         residual = spectra[:, band] - spectra[:, others] @ weights
-        left[band] = residual @ residual / (count - len(others))
+        residual_variance[band] = residual @ residual / (count - len(others))
         mixing[band, others] = weights**2
-    variance = np.linalg.solve(mixing, left)
-    # The system may leave next to nothing where neighbours are much noisier.
-    return np.sqrt(np.clip(variance, 0.01 * left, left) + ROUNDING_NOISE**2)
+    variance = np.linalg.solve(mixing, residual_variance)
+    # Where neighbours are much noisier, the solution may be far too small, or negative.
+    return np.sqrt(np.clip(variance, 0.01 * residual_variance, residual_variance) + _ROUNDING_NOISE**2)
 
 
 def pixel_noise(
     uncertainty: ReflectanceUncertainty, spectra: Float[np.ndarray, "n bands"]
 ) -> Float[np.ndarray, "n bands"]:
-    """Standard deviation by which a pixel's reflectance differs from another's of the same material.
+    """Standard deviation of the reflectance of pixels of the same material.
 
-    The white reference's share is left out, one error that all pixels have in common, and the packed cubes' rounding
-    is added.
+    The white reference's noise is left out, because all pixels have it in common; rounding in packed cubes is added.
     """
-    lit = np.maximum(spectra, 0.0)
-    return np.sqrt(uncertainty.constant + uncertainty.linear * lit + ROUNDING_NOISE**2)
+    return np.sqrt(uncertainty.constant + uncertainty.linear * np.maximum(spectra, 0.0) + _ROUNDING_NOISE**2)
 
 
 def sample_training_spectra(
-    frames: Sequence[PackedFrame], count: int = 4096, foreground_share: float | None = 0.5, seed: int = 0
+    frames: Sequence[PackedFrame], count: int = 4096, foreground_fraction: float | None = 0.5, seed: int = 0
 ) -> tuple[Float[np.ndarray, "count bands"], Bool[np.ndarray, "count bands"]]:
     """Reflectance at random pixels of the frames, and which values are measurements (0 where they are not).
 
     Args:
         frames: of a packed dataset.
         count: number of pixels; only these are read.
-        foreground_share: share drawn from the foreground; None for pixels of whole frames.
-        seed: of the choice.
+        foreground_fraction: fraction drawn from the foreground; None for pixels of whole frames.
+        seed: of the random choice.
     """
     masks = np.stack([frame.mask() for frame in frames])
-    # The training pixels' own reader has a file open for each of these frames as well.
+    # Closed at once: the data manager opens a file for each of these frames as well.
     with closing(PixelReader(frame.cube() for frame in frames)) as reader:
-        batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_share)
+        batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_fraction)
     return batch["spectral"], batch["valid"]

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hsi_sc_nerf.data.static_background import estimate_static_background
+from hsi_sc_nerf.data.background_image import estimate_static_background
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame

@@ -124,8 +124,8 @@ class PackedDataset:
     fwhm_nm: Float[np.ndarray, "bands"] | None = None
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
-    fingerprint: str | None = None
     pose_method: str | None = None
+    fingerprint: str | None = None
 
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
@@ -200,8 +200,8 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "scene_box_m": dataset.scene_box_m.tolist(),
         "object_box_m": dataset.object_box_m.tolist(),
         "container": None if dataset.container is None else asdict(dataset.container),
-        "fingerprint": dataset.fingerprint,
         "pose_method": dataset.pose_method,
+        "fingerprint": dataset.fingerprint,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
         "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
         "background_reflectance": dataset.background_reflectance.tolist(),
@@ -285,6 +285,6 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
             )
             for frame in content["frames"]
         ),
-        fingerprint=content.get("fingerprint"),
         pose_method=content.get("pose_method"),
+        fingerprint=content.get("fingerprint"),
     )

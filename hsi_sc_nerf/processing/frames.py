@@ -1,36 +1,48 @@
-"""The work on one frame: calibrate, pack, and keep what later steps need, so that a stopped run can go on.
+"""Frames of a session, calibrated and packed side by side; a run that stopped goes on where it was.
 
-A frame's cube and picture are written first and its notes last: a frame whose notes are there is finished. Earlier
-notes go before the first of its files is replaced, or they would vouch for a cube of other settings.
+A frame's cube and pictures are written first and its cache last, so a frame with a cache is finished. An earlier
+cache is deleted before the first of its files is replaced: it would vouch for a cube of other settings.
 """
 
 from __future__ import annotations
 
+import hashlib
+import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Num, UInt8, UInt16
+from jaxtyping import Float, Num, UInt8, UInt16
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
+from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
+from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
-from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.processing.masks import MaskConfig, bin_width, brightness, foreground_score
+from hsi_sc_nerf.packed.cube import write_packed_cube
+from hsi_sc_nerf.processing.fingerprint import capture_files, fingerprint
+from hsi_sc_nerf.processing.masks import brightness, foreground_score, spectral_bin_width
 from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
+
+MARKER_RANGE_NM = (450.0, 700.0)
+"""Markers are detected in the mean image of these bands: many inks are transparent beyond 700 nm."""
 
 
 @dataclass(frozen=True)
 class FramePaths:
-    """Where a frame's files are in a packed dataset."""
+    """Paths of a frame's files in a packed dataset."""
 
     image: Path
     cube: Path
     flags: Path
     mask: Path
-    notes: Path
+    cache: Path
 
     @staticmethod
     def of(root: Path, capture: str) -> FramePaths:
@@ -40,42 +52,98 @@ class FramePaths:
             cube=root / "cubes" / f"{capture}.hdr",
             flags=root / "flags" / f"{capture}.png",
             mask=root / "masks" / f"{capture}.png",
-            notes=root / ".notes" / f"{capture}.npz",
+            cache=root / ".cache" / f"{capture}.npz",
         )
 
 
 @dataclass(frozen=True, eq=False)
-class FrameNotes:
-    """What finding poses and masks, and the report, need of a frame; pictures are upright.
+class FrameCache:
+    """What poses, masks and the report need of a frame; images are upright.
 
     Attributes:
         fingerprint: of the files and settings that the frame was made from.
-        gray: in which markers are looked for.
-        score: foreground score (``masks.foreground_score``).
-        brightness: mean reflectance (``masks.brightness``).
-        tally: how many values were clipped and flagged, by kept band.
+        gray: mean over the marker bands, in which markers are detected.
+        score: foreground score (`masks.foreground_score`).
+        brightness: mean reflectance (`masks.brightness`).
+        pixel_counts: numbers of clipped and flagged values by kept band.
     """
 
     fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
     score: Float[np.ndarray, "lines samples"]
     brightness: Float[np.ndarray, "lines samples"]
-    tally: PixelCounts
+    pixel_counts: PixelCounts
 
 
-def finished_notes(paths: FramePaths, fingerprint: str) -> FrameNotes | None:
-    """The notes of a frame that was finished from the same files with the same settings, or None."""
-    try:
-        with np.load(paths.notes) as stored:
-            tally = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
-            notes = FrameNotes(
-                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], tally
-            )
-        open_cube(paths.cube)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
-        return None
-    complete = paths.image.is_file() and paths.flags.is_file()
-    return notes if complete and notes.fingerprint == fingerprint else None
+def pack_frames(
+    session: Session,
+    calibration: SessionCalibration,
+    output_dir: Path,
+    *,
+    pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM,
+    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
+    workers: int = 2,
+    progress: bool = False,
+) -> list[FrameCache]:
+    """Calibrate and pack all frames of a session; frames that an earlier run finished in the same way are kept.
+
+    Args:
+        session: raw captures.
+        calibration: of the session.
+        output_dir: folder of the packed dataset.
+        pseudo_rgb_nm: wavelengths shown as red, green and blue.
+        marker_range_nm: bands that are averaged into the gray image.
+        workers: frames that are calibrated at the same time.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The frames' caches, in the session's order.
+
+    Raises:
+        InputError: a raw cube cannot be read, or the operating system refused to write.
+
+    Example:
+        >>> session = open_session("apple_01")
+        >>> caches = pack_frames(session, calibrate_session(session, CalibrationConfig()), Path("apple_01-data"))
+        >>> caches[0].score.shape
+    """
+    # A worker packs frame after frame in the same memory.
+    own = threading.local()
+    num_values = max(cube.shape[0] * cube.shape[1] for cube in calibration.cubes) * len(calibration.bands)
+
+    def pack(index: int) -> FrameCache:
+        if not hasattr(own, "buffer"):
+            own.buffer = np.empty(num_values, np.uint16)
+        capture, frame_calibration = session.frames[index], calibration.frames[index]
+        paths = FramePaths.of(output_dir, capture.name)
+        key = fingerprint(
+            [pseudo_rgb_nm, marker_range_nm, capture_files(session, capture), _digest(frame_calibration)]
+        )
+        return read_cache(paths, key) or process_frame(
+            calibration.cubes[index],
+            frame_calibration,
+            paths,
+            key,
+            pseudo_rgb_nm=pseudo_rgb_nm,
+            marker_range_nm=marker_range_nm,
+            buffer=own.buffer,
+        )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with (
+        Progress(*columns, console=Console(stderr=True), disable=not progress) as bar,
+        ThreadPoolExecutor(workers) as pool,
+    ):
+        task = bar.add_task("Calibrating frames", total=len(session.frames))
+        futures = [pool.submit(pack, index) for index in range(len(session.frames))]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                bar.advance(task)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [future.result() for future in futures]
 
 
 def process_frame(
@@ -83,84 +151,77 @@ def process_frame(
     calibration: FrameCalibration,
     paths: FramePaths,
     fingerprint: str,
-    masks: MaskConfig,
     *,
-    pseudo_rgb_nm: tuple[float, float, float],
-    marker_range_nm: tuple[float, float],
+    pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM,
+    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     buffer: UInt16[np.ndarray, "values"] | None = None,
-) -> FrameNotes:
-    """Calibrate a frame's raw cube; write its packed cube, flags, pseudo-RGB picture and notes, all upright.
+) -> FrameCache:
+    """Calibrate a frame's raw cube; write its packed cube, flags, pseudo-RGB image and cache, all upright.
 
-    Frame after frame may be packed in the same ``buffer`` (``pack_counts``).
+    Args:
+        cube: raw counts, or finished reflectance.
+        calibration: of this frame.
+        paths: files to write.
+        fingerprint: of what the frame is made from, kept in its cache.
+        pseudo_rgb_nm: wavelengths shown as red, green and blue.
+        marker_range_nm: bands that are averaged into the gray image.
+        buffer: memory to pack in (`pack_counts`), which several frames may use in turn.
 
     Raises:
-        InputError: the raw cube cannot be read or the disk is full.
+        InputError: the raw cube cannot be read, or the operating system refused to write.
     """
     wavelengths_nm = cube.wavelengths_nm[calibration.bands]
     widths_nm = None if cube.fwhm_nm is None else cube.fwhm_nm[calibration.bands]
-    pictures = PictureBands(
+    picture_bands = PictureBands(
         rgb=nearest_bands(wavelengths_nm, pseudo_rgb_nm),
         gray=bands_within(wavelengths_nm, marker_range_nm),
-        bin_width=bin_width(len(wavelengths_nm), masks.spectral_bins),
+        bin_width=spectral_bin_width(len(wavelengths_nm)),
     )
     with CubeLines(cube) as lines:
-        frame = pack_counts(lines, calibration, pictures, buffer)
+        frame = pack_counts(lines, calibration, picture_bands, buffer)
 
     def upright(image: Num[np.ndarray, "lines samples *channels"]) -> Num[np.ndarray, "h w *channels"]:
         return np.rot90(image, calibration.quarter_turns)
 
-    paths.notes.unlink(missing_ok=True)
+    paths.cache.unlink(missing_ok=True)
     write_packed_cube(paths.cube, upright(frame.packed), wavelengths_nm, widths_nm)
     write_png(paths.flags, upright(frame.flags))
     write_png(paths.image, upright(to_8_bit(np.moveaxis(frame.rgb, 0, -1))))
-    notes = FrameNotes(
+    cache = FrameCache(
         fingerprint,
-        upright(to_8_bit(frame.gray)),
-        upright(foreground_score(frame.binned, masks.smoothing_px)),
-        upright(brightness(frame.binned, masks.smoothing_px)),
-        frame.pixel_counts,
+        gray=upright(to_8_bit(frame.gray)),
+        score=upright(foreground_score(frame.binned)),
+        brightness=upright(brightness(frame.binned)),
+        pixel_counts=frame.pixel_counts,
     )
-    with atomic_write(paths.notes) as (temporary,):
-        tally = {f.name: getattr(notes.tally, f.name) for f in fields(PixelCounts)}
+    with atomic_write(paths.cache) as (temporary,):
         np.savez(
             temporary,
-            fingerprint=notes.fingerprint,
-            gray=notes.gray,
-            score=notes.score,
-            brightness=notes.brightness,
-            **tally,
+            **{f.name: getattr(cache, f.name) for f in fields(FrameCache) if f.name != "pixel_counts"},
+            **{f.name: getattr(cache.pixel_counts, f.name) for f in fields(PixelCounts)},
         )
-    return notes
+    return cache
 
 
-def border_spectrum(
-    cube_path: Path, foreground: Bool[np.ndarray, "lines samples"], width_fraction: float = 1 / 32
-) -> Float[np.ndarray, "bands"]:
-    """Median reflectance spectrum of a packed frame along the image's border, the object left out.
-
-    The border is ``width_fraction`` of the image's shorter side wide, and one pixel at least. Flagged values do not
-    count; a band without any value there (an object that fills the border) is nan.
-    """
-    lines, samples = foreground.shape
-    width = max(1, round(width_fraction * min(lines, samples)))
-    border = ~foreground
-    border[width : lines - width, width : samples - width] = False
-    # In ascending order the flagged values, which are the largest numbers, come last.
-    ordered = np.sort(open_cube(cube_path).memmap()[border], axis=0)
-    measured = (ordered != FLAGGED).sum(axis=0)
-    median = np.full(ordered.shape[1], np.nan)
-    some = np.flatnonzero(measured)
-    middle = [ordered[(measured[some] - odd) // 2, some] for odd in (0, 1)]
-    median[some] = np.mean(middle, axis=0) / REFLECTANCE_SCALE
-    return median
+def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
+    """The cache of a frame that was finished from the same files with the same settings, or None."""
+    try:
+        with np.load(paths.cache) as stored:
+            pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
+            cache = FrameCache(
+                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], pixel_counts
+            )
+        open_cube(paths.cube)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
+        return None
+    complete = paths.image.is_file() and paths.flags.is_file()
+    return cache if complete and cache.fingerprint == fingerprint else None
 
 
-def object_spectrum(
-    cube_path: Path, foreground: Bool[np.ndarray, "lines samples"], pixels: int = 2000
-) -> Float[np.ndarray, "bands"]:
-    """Mean spectrum of a packed frame's foreground, from so many of its pixels; nan where there is none."""
-    at = np.flatnonzero(foreground)
-    chosen = np.unravel_index(at[:: max(1, len(at) // pixels)], foreground.shape)
-    reflectance, valid = unpack(open_cube(cube_path).memmap()[chosen])
-    measured = valid.sum(axis=0)
-    return np.where(measured > 0, reflectance.sum(axis=0) / np.maximum(measured, 1), np.nan)
+def _digest(calibration: FrameCalibration) -> str:
+    """Hash of all numbers that a frame's reflectance is computed with."""
+    digest = hashlib.sha256()
+    for field in fields(calibration):
+        value = getattr(calibration, field.name)
+        digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return digest.hexdigest()

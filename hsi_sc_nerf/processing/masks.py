@@ -1,68 +1,113 @@
-"""Foreground masks: the object on the container, without chamber, container, disc and markers.
+"""Foreground masks: the object on its container, without chamber, container, disc and markers.
 
-Plant tissue changes its reflectance strongly between 400 and 1000 nm (pigments, red edge), while Teflon, plastic,
-paper and ink are nearly flat: the spread of a pixel's spectrum tells them apart. What prints and labels may still
-feign is removed by geometry: the object stands on the container's lid. In shade the spread falls with the light, so
-the object's dark parts (its underside, next to the container) are told by spread relative to brightness.
+The reflectance of plant tissue changes strongly between 400 and 1000 nm (pigments, red edge), that of Teflon,
+plastic, paper and ink hardly. A pixel's foreground score is therefore the standard deviation of its spectrum, and
+Otsu's threshold separates the object's scores from the others. Prints and labels below the container's lid are
+excluded by geometry. In shade the score falls with the light, so dark parts next to the object are compared by score
+relative to brightness.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
-from hsi_sc_nerf.morphology import dilate, ellipse_close_open, fill_holes, largest_component, touching
+from hsi_sc_nerf.morphology import (
+    dilate,
+    draw_outline,
+    ellipse_close_open,
+    fill_holes,
+    largest_component,
+    touching,
+)
 from hsi_sc_nerf.packed.dataset import Container
 
+SPECTRAL_BINS = 24
+"""Neighbouring bands are averaged into this number of bins, or a few less, before the score: it reduces noise."""
+SMOOTHING_PX = 0.5
+"""Standard deviation of the Gaussian that smooths the bins over neighbouring pixels."""
+MIN_CONTRAST = 0.03
+"""Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
+CLOSING_FRACTION = 0.01
+"""Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
 _HISTOGRAM_BINS = 512
-# Shares of the object's median brightness: a background that lets shaded parts be told, and the least light to do it.
-_BRIGHT_BACKGROUND = 0.5
-_DARKEST = 0.1
+# Fractions of the object's median brightness. Before a darker background noise alone gives a high relative score; so
+# it does in darker pixels.
+_MIN_BACKGROUND_BRIGHTNESS = 0.5
+_MIN_BRIGHTNESS = 0.1
 
 
 @dataclass(frozen=True)
 class MaskConfig:
     """Settings of the foreground masks."""
 
-    spectral_bins: int = 24
-    """Neighbouring bands are averaged into so many bins of equal width (or a few less) before their spread is taken,
-    which quiets noise."""
-    smoothing_px: float = 0.5
-    """Standard deviation of the Gaussian that smooths the bins over neighbouring pixels, pixels; 0 for none."""
     threshold: float | None = None
-    """Spread of reflectance over the bins from which a pixel is the object's. Found over all frames if not given."""
-    weak_share: float = 0.5
-    """Parts that stick out of the object (a stem) are added from this share of the threshold; 1 for none."""
-    shaded_share: float | None = 0.4
-    """Pixels darker than the object and next to it are added where their spread relative to their brightness is more
-    than this share of the object's; none for none. Not done before a dark background, where noise feigns spread."""
-    min_contrast: float = 0.03
-    """Least difference between the mean spreads of object and background that is believed."""
-    morphology_fraction: float = 0.01
-    """Diameter of the ellipse that closes gaps, as a share of the image's shorter side (3 pixels at least)."""
+    """Foreground score (standard deviation of reflectance over the spectrum) from which a pixel is the object's.
+    Otsu's threshold over all frames if not given."""
+    weak_fraction: float = 0.5
+    """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
+    shaded_fraction: float | None = 0.4
+    """Pixels next to the object and darker than it are added where their score relative to their brightness is more
+    than this fraction of the object's; None for none. Not applied before a dark background."""
     overhang: float = 1.2
-    """The object may reach beyond the container's lid up to this many times its radius."""
+    """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
 
 
-def bin_width(bands: int, spectral_bins: int) -> int:
-    """How many neighbouring bands a bin averages, so that there are ``spectral_bins`` or fewer bins of one width."""
-    return -(-bands // spectral_bins)
+def foreground_masks(
+    scores: Sequence[Float[np.ndarray, "h w"]],
+    brightnesses: Sequence[Float[np.ndarray, "h w"]],
+    config: MaskConfig,
+    regions: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Bool[np.ndarray, "frames h w"]:
+    """Masks of the object in all frames, with one threshold.
+
+    Args:
+        scores: foreground score of each frame (`foreground_score`).
+        brightnesses: mean reflectance of each frame (`brightness`).
+        config: settings.
+        regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
+
+    Raises:
+        InputError: the spectra of object and background hardly differ.
+
+    Example:
+        >>> score, bright = foreground_score(binned), brightness(binned)  # binned: (24, 512, 512) reflectance
+        >>> foreground_masks([score], [bright], MaskConfig()).shape
+        (1, 512, 512)
+    """
+    threshold = select_threshold(scores, config.threshold)
+    masks = []
+    for index, (score, bright) in enumerate(zip(scores, brightnesses, strict=True)):
+        region = np.ones(score.shape, bool) if regions is None else regions[index]
+        mask = foreground_mask(score, threshold, region=region, weak_fraction=config.weak_fraction)
+        if config.shaded_fraction is not None:
+            shaded = shaded_parts(mask, score, bright, region=region, fraction=config.shaded_fraction)
+            mask = fill_holes(mask | shaded)
+        masks.append(mask)
+    return np.stack(masks)
+
+
+def spectral_bin_width(bands: int) -> int:
+    """Number of neighbouring bands in a bin, so that there are `SPECTRAL_BINS` or fewer bins of one width."""
+    return -(-bands // SPECTRAL_BINS)
 
 
 def foreground_score(
-    binned: Float[np.ndarray, "bins lines samples"], smoothing_px: float = 0.5
-) -> Float[np.ndarray, "lines samples"]:
-    """Standard deviation over spectral bins of the (slightly smoothed) reflectance: 0 for a flat spectrum.
+    binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX
+) -> Float[np.ndarray, "h w"]:
+    """Standard deviation over spectral bins of the slightly smoothed reflectance: 0 for a flat spectrum.
 
-    Where a pixel is part object and part flat background the score is nearly its share times the object's score.
+    The score of a mixed pixel of object and flat background is nearly the object's score times its fraction.
     """
-    # Differences from the first bin, whose squares single precision holds: exactly 0 for a flat spectrum.
+    # Differences from the first bin keep their squares within single precision, and a flat spectrum at exactly 0.
     first = _smoothed(binned[0], smoothing_px)
     difference, total, squares = np.empty_like(first), np.zeros_like(first), np.zeros_like(first)
     for image in binned[1:]:
@@ -73,18 +118,18 @@ def foreground_score(
     return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
 
 
-def brightness(
-    binned: Float[np.ndarray, "bins lines samples"], smoothing_px: float = 0.5
-) -> Float[np.ndarray, "lines samples"]:
-    """Mean over spectral bins of the (slightly smoothed) reflectance."""
+def brightness(binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX) -> Float[np.ndarray, "h w"]:
+    """Mean over spectral bins of the slightly smoothed reflectance."""
     return _smoothed(binned.mean(axis=0), smoothing_px)
 
 
-def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tuple[float, float]:
+def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, float]:
     """Otsu's threshold over all frames together, and the contrast: the difference of the two classes' means.
 
-    N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979). Scores are not
-    negative. A contrast of 0 means that all scores are the same.
+    N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979).
+
+    Args:
+        scores: of each frame, 0 or more. Equal scores have a contrast of 0.
     """
     top = max(float(score.max()) for score in scores)
     if not top > 0.0:
@@ -104,21 +149,83 @@ def otsu_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]]) -> tupl
     return float(edges[middle + 1]), float(high[middle] - low[middle])
 
 
-def choose_threshold(scores: Sequence[Float[np.ndarray, "lines samples"]], config: MaskConfig) -> float:
-    """The given threshold, or Otsu's where object and background are told apart.
+def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:
+    """The given threshold, or Otsu's if its contrast is at least `MIN_CONTRAST`.
 
     Raises:
         InputError: the spectra of object and background hardly differ.
     """
-    if config.threshold is not None:
-        return config.threshold
+    if threshold is not None:
+        return threshold
     threshold, contrast = otsu_threshold(scores)
-    if contrast < config.min_contrast:
+    if contrast < MIN_CONTRAST:
         raise InputError(
             f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
             "object is in view, or give a threshold with --masks.threshold."
         )
     return threshold
+
+
+def foreground_mask(
+    score: Float[np.ndarray, "h w"],
+    threshold: float,
+    *,
+    region: Bool[np.ndarray, "h w"] | None = None,
+    weak_fraction: float = 0.5,
+) -> Bool[np.ndarray, "h w"]:
+    """The largest connected component above the threshold, with gaps closed, holes filled and thin parts added.
+
+    Args:
+        score: of one frame.
+        threshold: of the score.
+        region: pixels that may be the object's; all if not given.
+        weak_fraction: thin parts that stick out of the component (a woody stem) are added from this fraction of the
+            threshold on; 1 for none. The component's edge, where pixels are mixed, does not grow.
+    """
+    region = np.ones(score.shape, dtype=bool) if region is None else region
+    closing_px = max(3, round(CLOSING_FRACTION * min(score.shape)))
+    closed = ellipse_close_open((score > threshold) & region, close_px=closing_px, open_px=0)
+    body = fill_holes(largest_component(closed))
+    weak = (score > weak_fraction * threshold) & region
+    edge = dilate(body, closing_px)
+    sticking_out = touching(weak & ~edge, dilate(edge, 3), min_area_px=closing_px + 1)
+    return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
+
+
+def shaded_parts(
+    body: Bool[np.ndarray, "h w"],
+    score: Float[np.ndarray, "h w"],
+    brightness: Float[np.ndarray, "h w"],
+    *,
+    region: Bool[np.ndarray, "h w"] | None = None,
+    fraction: float = 0.4,
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels next to ``body`` that belong to it but get less light than most of it.
+
+    Illumination scales score and brightness alike, so their ratio is the material's. The ratio of a mixed pixel falls
+    faster than its fraction of object: 0.4 of the object's ratio takes about 60 % object before a white background.
+
+    Args:
+        body: the object's mask so far.
+        score: of one frame.
+        brightness: of one frame.
+        region: pixels that may be the object's; all if not given.
+        fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
+
+    Returns:
+        The pixels to add. None where the background is less than half as bright as the body.
+    """
+    empty = np.zeros_like(body)
+    if not body.any() or body.all():
+        return empty
+    typical = float(np.median(brightness[body]))
+    if np.median(brightness[~body]) < _MIN_BACKGROUND_BRIGHTNESS * typical:
+        return empty
+    relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
+    shaded = (relative > fraction * np.median(relative[body])) & (brightness < typical) & ~body
+    if region is not None:
+        shaded &= region
+    return touching(shaded, dilate(body, 3), min_area_px=1)
 
 
 def above_lid(
@@ -128,10 +235,14 @@ def above_lid(
     container: Container,
     overhang: float = 1.2,
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels that can show something standing on the lid: their rays pass over it before they meet the container.
+    """Pixels whose rays pass through the space above the container's lid before they meet the container.
 
-    "Over it" is the upright cylinder around the axis with ``overhang`` times the container's radius, from the lid
-    upwards.
+    Args:
+        intrinsics: of the camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        camera_to_world: pose in the object frame, OpenGL axes, metres.
+        container: upright cylinder about the z axis, from z = 0 up.
+        overhang: the space above the lid is a cylinder of this multiple of the container's radius.
     """
     origin, directions = pixel_rays(intrinsics, camera_to_world, _undistorted_pixels(intrinsics, distortion))
     radius = container.diameter_m / 2.0
@@ -146,57 +257,37 @@ def above_lid(
     return (above[0] < above[1]) & ~blocked
 
 
-def foreground_mask(
-    score: Float[np.ndarray, "lines samples"],
-    threshold: float,
+def mask_picture(
+    path: Path,
+    images: Sequence[UInt8[np.ndarray, "h w 3"]],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    names: Sequence[str],
     *,
-    allowed: Bool[np.ndarray, "lines samples"] | None = None,
-    weak_share: float = 0.5,
-    morphology_fraction: float = 0.01,
-) -> Bool[np.ndarray, "lines samples"]:
-    """Pixels above the threshold (inside ``allowed``): gaps closed, largest component, holes filled.
+    columns: int = 6,
+    tile_px: int = 240,
+) -> None:
+    """Write a contact sheet: each frame's pseudo-RGB image with its mask's outline and its name.
 
-    Parts above ``weak_share`` of the threshold that stick out of the object (a woody stem) are added; its rim, where
-    pixels are part background, does not grow. A share of 1 adds nothing.
+    Raises:
+        InputError: the operating system refused to write.
     """
-    allowed = np.ones(score.shape, dtype=bool) if allowed is None else allowed
-    closing_px = max(3, round(morphology_fraction * min(score.shape)))
-    closed = ellipse_close_open((score > threshold) & allowed, close_px=closing_px, open_px=0)
-    body = fill_holes(largest_component(closed))
-    weak = (score > weak_share * threshold) & allowed
-    rim = dilate(body, closing_px)
-    sticking_out = touching(weak & ~rim, dilate(rim, 3), min_area_px=closing_px + 1)
-    return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
+    tiles = []
+    for image, mask, name in zip(images, masks, names, strict=True):
+        scale = tile_px / image.shape[1]
+        size = (tile_px, round(image.shape[0] * scale))
+        interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
+        small = cv2.resize(np.ascontiguousarray(image), size, interpolation=interpolation)
+        tile = draw_outline(small, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+        tiles.append(tile)
+    blank = np.full_like(tiles[0], 255)
+    rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
+    rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
+    write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
-def shaded_parts(
-    body: Bool[np.ndarray, "lines samples"],
-    score: Float[np.ndarray, "lines samples"],
-    brightness: Float[np.ndarray, "lines samples"],
-    *,
-    allowed: Bool[np.ndarray, "lines samples"] | None = None,
-    share: float = 0.4,
-) -> Bool[np.ndarray, "lines samples"]:
-    """Pixels (inside ``allowed``) that belong to ``body`` but get less light than most of it.
-
-    Illumination scales spread and brightness alike, their ratio stays the material's. A pixel that is part white
-    background has less of it than its share of object: the default of 0.4 is reached by about 60 % object. There are
-    none where the background is less than half as bright as the body.
-    """
-    empty = np.zeros_like(body)
-    if not body.any() or body.all():
-        return empty
-    typical = float(np.median(brightness[body]))
-    if np.median(brightness[~body]) < _BRIGHT_BACKGROUND * typical:
-        return empty
-    relative = score / np.maximum(brightness, _DARKEST * typical)
-    shaded = (relative > share * np.median(relative[body])) & (brightness < typical) & ~body
-    if allowed is not None:
-        shaded &= allowed
-    return touching(shaded, dilate(body, 3), min_area_px=1)
-
-
-def _smoothed(image: Float[np.ndarray, "lines samples"], sigma_px: float) -> Float[np.ndarray, "lines samples"]:
+def _smoothed(image: Float[np.ndarray, "h w"], sigma_px: float) -> Float[np.ndarray, "h w"]:
     return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.0 else image
 
 
@@ -206,7 +297,7 @@ _Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]
 def _undistorted_pixels(
     intrinsics: PinholeIntrinsics, distortion: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "h w 2"]:
-    """Where each pixel's centre would be without lens distortion."""
+    """Pixel coordinates of all pixel centres with the lens distortion removed."""
     x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
     pixels = np.stack([x, y], axis=-1)
     if not np.any(distortion):

@@ -20,11 +20,10 @@ from hsi_sc_nerf.calibration.report import (
     draw_calibration,
     write_calibration,
 )
-from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
-from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
+from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.morphology import fill_holes
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
     Container,
@@ -38,10 +37,9 @@ from hsi_sc_nerf.packed.dataset import (
 from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import PoseWay, find_poses
-from hsi_sc_nerf.processing.calibrated_frames import pack_frames
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
-from hsi_sc_nerf.processing.frames import FrameNotes, border_spectrum, object_spectrum
-from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, choose_threshold, foreground_mask, shaded_parts
+from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
+from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
     check_scale,
@@ -50,7 +48,7 @@ from hsi_sc_nerf.processing.posed_frames import (
     posed_frames,
     session_facts,
 )
-from hsi_sc_nerf.processing.report import mask_picture
+from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
@@ -59,7 +57,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ProcessConfig:
-    """Settings of the way from raw captures to a packed dataset."""
+    """Settings of the processing of raw captures into a packed dataset."""
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """White-reference calibration."""
@@ -73,18 +71,14 @@ class ProcessConfig:
     features: FeatureConfig = field(default_factory=FeatureConfig)
     """Poses from features."""
     camera: Path | None = None
-    """A dataset that was made before with the same camera and turntable: with known angles and its camera, poses need
-    neither markers nor texture."""
+    """An earlier dataset of the same camera and turntable: with known angles and its camera, poses need neither
+    markers nor texture."""
     marker_side_m: float | None = None
-    """Side of a marker's black square, metres; session.json's where it is not given here."""
-    marker_range_nm: tuple[float, float] = (450.0, 700.0)
-    """Markers are looked for in the mean image of these bands, nm (many inks are transparent beyond 700 nm)."""
-    object_margin_m: float = 0.003
-    """The object's box is widened by this, metres."""
-    scene_margin_m: float = 0.005
-    """The box of everything that turns is widened by this, metres."""
+    """Side of a marker's black square, metres; session.json's if not given."""
+    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM
+    """Markers are detected in the mean image of these bands, nm: many inks are transparent beyond 700 nm."""
     workers: int = 2
-    """Frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
+    """Number of frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
 
 
 def process_session(
@@ -94,55 +88,64 @@ def process_session(
     progress: bool = True,
     estimate_poses: PoseFunction = find_poses,
 ) -> Path:
-    """Make the packed dataset ``output_dir`` (docs/architecture.md) from a capture session; returns its path.
+    """Make a packed dataset (docs/reference/files.md) from a capture session.
 
-    The same session with the same settings is processed once: a second call returns at once. A run that stopped
+    The same session is processed once with the same settings: a second call returns at once, and a run that stopped
     goes on with the frames that are not finished. ``transforms.json`` is written last, so a dataset that has one is
-    whole.
+    complete.
+
+    Args:
+        session_dir: folder of the captures (`open_session`).
+        output_dir: folder of the dataset; made if it does not exist.
+        config: settings.
+        progress: whether to print what is found.
+        estimate_poses: called like `find_poses`.
+
+    Returns:
+        ``output_dir``.
 
     Raises:
-        InputError: a setting is out of range; the session cannot be used (``open_session``, ``white_reference``), has
-            no marker size, shows no markers or no object; or the output cannot be written or holds another dataset.
+        InputError: a setting is out of range; the session cannot be used (`open_session`, `calibrate_session`), has
+            no marker size, no poses or no object; or the output cannot be written or holds another kind of dataset.
+
+    Example:
+        >>> data = process_session(Path("apple_01"), Path("apple_01-data"))
+        >>> dataset = open_packed(data)
+        >>> dataset.frames[0].cube().shape
+        (512, 512, 204)
     """
     config = config or ProcessConfig()
-    _check_settings(config)
+    if config.workers < 1:
+        raise InputError(f"--workers is {config.workers}, but must be 1 or more; correct it.")
     output_dir = Path(output_dir)
-    # A folder's name in square brackets, or between colons, is no command to the console.
+    # Square brackets and colons in a folder's name are no markup.
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
+
     session = open_session(session_dir)
-    stamp = session_fingerprint(session, config, _named_files(config))
-    if _is_done(output_dir, stamp):
+    fingerprint = session_fingerprint(session, config, _named_files(config))
+    if _is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
-    earlier = None if config.camera is None else open_packed(config.camera)
-    facts = session_facts(session, config.marker_side_m, earlier)
+    facts = session_facts(session, config.marker_side_m, open_packed(config.camera) if config.camera else None)
     check_scale(session, facts, config.poses)
-    _clear_transforms(output_dir)
+    _remove_transforms(output_dir)
 
-    with console.status("measuring white, noise and lamps"):
-        calibration = calibrate_session(session, config.calibration)
-        draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
-    for sentence in describe_calibration(session, calibration):
-        console.print(sentence, highlight=False)
-    notes = pack_frames(
+    calibration = _calibrate(session, config, output_dir, console)
+    caches = pack_frames(
         session,
         calibration,
         output_dir,
-        config.masks,
         pseudo_rgb_nm=config.pseudo_rgb_nm,
         marker_range_nm=config.marker_range_nm,
         workers=config.workers,
         progress=progress,
     )
-    tally = PixelCounts.total(note.tally for note in notes)
-    wavelengths_nm = session.wavelengths_nm[calibration.bands]
-    values = sum(note.score.size for note in notes) * len(wavelengths_nm)
-    console.print(describe_pixel_counts(tally, values), highlight=False)
-
-    images = [note.gray for note in notes]
+    pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
+    num_values = sum(cache.score.size for cache in caches) * len(calibration.bands)
+    console.print(describe_pixel_counts(pixel_counts, num_values), highlight=False)
     poses = pose_frames(
         session,
-        images,
+        [cache.gray for cache in caches],
         facts,
         config.poses,
         config.features,
@@ -151,40 +154,18 @@ def process_session(
         estimate_poses,
         config.marker_range_nm,
     )
+    caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
-    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
-    used_notes = [note for note, posed in zip(notes, poses.used, strict=True) if posed]
-    masks = _make_masks(used_notes, camera_to_worlds, poses, container, config.masks)
-    for frame, mask in zip(frames, masks, strict=True):
-        write_png(frame.mask_path, mask.astype(np.uint8) * 255)
-        if not mask.any():
-            _log.warning("%s: nothing of the object was found in this frame (see report/masks.png)", frame.capture)
-    mask_picture(
-        output_dir / "report" / "masks.png",
-        [frame.pseudo_rgb() for frame in frames],
-        list(masks),
-        [frame.capture for frame in frames],
-    )
-    console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
-
-    bounds = object_box(
-        masks,
-        camera_to_worlds,
-        poses.intrinsics,
-        min_z_m=None if container is None else container.height_m,
-        margin_m=config.object_margin_m,
-    )
-    size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(bounds, axis=0)[0])
-    console.print(f"Object: inside a box of {size_mm} mm.")
+    masks = _write_masks(caches, frames, poses, container, config.masks, output_dir, console)
+    object_box_m, scene_box_m = _boxes(session, frames, masks, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
-        typical = calibration.uncertainty.standard_deviation(_mean_spectrum(frames, masks))
-    write_calibration(output_dir / REPORT_NAME, session, calibration, tally, typical)
+        typical = calibration.uncertainty.standard_deviation(object_spectrum(frames, masks))
+    write_calibration(output_dir / REPORT_NAME, session, calibration, pixel_counts, typical)
+
+    wavelengths_nm = session.wavelengths_nm[calibration.bands]
     widths_nm = session.frames[0].cube.fwhm_nm
-    diameter_m = session.info.container_diameter_m if poses.metric else None
-    if note := assumed_disc(bool(poses.marker_corners_m), diameter_m):
-        console.print(f"Scene: {note}.", highlight=False)
     dataset = PackedDataset(
         root=output_dir,
         intrinsics=poses.intrinsics,
@@ -193,27 +174,21 @@ def process_session(
         fwhm_nm=None if widths_nm is None else widths_nm[calibration.bands],
         pseudo_rgb_nm=wavelengths_nm[nearest_bands(wavelengths_nm, config.pseudo_rgb_nm)],
         object_name=session.info.object or session.path.resolve().name,
-        scene_box_m=scene_box(bounds, poses.marker_corners_m, container, config.scene_margin_m, diameter_m),
-        object_box_m=bounds,
-        background_reflectance=_background(frames, masks),
+        scene_box_m=scene_box_m,
+        object_box_m=object_box_m,
+        background_reflectance=background_spectrum(frames, masks),
         container=container,
         frames=tuple(frames),
-        flagged_values=sum(int(note.tally.flagged.sum()) for note in used_notes),
+        flagged_values=sum(int(cache.pixel_counts.flagged.sum()) for cache in caches),
         bad_bands_nm=np.delete(session.wavelengths_nm, calibration.bands),
         uncertainty=calibration.uncertainty,
         typical_uncertainty=typical,
-        fingerprint=stamp,
+        pose_method=poses.method,
+        fingerprint=fingerprint,
     )
     write_transforms(dataset)
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir
-
-
-def _check_settings(config: ProcessConfig) -> None:
-    bins = config.masks.spectral_bins
-    for option, value, least in (("workers", config.workers, 1), ("masks.spectral-bins", bins, 2)):
-        if value < least:
-            raise InputError(f"--{option} is {value}, but must be {least} or more; correct it.")
 
 
 def _named_files(config: ProcessConfig) -> list[Path]:
@@ -222,62 +197,80 @@ def _named_files(config: ProcessConfig) -> list[Path]:
     return ([] if panel is None else [panel]) + ([] if camera is None else [transforms_path(camera)])
 
 
-def _is_done(output_dir: Path, stamp: str) -> bool:
+def _is_up_to_date(output_dir: Path, fingerprint: str) -> bool:
     if not is_packed(output_dir):
         return False
     try:
-        return open_packed(output_dir).fingerprint == stamp
+        return open_packed(output_dir).fingerprint == fingerprint
     except InputError:  # an incomplete dataset is made again
         return False
 
 
-def _clear_transforms(output_dir: Path) -> None:
-    """Take away an outdated ``transforms.json``: its frames are about to change."""
+def _remove_transforms(output_dir: Path) -> None:
+    """Delete an outdated ``transforms.json``, whose frames are about to change.
+
+    Raises:
+        InputError: it belongs to another kind of dataset.
+    """
     transforms = output_dir / TRANSFORMS_NAME
     if transforms.exists() and not is_packed(output_dir):
         raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
     transforms.unlink(missing_ok=True)
 
 
-def _make_masks(
-    notes: Sequence[FrameNotes],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+def _calibrate(session: Session, config: ProcessConfig, output_dir: Path, console: Console) -> SessionCalibration:
+    """Calibrate the session, draw the calibration's pictures and print what was found."""
+    with console.status("measuring white, noise and lamps"):
+        calibration = calibrate_session(session, config.calibration)
+        draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
+    for sentence in describe_calibration(session, calibration):
+        console.print(sentence, highlight=False)
+    return calibration
+
+
+def _write_masks(
+    caches: Sequence[FrameCache],
+    frames: Sequence[PackedFrame],
     poses: TurntablePoses,
     container: Container | None,
     config: MaskConfig,
+    output_dir: Path,
+    console: Console,
 ) -> Bool[np.ndarray, "frames h w"]:
-    threshold = choose_threshold([note.score for note in notes], config)
-    distortion = np.array(poses.distortion, dtype=float)
-    masks = []
-    for note, pose in zip(notes, camera_to_worlds, strict=True):
-        allowed = above_lid(poses.intrinsics, distortion, pose, container, config.overhang) if container else None
-        body = foreground_mask(
-            note.score,
-            threshold,
-            allowed=allowed,
-            weak_share=config.weak_share,
-            morphology_fraction=config.morphology_fraction,
-        )
-        if config.shaded_share is not None:
-            shaded = shaded_parts(body, note.score, note.brightness, allowed=allowed, share=config.shaded_share)
-            body = fill_holes(body | shaded)
-        masks.append(body)
-    return np.stack(masks)
+    """Find, write and draw the foreground masks of the posed frames."""
+    regions = None
+    if container is not None:
+        distortion = np.array(poses.distortion, dtype=float)
+        regions = [
+            above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
+            for frame in frames
+        ]
+    masks = foreground_masks([c.score for c in caches], [c.brightness for c in caches], config, regions)
+    for frame, mask in zip(frames, masks, strict=True):
+        write_png(frame.mask_path, mask.astype(np.uint8) * 255)
+        if not mask.any():
+            _log.warning("%s: nothing of the object was found in this frame (see report/masks.png)", frame.capture)
+    images, names = [frame.pseudo_rgb() for frame in frames], [frame.capture for frame in frames]
+    mask_picture(output_dir / "report" / "masks.png", images, list(masks), names)
+    console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
+    return masks
 
 
-def _background(frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]) -> Float[np.ndarray, "bands"]:
-    """Median over frames of the spectra along the image's border; 0 in a band that no frame shows there."""
-    spectra = np.stack([border_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
-    shown = np.isfinite(spectra).any(axis=0)
-    background = np.zeros(spectra.shape[1])
-    background[shown] = np.nanmedian(spectra[:, shown], axis=0)
-    return background
-
-
-def _mean_spectrum(
-    frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]
-) -> Float[np.ndarray, "bands"]:
-    """Mean over frames of the object's spectrum; 0 in a band that no frame has."""
-    spectra = np.stack([object_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
-    shown = np.isfinite(spectra)
-    return np.where(shown, spectra, 0.0).sum(axis=0) / np.maximum(shown.sum(axis=0), 1)
+def _boxes(
+    session: Session,
+    frames: Sequence[PackedFrame],
+    masks: Bool[np.ndarray, "frames h w"],
+    poses: TurntablePoses,
+    container: Container | None,
+    console: Console,
+) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
+    """The boxes of the object and of everything that turns; print what they rest on."""
+    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
+    min_z_m = None if container is None else container.height_m
+    object_box_m = object_box(masks, camera_to_worlds, poses.intrinsics, min_z_m=min_z_m)
+    size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
+    console.print(f"Object: inside a box of {size_mm} mm.")
+    diameter_m = session.info.container_diameter_m if poses.metric else None
+    if assumption := assumed_disc(bool(poses.marker_corners_m), diameter_m):
+        console.print(f"Scene: {assumption}.", highlight=False)
+    return object_box_m, scene_box(object_box_m, poses.marker_corners_m, container, container_diameter_m=diameter_m)

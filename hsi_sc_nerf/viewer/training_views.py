@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame

@@ -16,9 +16,7 @@ from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.processing.calibrated_frames import pack_frames
-from hsi_sc_nerf.processing.frames import FramePaths
-from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.processing.frames import FramePaths, pack_frames
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -55,24 +53,11 @@ class Calibrated:
         return np.rot90(reflectance, turns), np.rot90(valid, turns), expected
 
 
-def pack(session: Session, calibration: SessionCalibration, root: Path) -> None:
-    pack_frames(
-        session,
-        calibration,
-        root,
-        MaskConfig(),
-        pseudo_rgb_nm=paper.PSEUDO_RGB_NM,
-        marker_range_nm=(450.0, 700.0),
-        workers=2,
-        progress=False,
-    )
-
-
 def calibrated(folder: Path, effects: list[str], config: CalibrationConfig) -> Calibrated:
     scene = override(load_scene("pear"), size_px=72, bands=68, frames=8, effects=effects)
     session = open_session(simulate_session(scene, folder / "session", progress=False))
     calibration = calibrate_session(session, config)
-    pack(session, calibration, folder / "data")
+    pack_frames(session, calibration, folder / "data")
     return Calibrated(session, load_truth(session.path), calibration, folder / "data")
 
 
@@ -261,7 +246,7 @@ def test_finished_reflectance_as_input(tmp_path):
     session = open_session(folder)
     calibration = calibrate_session(session, CalibrationConfig(white_source="product"))
     assert calibration.uncertainty is None
-    pack(session, calibration, tmp_path / "data")
+    pack_frames(session, calibration, tmp_path / "data")
     name = session.frames[0].name
     reflectance, _ = unpack(open_cube(FramePaths.of(tmp_path / "data", name).cube).memmap())
     np.testing.assert_allclose(reflectance, np.clip(truth.reflectance(name), 0.0, 1.0), atol=2e-4)

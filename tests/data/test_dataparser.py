@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
-from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 

@@ -116,7 +116,7 @@ def test_flagged_values_take_their_spectra_out():
         find_subspace(spoilt, deviation, valid)
 
 
-def test_pixel_noise_has_no_share_that_all_pixels_have_in_common():
+def test_pixel_noise_excludes_the_white_reference():
     uncertainty = ReflectanceUncertainty(np.full(2, 1e-6), np.array([0.0, 3e-6]), np.full(2, 1.0))
     noise = pixel_noise(uncertainty, np.array([[1.0, 1.0], [-0.1, -0.1]]))
     np.testing.assert_allclose(noise, [[1e-3, 2e-3], [1e-3, 1e-3]], rtol=1e-3)
@@ -144,7 +144,7 @@ def test_spectra_of_a_packed_dataset_are_sampled(tmp_path):
                 camera_to_world=np.eye(4),
             )
         )
-    spectra, valid = sample_training_spectra(frames, 400, foreground_share=0.25, seed=1)
+    spectra, valid = sample_training_spectra(frames, 400, foreground_fraction=0.25, seed=1)
     assert spectra.shape == valid.shape == (400, 3)
     assert (spectra[:, 0] > 0.75).sum() == 100
     assert 0 < (~valid).sum() == (spectra == 0).sum()

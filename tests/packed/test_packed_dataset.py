@@ -23,7 +23,6 @@ from hsi_sc_nerf.packed.cube import (
     write_packed_cube,
 )
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
-from hsi_sc_nerf.processing.frames import border_spectrum
 
 WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
 
@@ -229,14 +228,3 @@ def test_missing_files(tmp_path, dataset):
         with pytest.raises(InputError, match=rf"{folder}.b\.png: is missing"):
             open_packed(tmp_path)
         (tmp_path / "elsewhere.png").rename(tmp_path / folder / "b.png")
-
-
-def test_border_spectrum_is_the_background(tmp_path):
-    reflectance = np.full((64, 64, 3), 0.5)
-    reflectance[:2] = reflectance[-2:] = reflectance[:, :2] = reflectance[:, -2:] = [0.7, 0.8, 0.9]
-    foreground = np.zeros((64, 64), bool)
-    foreground[:40, 10:50] = True
-    reflectance[foreground] = 0.1
-    write_packed_cube(tmp_path / "c.hdr", pack(reflectance), WAVELENGTHS_NM)
-    np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), [0.7, 0.8, 0.9], atol=1e-4)
-    assert np.isnan(border_spectrum(tmp_path / "c.hdr", np.ones((64, 64), bool))).all()

@@ -1,4 +1,4 @@
-"""What one frame leaves behind in a packed dataset, and when it counts as finished."""
+"""The files of one frame in a packed dataset, and when it counts as finished."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pytest
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PixelCounts
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
-from hsi_sc_nerf.processing import frames
-from hsi_sc_nerf.processing.frames import FramePaths, border_spectrum, finished_notes, process_frame
-from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
+from hsi_sc_nerf.processing.frames import FramePaths, process_frame, read_cache
+from hsi_sc_nerf.processing.masks import foreground_score
 from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 
 WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
@@ -44,12 +43,12 @@ def cube(tmp_path):
 
 def process(cube, root, calibration=CALIBRATION, stamp="made"):
     paths = FramePaths.of(root, "frame")
-    return paths, process_frame(cube, calibration, paths, stamp, MaskConfig(smoothing_px=0.0), **PICTURES)
+    return paths, process_frame(cube, calibration, paths, stamp, **PICTURES)
 
 
 def test_everything_is_written_upright(cube, tmp_path):
     bands = np.array([0, 1, 2, 3, 4])
-    paths, notes = process(cube, tmp_path / "data", replace(CALIBRATION, bands=bands, quarter_turns=1))
+    paths, cache = process(cube, tmp_path / "data", replace(CALIBRATION, bands=bands, quarter_turns=1))
     packed = open_cube(paths.cube)
     assert packed.shape == (16, 20, 5)
     np.testing.assert_array_equal(packed.wavelengths_nm, WAVELENGTHS_NM[bands])
@@ -64,17 +63,18 @@ def test_everything_is_written_upright(cube, tmp_path):
     np.testing.assert_array_equal(flags, np.where(valid.all(axis=-1), 0, PixelFlag.SATURATED))
     picture = cv2.imread(str(paths.image))[..., ::-1]
     np.testing.assert_allclose(picture / 255.0, expected[..., [3, 2, 0]], atol=0.5 / 255 + 1e-4)
-    np.testing.assert_allclose(notes.gray / 255.0, expected[..., 1:5].mean(axis=-1), atol=0.5 / 255 + 1e-4)
-    np.testing.assert_allclose(notes.score, expected.std(axis=-1), atol=1e-4)
-    assert notes.tally.saturated.tolist() == [0, 0, 1, 0, 0]
-    assert notes.tally.clipped_low.min() > 0
+    np.testing.assert_allclose(cache.gray / 255.0, expected[..., 1:5].mean(axis=-1), atol=0.5 / 255 + 1e-4)
+    bins = np.moveaxis(expected, -1, 0).astype(np.float32)
+    np.testing.assert_allclose(cache.score, foreground_score(bins), atol=1e-4)
+    assert cache.pixel_counts.saturated.tolist() == [0, 0, 1, 0, 0]
+    assert cache.pixel_counts.clipped_low.min() > 0
     assert not list((tmp_path / "data").rglob("*partial*"))
 
 
 def test_finished_reflectance_goes_the_same_way(tmp_path):
     rng = np.random.default_rng(1)
     stored = rng.uniform(0.0, 10_000.0, (8, 6, BANDS)).astype(np.float32)
-    stored[2, 3] = -9999.0
+    stored[:5, :5] = -9999.0
     header = {"reflectance scale factor": 10_000, "data ignore value": -9999}
     path = tmp_path / "product.hdr"
     write_cube(path, stored, wavelengths_nm=WAVELENGTHS_NM, interleave="bsq", extra_header=header)
@@ -85,70 +85,55 @@ def test_finished_reflectance_goes_the_same_way(tmp_path):
         bands=np.arange(BANDS),
         ignore_value=cube.ignore_value,
     )
-    paths, notes = process(cube, tmp_path / "data", calibration)
+    paths, cache = process(cube, tmp_path / "data", calibration)
     reflectance, valid = unpack(open_cube(paths.cube).read())
     np.testing.assert_array_equal(valid, stored != -9999.0)
     np.testing.assert_allclose(reflectance[valid], stored[valid] / 10_000, atol=1e-5)
-    assert notes.tally.no_data.tolist() == [1] * BANDS
-    assert notes.score[2, 3] < 1e-6
+    assert cache.pixel_counts.no_data.tolist() == [25] * BANDS
+    assert cache.score[2, 2] < 1e-6
 
 
-def test_notes_of_a_finished_frame_are_read_again(cube, tmp_path):
-    paths, notes = process(cube, tmp_path / "data")
-    again = finished_notes(paths, "made")
+def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
+    paths, cache = process(cube, tmp_path / "data")
+    again = read_cache(paths, "made")
     assert again.fingerprint == "made"
-    np.testing.assert_array_equal(again.gray, notes.gray)
-    np.testing.assert_array_equal(again.score, notes.score)
+    np.testing.assert_array_equal(again.gray, cache.gray)
+    np.testing.assert_array_equal(again.score, cache.score)
     for field in fields(PixelCounts):
-        np.testing.assert_array_equal(getattr(again.tally, field.name), getattr(notes.tally, field.name))
-    assert finished_notes(paths, "other files") is None
+        np.testing.assert_array_equal(
+            getattr(again.pixel_counts, field.name), getattr(cache.pixel_counts, field.name)
+        )
+    assert read_cache(paths, "other files") is None
 
 
-@pytest.mark.parametrize("kind", ["image", "cube", "flags", "notes"])
+@pytest.mark.parametrize("kind", ["image", "cube", "flags", "cache"])
 def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
     paths, _ = process(cube, tmp_path / "data")
     getattr(paths, kind).unlink()
-    assert finished_notes(paths, "made") is None
+    assert read_cache(paths, "made") is None
 
 
-def test_notes_of_an_earlier_version_are_not_finished(cube, tmp_path):
-    paths, notes = process(cube, tmp_path / "data")
-    np.savez(paths.notes, fingerprint="made", gray=notes.gray, score=notes.score)
-    assert finished_notes(paths, "made") is None
+def test_a_cache_of_an_earlier_version_is_not_finished(cube, tmp_path):
+    paths, cache = process(cube, tmp_path / "data")
+    np.savez(paths.cache, fingerprint="made", gray=cache.gray, score=cache.score)
+    assert read_cache(paths, "made") is None
 
 
-def test_a_frame_whose_pictures_cannot_be_written_has_no_notes(cube, tmp_path):
+def test_a_frame_whose_pictures_cannot_be_written_has_no_cache(cube, tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "images").write_text("in the way")
     with pytest.raises(InputError, match="cannot be written"):
         process(cube, tmp_path / "data")
-    assert finished_notes(FramePaths.of(tmp_path / "data", "frame"), "made") is None
+    assert read_cache(FramePaths.of(tmp_path / "data", "frame"), "made") is None
 
 
-def test_notes_do_not_vouch_for_a_cube_of_other_settings(cube, tmp_path, monkeypatch):
+def test_a_cache_does_not_vouch_for_a_cube_of_other_settings(cube, tmp_path):
     paths, _ = process(cube, tmp_path / "data")
-
-    def stops(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(frames, "write_png", stops)
-    with pytest.raises(KeyboardInterrupt):
+    paths.image.unlink()
+    paths.image.mkdir()  # the cube is replaced, then the picture cannot be written
+    with pytest.raises(InputError, match="cannot be written"):
         process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
-    assert finished_notes(paths, "made") is None
-
-
-def test_border_spectrum_of_measured_values(tmp_path):
-    rng = np.random.default_rng(2)
-    reflectance = rng.random((12, 12, BANDS))
-    reflectance[rng.random(reflectance.shape) < 0.4] = np.nan
-    reflectance[..., 5] = np.nan
-    write_packed_cube(tmp_path / "c.hdr", pack(reflectance), WAVELENGTHS_NM)
-    foreground = np.zeros((12, 12), bool)
-    foreground[:5, :] = True
-    border = ~foreground
-    border[1:-1, 1:-1] = False
-    expected = np.append(np.nanmedian(reflectance[border][:, :5], axis=0), np.nan)
-    np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), expected, atol=1e-5)
+    assert not paths.cache.exists()
 
 
 def test_pictures_of_bands():

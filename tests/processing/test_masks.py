@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 from capture_factory import (
     INTRINSICS,
-    SPHERE_CENTRE_M,
-    SPHERE_RADIUS_M,
     frame_reflectance,
     sphere_mask,
     true_pose,
@@ -14,21 +12,25 @@ from capture_factory import (
 from scipy import ndimage
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, project, turntable_camera_to_world
-from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays
+from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing.masks import (
     MaskConfig,
     above_lid,
-    bin_width,
     brightness,
-    choose_threshold,
     foreground_mask,
+    foreground_masks,
     foreground_score,
+    mask_picture,
     otsu_threshold,
+    select_threshold,
     shaded_parts,
+    spectral_bin_width,
 )
-from hsi_sc_nerf.processing.report import mask_picture
-from hsi_sc_nerf.processing.scene_box import DISC_OVER_CONTAINER, assumed_disc, focus_point, object_box, scene_box
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import load_truth
 
 NO_DISTORTION = np.zeros(4)
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
@@ -41,17 +43,17 @@ def test_score_is_the_spread_over_bins():
     assert foreground_score(np.full((6, 4, 4), 0.4, np.float32)).max() < 1e-6
 
 
-@pytest.mark.parametrize(("bands", "spectral_bins", "width"), [(204, 24, 9), (12, 24, 1), (24, 24, 1), (25, 24, 2)])
-def test_bins_of_one_width(bands, spectral_bins, width):
-    assert bin_width(bands, spectral_bins) == width
+@pytest.mark.parametrize(("bands", "width"), [(204, 9), (12, 1), (24, 1), (25, 2)])
+def test_bins_of_one_width(bands, width):
+    assert spectral_bin_width(bands) == width
 
 
-def test_score_is_linear_in_the_share_of_a_pixel():
+def test_score_is_linear_in_the_fraction_of_a_mixed_pixel():
     plant = np.linspace(0.1, 0.6, 12)
-    shares = np.array([0.0, 0.25, 0.5, 1.0])
-    cube = (shares[:, None] * plant + (1 - shares[:, None]) * 0.8)[None].astype(np.float32)
+    fractions = np.array([0.0, 0.25, 0.5, 1.0])
+    cube = (fractions[:, None] * plant + (1 - fractions[:, None]) * 0.8)[None].astype(np.float32)
     score = foreground_score(np.moveaxis(cube, -1, 0), smoothing_px=0.0)[0]
-    np.testing.assert_allclose(score, shares * score[-1], atol=1e-6)
+    np.testing.assert_allclose(score, fractions * score[-1], atol=1e-6)
 
 
 def test_otsu_separates_two_classes_and_says_how_far_they_are_apart():
@@ -75,10 +77,10 @@ def test_otsu_agrees_with_opencv():
 def test_no_contrast():
     rng = np.random.default_rng(4)
     with pytest.raises(InputError, match="no object can be told from the background"):
-        choose_threshold([np.abs(rng.normal(0.0, 0.01, (30, 30)))], MaskConfig())
+        select_threshold([np.abs(rng.normal(0.0, 0.01, (30, 30)))])
     with pytest.raises(InputError, match="no object"):
-        choose_threshold([np.zeros((30, 30))], MaskConfig())
-    assert choose_threshold([np.zeros((30, 30))], MaskConfig(threshold=0.2)) == 0.2
+        select_threshold([np.zeros((30, 30))])
+    assert select_threshold([np.zeros((30, 30))], 0.2) == 0.2
 
 
 def test_mask_is_one_whole_region_with_its_stem():
@@ -94,10 +96,10 @@ def test_mask_is_one_whole_region_with_its_stem():
     expected[20:50, 15:45] = True
     expected[5:20, 30] = True
     np.testing.assert_array_equal(mask, expected)
-    assert not foreground_mask(score, 0.2, weak_share=1.0)[:20].any()
-    allowed = np.ones((60, 60), bool)
-    allowed[40:] = False
-    assert not foreground_mask(score, 0.2, allowed=allowed)[40:].any()
+    assert not foreground_mask(score, 0.2, weak_fraction=1.0)[:20].any()
+    region = np.ones((60, 60), bool)
+    region[40:] = False
+    assert not foreground_mask(score, 0.2, region=region)[40:].any()
     assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
 
 
@@ -121,10 +123,10 @@ def test_shaded_parts_are_told_by_spread_relative_to_brightness():
     rim = ball & ~ndimage.binary_erosion(ball)
     assert not (ball & (light > 0.15) & ~body & ~shaded & ~rim).any()
     assert (shaded & ~ball).sum() <= 4
-    assert not shaded_parts(body, score, bright, share=1.5).any()
+    assert not shaded_parts(body, score, bright, fraction=1.5).any()
     upper = np.zeros_like(ball)
     upper[:40] = True
-    assert not shaded_parts(body, score, bright, allowed=upper)[40:].any()
+    assert not shaded_parts(body, score, bright, region=upper)[40:].any()
 
 
 def test_shaded_parts_are_not_looked_for_before_a_dark_background():
@@ -141,7 +143,7 @@ def test_shaded_parts_are_not_looked_for_before_a_dark_background():
 def test_mask_of_a_sphere(angle_deg):
     score = foreground_score(np.moveaxis(frame_reflectance(angle_deg), -1, 0).astype(np.float32))
     truth = sphere_mask(true_pose(angle_deg))
-    mask = foreground_mask(score, choose_threshold([score], MaskConfig()))
+    (mask,) = foreground_masks([score], [score], MaskConfig(shaded_fraction=None))
     assert (mask & truth).sum() / (mask | truth).sum() > 0.97
 
 
@@ -182,94 +184,6 @@ def test_above_lid_undoes_lens_distortion():
     assert (bent != straight)[central].mean() > 2 * disagree
 
 
-def turn(count: int) -> np.ndarray:
-    return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
-
-
-def test_focus_point_is_where_the_cameras_look():
-    np.testing.assert_allclose(focus_point(turn(8)), [0.0, 0.0, 0.1], atol=1e-9)
-
-
-def test_object_box_of_a_sphere():
-    poses = turn(24)
-    intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
-    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics, margin_m=0.0)
-    truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
-    outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
-    assert outside.min() > -0.001
-    # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
-    assert outside[:, :2].max() < 0.005
-    np.testing.assert_allclose(
-        object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
-    )
-    assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
-
-
-@pytest.mark.parametrize("count", [4, 6, 8])
-def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
-    """Beyond the common field of view a voxel is in a few frames only, and in front of their masks by chance."""
-    start = look_at([0.42, 0.0, 0.23], [0.0, 0.0, 0.06])
-    poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
-    intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
-    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics, margin_m=0.0)
-    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
-
-
-def test_one_wrong_mask_does_not_cut_the_object():
-    poses = turn(24)
-    masks = np.stack([sphere_mask(pose) for pose in poses])
-    box = object_box(masks, poses, INTRINSICS)
-    masks[5] = False
-    assert np.abs(object_box(masks, poses, INTRINSICS) - box).max() < 0.01
-
-
-def test_box_keeps_a_part_thinner_than_a_voxel():
-    poses = turn(12)
-    stem = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.1, 0.17, 200)])
-    intrinsics = PinholeIntrinsics(160, 160, 300.0, 300.0, 80.0, 80.0)
-    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    for mask, pose in zip(masks, poses, strict=True):
-        x, y = project(stem, pose, intrinsics)[0].astype(int).T
-        mask[y, x] = True
-    assert 0.17 <= object_box(masks, poses, intrinsics, margin_m=0.0)[1, 2] < 0.18
-
-
-def test_masks_that_do_not_fit_the_poses():
-    poses = turn(6)
-    masks = np.zeros((6, 48, 48), bool)
-    with pytest.raises(InputError, match="do not fit each other"):
-        object_box(masks, poses, INTRINSICS)
-
-
-def test_scene_box_holds_all_that_turns():
-    corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
-    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
-    disc = 1.1 * np.hypot(0.12, 0.02)
-    reach = disc + 0.01
-    np.testing.assert_allclose(
-        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
-    )
-    wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
-    np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
-
-
-def test_without_markers_the_scene_box_holds_a_disc_as_wide_as_the_container_suggests():
-    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
-    reach = DISC_OVER_CONTAINER * CONTAINER.diameter_m / 2.0
-    assert reach > 0.205 / 2.0  # the simulator's disc
-    expected = [[-reach, -reach, 0.0], [reach, reach, 0.2]]
-    np.testing.assert_allclose(scene_box(obj, {}, CONTAINER, margin_m=0.0), expected)
-    np.testing.assert_allclose(
-        scene_box(obj, {}, None, margin_m=0.0, container_diameter_m=CONTAINER.diameter_m), expected
-    )
-    np.testing.assert_allclose(scene_box(obj, {}, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.02, 0.02, 0.2]])
-    assert assumed_disc(True, 0.09) is None
-    assert "207 mm" in assumed_disc(False, 0.09)
-    assert "masks' hull" in assumed_disc(False, None)
-
-
 def test_mask_picture_draws_each_outline(tmp_path):
     images = [np.full((30, 40, 3), 90, np.uint8)] * 4
     masks = [np.zeros((30, 40), bool) for _ in images]
@@ -281,3 +195,23 @@ def test_mask_picture_draws_each_outline(tmp_path):
     magenta = (sheet == [255, 0, 200]).all(-1)
     assert magenta[60:, :80].sum() > 40
     assert not magenta[:60].any()
+
+
+def test_the_shaded_underside_is_the_objects(tmp_path):
+    """A simulated session in the chamber's uneven light, where the fruit's underside lies in its own shade."""
+    effects = ("photon_noise", "read_noise", "chamber_shading")
+    scene = override(load_scene("apple"), frames=8, size_px=128, bands=24, effects=effects)
+    session = simulate_session(scene, tmp_path / "session", progress=False)
+    truth = load_truth(session)
+
+    def mean_overlap(config):
+        data = process_session(session, tmp_path / "data", ProcessConfig(masks=config), progress=False)
+        overlaps = []
+        for frame in open_packed(data).frames:
+            mask, covered = frame.mask(), truth.object_coverage(frame.capture) > 0.5
+            overlaps.append((mask & covered).sum() / (mask | covered).sum())
+        return np.mean(overlaps)
+
+    found = mean_overlap(MaskConfig())
+    assert found > 0.985
+    assert mean_overlap(MaskConfig(shaded_fraction=None)) < found - 0.015

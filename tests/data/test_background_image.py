@@ -1,17 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.data.static_background import (
+from hsi_sc_nerf.data.background_image import (
+    cell_pixels,
     estimate_static_background,
-    evenly_spread,
-    fill_in,
+    inpaint,
     median_over_frames,
-    pixel_of_cells,
-    quieten,
-    turning_outline,
-    turning_solids,
+    turntable_cylinders,
+    turntable_silhouette,
+    wiener_filter,
 )
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
@@ -79,13 +80,13 @@ def session(tmp_path):
     for frame, mask in zip(dataset.frames, masks, strict=True):
         cube = wall()
         cube[mask] = 0.0
-        table = turning_outline(turning_solids(dataset), frame.camera_to_world, LENS, np.zeros(4))
+        table = turntable_silhouette(dataset, frame.camera_to_world)
         cube[table] = rng.random((table.sum(), BANDS))
         cubes.append(pack(cube))
     return write_dataset(tmp_path, cubes, masks)
 
 
-def test_the_wall_is_found_and_its_hidden_part_filled_in(session):
+def test_the_wall_is_found_and_its_hidden_part_inpainted(session):
     found = estimate_static_background(session, session.frames)
     assert found.image.dtype == np.float32
     assert found.cell_px == 1
@@ -99,7 +100,7 @@ def test_the_wall_is_found_and_its_hidden_part_filled_in(session):
     assert 0.3 - 0.05 < found.image.min() < found.image.max() < 0.65 + 0.05
 
 
-def test_what_few_frames_show_is_filled_in(session):
+def test_what_few_frames_show_is_inpainted(session):
     found = estimate_static_background(session, session.frames, min_fraction=0.6)
     np.testing.assert_array_equal(found.coverage[4, [20, 24, 28, 40]], [0, 0, 0, 1])
 
@@ -150,54 +151,49 @@ def test_reads_no_more_frames_than_told(session):
     estimate_static_background(session, chosen, max_frames=4)
 
 
-def test_evenly_spread():
-    np.testing.assert_array_equal(evenly_spread(60, 4), [7, 22, 37, 52])
-    np.testing.assert_array_equal(evenly_spread(3, 12), [0, 1, 2])
-
-
 def test_pixels_of_cells_fill_the_cells():
     seen = np.zeros((10, 9), int)
-    for turn in range(16):
-        y, x = pixel_of_cells(10, 9, 4, turn)
+    for index in range(16):
+        y, x = cell_pixels(10, 9, 4, index)
         np.testing.assert_array_equal([y // 4, x // 4], [[0, 1, 2], [0, 1, 2]])
         seen[np.ix_(y, x)] += 1
     assert (seen[:8, :8] > 0).mean() > 0.7
     assert seen.max() <= 12
 
 
-def test_outline_of_the_turntable_is_where_rays_meet_it(tmp_path):
+def test_silhouette_of_the_turntable_is_where_rays_meet_it(tmp_path):
     lens = PinholeIntrinsics(160, 120, 220.0, 230.0, 78.0, 63.0)
     empty = np.zeros((lens.h, lens.w), bool)
     container = Container(0.06, 0.05)
     dataset = write_dataset(tmp_path, [np.zeros((lens.h, lens.w, 1), np.uint16)], [empty], lens, container)
     pose = dataset.frames[0].camera_to_world
-    outline = turning_outline(turning_solids(dataset), pose, lens, dataset.distortion)
+    silhouette = turntable_silhouette(dataset, pose)
     y, x = np.mgrid[: lens.h, : lens.w] + 0.5
     origin, directions = pixel_rays(lens, pose, np.stack([x, y], -1))
     steps = np.linspace(0.35, 0.8, 450)
-    met = np.zeros_like(outline)
+    met = np.zeros_like(silhouette)
     for t in steps:
         p = origin + t * directions
         radius = np.hypot(p[..., 0], p[..., 1])
         met |= (radius < 0.09) & (p[..., 2] > -0.005) & (p[..., 2] < 0.0)
         met |= (radius < 0.03 / np.cos(np.pi / 6)) & (p[..., 2] > 0.0) & (p[..., 2] < 0.05)
     assert 0.1 < met.mean() < 0.9
-    assert not (met & ~dilate(outline, 5)).any()
-    assert not (outline & ~dilate(met, 5)).any()
+    assert not (met & ~dilate(silhouette, 5)).any()
+    assert not (silhouette & ~dilate(met, 5)).any()
 
 
-def test_all_under_the_object_turns_where_the_container_is_not_known(tmp_path):
+def test_everything_below_the_object_turns_where_the_container_is_not_known(tmp_path):
     dataset = write_dataset(tmp_path, [np.zeros((LENS.h, LENS.w, 1), np.uint16)], [np.zeros((LENS.h, LENS.w), bool)])
-    (rims,) = turning_solids(dataset)
+    (rims,) = turntable_cylinders(dataset)
     np.testing.assert_allclose(np.hypot(rims[:, 0], rims[:, 1]), 0.09)
     np.testing.assert_allclose([rims[:, 2].min(), rims[:, 2].max()], [-0.005, 0.03])
 
 
-def test_lens_distortion_moves_the_outline(tmp_path):
+def test_lens_distortion_moves_the_silhouette(tmp_path):
     dataset = write_dataset(tmp_path, [np.zeros((LENS.h, LENS.w, 1), np.uint16)], [np.zeros((LENS.h, LENS.w), bool)])
     pose = dataset.frames[0].camera_to_world
-    plain = turning_outline(turning_solids(dataset), pose, LENS, np.zeros(4))
-    barrel = turning_outline(turning_solids(dataset), pose, LENS, np.array([-0.8, 0.0, 0.0, 0.0]))
+    plain = turntable_silhouette(dataset, pose)
+    barrel = turntable_silhouette(replace(dataset, distortion=np.array([-0.8, 0.0, 0.0, 0.0])), pose)
     assert barrel.sum() < 0.97 * plain.sum()
 
 
@@ -206,7 +202,7 @@ def test_median_over_frames_agrees_with_numpy():
     counts = rng.integers(0, 50_000, (9, 40, 4), dtype=np.uint16)
     counts[rng.random(counts.shape) < 0.3] = FLAGGED
     free = rng.random((9, 40)) < 0.7
-    median, variance = median_over_frames(counts, free, least=2)
+    median, variance = median_over_frames(counts, free, min_frames=2)
     for cell in range(40):
         for band in range(4):
             value = counts[free[:, cell], cell, band]
@@ -223,59 +219,59 @@ def test_median_over_frames_agrees_with_numpy():
 def test_variance_of_the_median_is_what_noise_gives_it():
     rng = np.random.default_rng(2)
     counts = pack(0.5 + 0.02 * rng.standard_normal((12, 20_000, 1)))
-    median, variance = median_over_frames(counts, np.ones((12, 20_000), bool), least=1)
+    median, variance = median_over_frames(counts, np.ones((12, 20_000), bool), min_frames=1)
     assert variance.mean() == pytest.approx(median.var(), rel=0.15)
 
 
-def test_quieten_averages_noise_and_keeps_edges():
+def test_wiener_filter_averages_noise_and_keeps_edges():
     rng = np.random.default_rng(3)
     clean = np.full((60, 60, 2), 0.4)
     clean[:, 30:] = 0.8
     noisy = (clean + 0.01 * rng.standard_normal(clean.shape)).astype(np.float32)
-    quiet = quieten(noisy, np.full(clean.shape, 1e-4, np.float32), 5)
+    filtered = wiener_filter(noisy, np.full(clean.shape, 1e-4, np.float32), 5)
     far = np.abs(np.arange(60) - 29.5) > 4
-    assert np.sqrt(np.mean((quiet - clean)[:, far] ** 2)) < 0.35 * 0.01
-    assert np.abs(quiet - clean)[:, ~far].max() < 0.05
+    assert np.sqrt(np.mean((filtered - clean)[:, far] ** 2)) < 0.35 * 0.01
+    assert np.abs(filtered - clean)[:, ~far].max() < 0.05
 
 
-def test_quieten_leaves_a_picture_without_noise_and_what_is_not_measured():
+def test_wiener_filter_keeps_an_image_without_noise_and_values_that_are_not_measured():
     rng = np.random.default_rng(4)
     image = rng.random((20, 20, 2)).astype(np.float32)
     image[5:9, 5:9, 0] = np.nan
-    np.testing.assert_allclose(quieten(image, np.zeros_like(image), 5), image, atol=1e-6)
+    np.testing.assert_allclose(wiener_filter(image, np.zeros_like(image), 5), image, atol=1e-6)
     lonely = np.full((9, 9, 1), np.nan, np.float32)
     lonely[4, 4] = 0.25
-    np.testing.assert_allclose(quieten(lonely, np.ones_like(lonely), 3), lonely, atol=1e-6)
+    np.testing.assert_allclose(wiener_filter(lonely, np.ones_like(lonely), 3), lonely, atol=1e-6)
 
 
-def test_quieten_does_not_mix_bands():
+def test_wiener_filter_does_not_mix_bands():
     image = np.zeros((12, 12, 3), np.float32)
     image[..., 1] = 1.0
-    quiet = quieten(image, np.full_like(image, 0.01), 5)
-    np.testing.assert_allclose(quiet, image, atol=1e-6)
+    filtered = wiener_filter(image, np.full_like(image, 0.01), 5)
+    np.testing.assert_allclose(filtered, image, atol=1e-6)
 
 
-def test_fill_in_keeps_a_ramp_and_every_filled_cell_is_its_neighbours_mean():
+def test_inpainting_keeps_a_ramp_and_every_inpainted_cell_is_its_neighbours_mean():
     y, x = np.mgrid[:20, :24]
     ramp = np.stack([x + 2.0 * y, np.ones_like(x, float), -0.5 * x], -1)
     image = ramp.copy()
     image[5:15, 6:18] = np.nan
     image[2, 3, 1] = np.nan
-    np.testing.assert_allclose(fill_in(image, np.zeros(3)), ramp, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(inpaint(image, np.zeros(3)), ramp, rtol=1e-5, atol=1e-5)
 
     rng = np.random.default_rng(5)
     image = rng.random((12, 10, 1))
     hidden = rng.random((12, 10)) < 0.5
     image[hidden] = np.nan
-    filled = fill_in(image, np.zeros(1))[..., 0]
+    filled = inpaint(image, np.zeros(1))[..., 0]
     np.testing.assert_allclose(filled[~hidden], image[~hidden, 0], rtol=1e-6)
     for i, j in np.argwhere(hidden):
         near = [(i + a, j + b) for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0)) if 0 <= i + a < 12 and 0 <= j + b < 10]
-        assert filled[i, j] == pytest.approx(np.mean([filled[place] for place in near]), abs=1e-5)
+        assert filled[i, j] == pytest.approx(np.mean([filled[cell] for cell in near]), abs=1e-5)
 
 
-def test_fill_in_without_anything_measured():
-    filled = fill_in(np.full((4, 5, 2), np.nan, np.float32), np.array([0.1, 0.9]))
+def test_inpainting_without_anything_measured():
+    filled = inpaint(np.full((4, 5, 2), np.nan, np.float32), np.array([0.1, 0.9]))
     np.testing.assert_allclose(filled, np.broadcast_to([0.1, 0.9], (4, 5, 2)))
 
 
@@ -284,8 +280,6 @@ def test_held_out_frames_see_the_same_chamber(tiny_dataset):
     held_out = dataset.frames[4]
     found = estimate_static_background(dataset, [frame for frame in dataset.frames if frame is not held_out])
     reflectance, _ = unpack(np.array(held_out.cube()))
-    solids = turning_solids(dataset)
-    outline = turning_outline(solids, held_out.camera_to_world, dataset.intrinsics, dataset.distortion)
-    static = ~dilate(held_out.mask() | outline, 3)
+    static = ~dilate(held_out.mask() | turntable_silhouette(dataset, held_out.camera_to_world), 3)
     assert 0.3 < static.mean() < 0.9
     assert np.sqrt(np.mean((found.image - reflectance)[static] ** 2)) < 1e-3

@@ -1,0 +1,247 @@
+"""An image of the chamber behind the turntable, estimated from the frames.
+
+The camera stands still, so the median over the frames of the pixels that show neither object nor turntable is the
+chamber without noise. Pixels that no frame shows are inpainted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt16
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+from hsi_sc_nerf.packed.pixels import PixelReader
+from hsi_sc_nerf.processing.region_spectra import median_of_smallest
+
+MARGIN_FRACTION = 0.01
+"""Object and turntable are dilated by this fraction of the image's shorter side, because their edges are blurred."""
+SMOOTHING_CELLS = 5
+"""Side of the Wiener filter's window."""
+_MEDIAN_VARIANCE = np.pi / 2.0
+"""Variance of the median of many normal values, as a multiple of their mean's."""
+_SIGMA_OF_MAD = 1.4826
+"""Standard deviation of a normal distribution, as a multiple of its median absolute deviation."""
+# Multiples of these fill a square evenly (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
+# 2018).
+_QUASIRANDOM_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
+
+
+@dataclass(frozen=True, eq=False)
+class StaticBackground:
+    """The chamber as the camera sees it.
+
+    Attributes:
+        image: reflectance.
+        coverage: fraction of the frames read that show the chamber there; 0 where it was inpainted.
+        cell_px: side of a cell in pixels of the camera's image; cells count from the image's upper left corner.
+    """
+
+    image: Float[np.ndarray, "lines samples bands"]
+    coverage: Float[np.ndarray, "lines samples"]
+    cell_px: int
+
+
+def estimate_static_background(
+    dataset: PackedDataset,
+    frames: Sequence[PackedFrame],
+    *,
+    max_frames: int = 12,
+    max_cells: int = 128,
+    min_fraction: float = 0.2,
+) -> StaticBackground:
+    """The chamber behind the turntable, on a coarse grid over the camera's image.
+
+    Each frame contributes another single pixel of a cell, so that memory and reading do not grow with the image.
+    Pixels count outside of the object's mask and of the turntable's silhouette, and of their values those that are
+    measurements. Bands that are measured nowhere take ``dataset.background_reflectance``.
+
+    Args:
+        dataset: its camera, boxes and container.
+        frames: the frames that may be read (training frames).
+        max_frames: number of frames that are read, evenly spread over the session.
+        max_cells: cells of the image along its longer side.
+        min_fraction: fraction of the frames read that has to show the chamber at a cell; other cells are inpainted.
+
+    Example:
+        >>> dataset = open_packed("apple_01-data")
+        >>> estimate_static_background(dataset, dataset.frames).image.shape
+        (128, 128, 204)
+    """
+    count = min(len(frames), max_frames)
+    chosen = [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]
+    height, width = dataset.intrinsics.h, dataset.intrinsics.w
+    cell_px = -(-max(width, height) // max_cells)
+    margin_px = 2 * max(1, round(MARGIN_FRACTION * min(width, height))) + 1
+    pixels = [cell_pixels(height, width, cell_px, k) for k in range(count)]
+    free = np.empty((count, len(pixels[0][0]), len(pixels[0][1])), bool)
+    for k, (frame, (y, x)) in enumerate(zip(chosen, pixels, strict=True)):
+        turning = frame.mask() | turntable_silhouette(dataset, frame.camera_to_world)
+        free[k] = ~dilate(turning, margin_px)[np.ix_(y, x)]
+
+    min_frames = max(1, int(np.ceil(min_fraction * count)))
+    with closing(PixelReader(frame.cube() for frame in chosen)) as reader:
+        image = np.empty((*free.shape[1:], reader.shape[2]), np.float32)
+        variance = np.empty_like(image)
+        for line in range(len(image)):
+            indices = [np.stack(np.broadcast_arrays(k, y[line], x), axis=-1) for k, (y, x) in enumerate(pixels)]
+            counts = reader.read(np.concatenate(indices)).reshape(count, len(image[0]), -1)
+            image[line], variance[line] = median_over_frames(counts, free[:, line], min_frames)
+    image = wiener_filter(image, variance, SMOOTHING_CELLS)
+    return StaticBackground(
+        image=inpaint(image, dataset.background_reflectance),
+        coverage=np.where(free.sum(axis=0) >= min_frames, free.mean(axis=0), 0.0).astype(np.float32),
+        cell_px=cell_px,
+    )
+
+
+def cell_pixels(
+    lines: int, samples: int, cell_px: int, index: int
+) -> tuple[Int[np.ndarray, "cells_down"], Int[np.ndarray, "cells_across"]]:
+    """Lines and samples of the pixel that represents each cell in frame ``index``; indices fill the cells evenly.
+
+    Cells that reach beyond the image's far borders are represented by their last pixel inside it.
+    """
+    offset = (cell_px * ((0.5 + _QUASIRANDOM_STEPS * index) % 1.0)).astype(int)
+    down, across = np.arange(0, lines, cell_px) + offset[0], np.arange(0, samples, cell_px) + offset[1]
+    return np.minimum(down, lines - 1), np.minimum(across, samples - 1)
+
+
+def turntable_silhouette(
+    dataset: PackedDataset, camera_to_world: Float[np.ndarray, "4 4"]
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of a camera that show the turntable's disc or the container (`turntable_cylinders`)."""
+    silhouette = np.zeros((dataset.intrinsics.h, dataset.intrinsics.w), np.uint8)
+    to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
+    matrix = dataset.intrinsics.matrix()
+    for points in turntable_cylinders(dataset):
+        in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+        pixels, _ = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), matrix, dataset.distortion)
+        # OpenCV draws in coordinates whose origin is the first pixel's centre.
+        cv2.fillConvexPoly(silhouette, cv2.convexHull(np.rint(pixels[:, 0] - 0.5).astype(np.int32)), 1)
+    return silhouette > 0
+
+
+def turntable_cylinders(dataset: PackedDataset) -> list[Float[np.ndarray, "points 3"]]:
+    """Points on the rims of upright cylinders that hold the disc and the container, object frame, metres.
+
+    Where the container's size is not known, one cylinder holds everything below the object. Flat markers around the
+    container stand off its wall at their corners, so its cylinder is the one around that prism.
+    """
+    reach = np.abs(dataset.scene_box_m[:, :2]).max()
+    lowest, container = dataset.scene_box_m[0, 2], dataset.container
+    if container is None:
+        return [_rims(reach, lowest, dataset.object_box_m[0, 2])]
+    prism_radius = container.diameter_m / 2.0 / np.cos(np.pi / paper.CONTAINER_MARKERS)
+    return [_rims(reach, lowest, 0.0), _rims(prism_radius, 0.0, container.height_m)]
+
+
+def median_over_frames(
+    counts: UInt16[np.ndarray, "frames *cells bands"], free: Bool[np.ndarray, "frames *cells"], min_frames: int
+) -> tuple[Float[np.ndarray, "*cells bands"], Float[np.ndarray, "*cells bands"]]:
+    """Median reflectance over the frames and its variance due to noise; nan where too few frames show the chamber.
+
+    Args:
+        counts: packed reflectance; ``FLAGGED`` values are left out.
+        free: where a frame shows the chamber.
+        min_frames: number of values that a median needs.
+
+    Returns:
+        Medians, and their variances by the median absolute deviation over the frames (0 for a single frame).
+    """
+    values = np.where(free[..., None] & (counts != FLAGGED), counts, np.inf).astype(np.float32)
+    number = np.isfinite(values).sum(axis=0)
+    number[number < min_frames] = 0
+    median = median_of_smallest(values, number)
+    with np.errstate(invalid="ignore"):
+        # Infinite where not measured, nan where there is no median: both are sorted to the end.
+        deviation = np.abs(values - median)
+    sigma = _SIGMA_OF_MAD * median_of_smallest(deviation, number) / REFLECTANCE_SCALE
+    return median / REFLECTANCE_SCALE, _MEDIAN_VARIANCE * sigma**2 / np.maximum(number, 1)
+
+
+def wiener_filter(
+    image: Float[np.ndarray, "lines samples bands"], variance: Float[np.ndarray, "lines samples bands"], window: int
+) -> Float[np.ndarray, "lines samples bands"]:
+    """Local Wiener filter of each band: values are averaged where they differ no more than by their noise.
+
+    J.-S. Lee, "Digital image enhancement and noise filtering by use of local statistics", IEEE TPAMI 2, 1980. Values
+    that are not measured (nan) are left out and stay nan.
+
+    Args:
+        image: with noise.
+        variance: of the noise of each value.
+        window: side of the neighbourhood, odd.
+    """
+    measured = np.isfinite(image)
+    number = _window_sum(measured.astype(np.float32), window)
+
+    def local_mean(values: Float[np.ndarray, "lines samples bands"]) -> Float[np.ndarray, "lines samples bands"]:
+        return _window_sum(np.where(measured, values, 0.0), window) / np.maximum(number, 1.0)
+
+    mean = local_mean(image)
+    # Deviations from the mean of each band keep single precision from cancelling.
+    offset = np.where(measured, image, 0.0).sum(axis=(0, 1)) / np.maximum(measured.sum(axis=(0, 1)), 1)
+    local_variance = local_mean((image - offset) ** 2) - (mean - offset) ** 2
+    signal = np.maximum(1.0 - local_mean(variance) / np.maximum(local_variance, np.finfo(np.float32).tiny), 0.0)
+    return np.where(measured, mean + signal * (image - mean), np.nan).astype(np.float32)
+
+
+def inpaint(
+    image: Float[np.ndarray, "lines samples bands"], spectrum: Float[np.ndarray, "bands"]
+) -> Float[np.ndarray, "lines samples bands"]:
+    """Replace values that are not measured (nan) by the solution of Laplace's equation, each band alone.
+
+    Every inpainted value is the mean of its neighbours. A band that is measured nowhere takes its value of
+    ``spectrum``.
+    """
+    filled = np.array(image, dtype=np.float32)
+    flat = filled.reshape(-1, filled.shape[-1])
+    missing = np.isnan(flat)
+    nowhere = missing.all(axis=0)
+    flat[:, nowhere] = spectrum[nowhere]
+    # Bands that miss the same cells, nearly always all of them, share their system of equations.
+    bands_by_pattern: dict[bytes, list[int]] = {}
+    for band in np.flatnonzero(missing.any(axis=0) & ~nowhere):
+        bands_by_pattern.setdefault(missing[:, band].tobytes(), []).append(int(band))
+    laplacian = _grid_laplacian(*image.shape[:2])
+    for bands in map(np.array, bands_by_pattern.values()):
+        unknown = missing[:, bands[0]]
+        rows = laplacian[unknown]
+        right_side = -(rows[:, ~unknown] @ flat[np.ix_(~unknown, bands)].astype(float))
+        flat[np.ix_(unknown, bands)] = splu(rows[:, unknown].tocsc()).solve(right_side)
+    return filled
+
+
+def _rims(radius_m: float, low_m: float, high_m: float, points: int = 64) -> Float[np.ndarray, "points 3"]:
+    angle = 2.0 * np.pi * np.arange(points) / points
+    circle = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([np.insert(circle, 2, height, axis=1) for height in (low_m, high_m)])
+
+
+def _window_sum(values: Float[np.ndarray, "lines samples bands"], window: int) -> Float[np.ndarray, "..."]:
+    means = ndimage.uniform_filter(values, (window, window, 1), mode="constant")
+    return means * np.float32(window**2)
+
+
+def _grid_laplacian(lines: int, samples: int) -> sparse.csr_array:
+    """Number of neighbours minus the neighbours' sum, for the cells of a grid, line by line."""
+
+    def chain(length: int) -> sparse.dia_array:
+        degree = np.full(length, 2.0)
+        degree[[0, -1]] -= 1.0
+        return sparse.diags_array([degree, *[np.full(length - 1, -1.0)] * 2], offsets=[0, 1, -1])
+
+    return sparse.csr_array(
+        sparse.kron(chain(lines), sparse.eye_array(samples)) + sparse.kron(sparse.eye_array(lines), chain(samples))
+    )

@@ -1,0 +1,109 @@
+"""Boxes of the object and of everything that turns, from masks and poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from capture_factory import INTRINSICS, SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_pose
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, project, turntable_camera_to_world
+from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.scene_box import (
+    DISC_OVER_CONTAINER,
+    DISC_OVER_MARKERS,
+    assumed_disc,
+    focus_point,
+    object_box,
+    scene_box,
+)
+
+CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+
+
+def turn(count: int) -> np.ndarray:
+    return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
+
+
+def test_focus_point_is_where_the_cameras_look():
+    np.testing.assert_allclose(focus_point(turn(8)), [0.0, 0.0, 0.1], atol=1e-9)
+
+
+def test_object_box_of_a_sphere():
+    poses = turn(24)
+    intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
+    outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
+    assert outside.min() > -0.001
+    # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
+    assert outside[:, :2].max() < 0.005
+    np.testing.assert_allclose(
+        object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
+    )
+    assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
+    """Beyond the common field of view a voxel is in a few frames only, and in front of their masks by chance."""
+    start = look_at([0.42, 0.0, 0.23], [0.0, 0.0, 0.06])
+    poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
+    intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
+
+
+def test_one_wrong_mask_does_not_cut_the_object():
+    poses = turn(24)
+    masks = np.stack([sphere_mask(pose) for pose in poses])
+    box = object_box(masks, poses, INTRINSICS)
+    masks[5] = False
+    assert np.abs(object_box(masks, poses, INTRINSICS) - box).max() < 0.01
+
+
+def test_box_keeps_a_part_thinner_than_a_voxel():
+    poses = turn(12)
+    stem = np.column_stack([np.zeros(200), np.zeros(200), np.linspace(0.1, 0.17, 200)])
+    intrinsics = PinholeIntrinsics(160, 160, 300.0, 300.0, 80.0, 80.0)
+    masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
+    for mask, pose in zip(masks, poses, strict=True):
+        x, y = project(stem, pose, intrinsics)[0].astype(int).T
+        mask[y, x] = True
+    assert 0.17 <= object_box(masks, poses, intrinsics, margin_m=0.0)[1, 2] < 0.18
+
+
+def test_masks_that_do_not_fit_the_poses():
+    poses = turn(6)
+    masks = np.zeros((6, 48, 48), bool)
+    with pytest.raises(InputError, match="do not fit each other"):
+        object_box(masks, poses, INTRINSICS)
+
+
+def test_scene_box_holds_all_that_turns():
+    corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    disc = DISC_OVER_MARKERS * np.hypot(0.12, 0.02)
+    reach = disc + 0.01
+    np.testing.assert_allclose(
+        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
+    )
+    wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
+
+
+def test_without_markers_the_scene_box_holds_a_disc_as_wide_as_the_container_suggests():
+    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+    reach = DISC_OVER_CONTAINER * CONTAINER.diameter_m / 2.0
+    assert reach > 0.205 / 2.0  # the simulator's disc
+    expected = [[-reach, -reach, 0.0], [reach, reach, 0.2]]
+    np.testing.assert_allclose(scene_box(obj, {}, CONTAINER, margin_m=0.0), expected)
+    np.testing.assert_allclose(
+        scene_box(obj, {}, None, margin_m=0.0, container_diameter_m=CONTAINER.diameter_m), expected
+    )
+    np.testing.assert_allclose(scene_box(obj, {}, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.02, 0.02, 0.2]])
+    assert assumed_disc(True, 0.09) is None
+    assert "207 mm" in assumed_disc(False, 0.09)
+    assert "masks' hull" in assumed_disc(False, None)
