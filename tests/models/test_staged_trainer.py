@@ -21,7 +21,8 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 
     def next_train(step):
         rays, batch = original(step)
-        beside = sum(0 < from_object[f][line, sample] < BOUNDARY_PX + 1 for f, line, sample in batch["indices"].tolist())
+        distances = [from_object[f][line, sample] for f, line, sample in batch["indices"].tolist()]
+        beside = sum(0 < distance < BOUNDARY_PX + 1 for distance in distances)
         seen.append((made.pipeline.model.camera_optimizer.frozen, int(batch["mask"].sum()), beside))
         return rays, batch
 
