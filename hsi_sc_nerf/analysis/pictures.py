@@ -62,9 +62,9 @@ class SideViews:
     def of(self, values: Float[np.ndarray, "v *channels"]) -> list[Float[np.ndarray, "h w *channels"]]:
         """Values at vertices as pictures, a side each, mixed linearly within triangles; NaN beside the object."""
         pictures = []
-        for hit, triangle, share in self.sides:
+        for hit, triangle, barycentric in self.sides:
             corners = values[self._mesh.triangles[triangle]]
-            mixed = np.einsum("hwc,hwc...->hw...", share, corners)
+            mixed = np.einsum("hwc,hwc...->hw...", barycentric, corners)
             mixed[~hit] = np.nan
             pictures.append(mixed)
         return pictures

@@ -12,7 +12,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
-from hsi_sc_nerf.evaluation.threshold_curves import ThresholdCurves
+from hsi_sc_nerf.evaluation.spatial import ThresholdCurves
 from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
 from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure
 

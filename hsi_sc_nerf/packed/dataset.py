@@ -104,6 +104,7 @@ class PackedDataset:
         fwhm_nm: full widths at half maximum of the bands; None if they are unknown.
         uncertainty: of the reflectance; None if it is unknown (finished reflectance).
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
+        pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         fingerprint: of the session and the settings that the dataset was made from.
     """
 
@@ -124,6 +125,7 @@ class PackedDataset:
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     fingerprint: str | None = None
+    pose_method: str | None = None
 
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
@@ -199,6 +201,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         "object_box_m": dataset.object_box_m.tolist(),
         "container": None if dataset.container is None else asdict(dataset.container),
         "fingerprint": dataset.fingerprint,
+        "pose_method": dataset.pose_method,
         "wavelengths_nm": dataset.wavelengths_nm.tolist(),
         "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
         "background_reflectance": dataset.background_reflectance.tolist(),
@@ -283,4 +286,5 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
             for frame in content["frames"]
         ),
         fingerprint=content.get("fingerprint"),
+        pose_method=content.get("pose_method"),
     )

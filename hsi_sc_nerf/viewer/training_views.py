@@ -10,7 +10,7 @@ from torch import Tensor
 from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.models.camera_background import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.cube import unpack
 
 SAME_PLACE = 1e-4
