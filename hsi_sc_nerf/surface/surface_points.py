@@ -120,7 +120,7 @@ def sample_surface_points(
         triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
         parts = even_points(mesh.vertices, triangles, num_points, keep, seed)
     if not parts:
-        raise InputError("no point of the object lies in the region that was asked for; make it larger.")
+        raise InputError("no point of the object lies in the selected region; make it larger.")
     return SurfacePoints.concatenate(parts)
 
 
