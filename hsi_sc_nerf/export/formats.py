@@ -52,7 +52,8 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
         ValueError: the chunks do not fit together.
 
     Example:
-        >>> write_cloud(Path("out/point_cloud"), stream(read_spectral_ply("point_cloud.ply")), "netcdf")
+        >>> cloud = read_spectral_ply("point_cloud.ply")
+        >>> write_cloud(Path("out/point_cloud"), stream(cloud), "netcdf")
         PosixPath('out/point_cloud.nc')
     """
     path = require_format(path_without_suffix, file_format, len(cloud.wavelengths_nm), len(cloud.extra_names))
