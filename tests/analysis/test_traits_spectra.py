@@ -15,7 +15,7 @@ from hsi_sc_nerf.analysis.classes import (
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.regions import PickedRegion, picked_region, read_regions, weighted_mean_and_sd
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, vertex_normals, with_spectra, write_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra, write_mesh
 from hsi_sc_nerf.analysis.traits import WHOLE, analyse, classified
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
@@ -51,7 +51,7 @@ def test_areas_of_vertices_add_up():
 def test_normals_point_outwards():
     mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
     middle = mesh.vertices - [0.0, 0.0, 0.02]
-    assert ((vertex_normals(mesh) * middle).sum(axis=1) > 0.0).all()
+    assert ((mesh.vertex_normals() * middle).sum(axis=1) > 0.0).all()
 
 
 def test_class_areas_and_regions_of_two_halves():
