@@ -33,6 +33,12 @@ class SpectralCloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, rows: np.ndarray | slice) -> SpectralCloud:
+        """The points that a slice, an index or a boolean array selects."""
+        arrays = (array[rows] for array in (self.points, self.normals, self.colours, self.spectra))
+        extra = {name: column[rows] for name, column in self.extra.items()}
+        return SpectralCloud(*arrays, self.wavelengths_nm, extra)
+
     def check(self) -> None:
         """Raise ValueError if the arrays' shapes do not fit together."""
         count = len(self.points)
@@ -88,20 +94,8 @@ def stream(cloud: SpectralCloud, chunk_points: int = CHUNK_POINTS) -> CloudStrea
         ValueError: the arrays' shapes do not fit together.
     """
     cloud.check()
-
-    def chunks() -> Iterator[SpectralCloud]:
-        for start in range(0, len(cloud), chunk_points):
-            rows = slice(start, start + chunk_points)
-            yield SpectralCloud(
-                cloud.points[rows],
-                cloud.normals[rows],
-                cloud.colours[rows],
-                cloud.spectra[rows],
-                cloud.wavelengths_nm,
-                {name: column[rows] for name, column in cloud.extra.items()},
-            )
-
-    return CloudStream(len(cloud), cloud.wavelengths_nm, tuple(cloud.extra), chunks())
+    chunks = (cloud.select(slice(start, start + chunk_points)) for start in range(0, len(cloud), chunk_points))
+    return CloudStream(len(cloud), cloud.wavelengths_nm, tuple(cloud.extra), chunks)
 
 
 def statistical_inliers(points: Float[np.ndarray, "n 3"], std_ratio: float) -> Int[np.ndarray, "inliers"]:

@@ -11,9 +11,8 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -39,7 +38,9 @@ _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for
 _COLOURS = ("red", "green", "blue")
 _EIGHT_TO_SIXTEEN_BITS = 257
 
+_NORMALS = ("nx", "ny", "nz")
 _TABLE_ATTRIBUTES = {"title": "spectral point cloud", "frame": "object: z along the turntable's axis, up; metres"}
+_REFLECTANCE_ATTRIBUTES = {"units": "1", "long_name": "reflectance", "coordinates": "x y z"}
 _WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band"}
 
 
@@ -51,7 +52,8 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
         ValueError: the chunks do not fit together.
 
     Example:
-        >>> write_cloud(Path("out/point_cloud"), stream(read_spectral_ply("point_cloud.ply")), "netcdf")
+        >>> cloud = read_spectral_ply("point_cloud.ply")
+        >>> write_cloud(Path("out/point_cloud"), stream(cloud), "netcdf")
         PosixPath('out/point_cloud.nc')
     """
     path = require_format(path_without_suffix, file_format, len(cloud.wavelengths_nm), len(cloud.extra_names))
@@ -126,48 +128,38 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
             writer.write_points(record)
 
 
-@dataclass(frozen=True)
-class _Variable:
-    """A variable of a table with one row a point."""
+def _columns(chunk: SpectralCloud) -> dict[str, np.ndarray]:
+    """The variables of a table, each with one row a point."""
+    return {
+        "reflectance": chunk.spectra,
+        **dict(zip("xyz", chunk.points.T, strict=True)),
+        **dict(zip(_NORMALS, chunk.normals.T, strict=True)),
+        **dict(zip(_COLOURS, chunk.colours.T, strict=True)),
+        **chunk.extra,
+    }
 
-    name: str
-    rows_of: Callable[[SpectralCloud], np.ndarray]
-    dtype: str = "<f4"
-    dimensions: tuple[str, ...] = ("point",)
-    attributes: dict[str, str] = field(default_factory=dict)
 
-
-def _variables(cloud: CloudStream) -> list[_Variable]:
-    def column(name: str, axis: int) -> Callable[[SpectralCloud], np.ndarray]:
-        return lambda chunk: getattr(chunk, name)[:, axis]
-
-    def extra(name: str) -> Callable[[SpectralCloud], np.ndarray]:
-        return lambda chunk: chunk.extra[name]
-
-    reflectance = {"units": "1", "long_name": "reflectance", "coordinates": "x y z"}
-    return [
-        _Variable("reflectance", lambda chunk: chunk.spectra, "<f4", ("point", "wavelength"), reflectance),
-        *(_Variable(axis, column("points", i), attributes={"units": "m"}) for i, axis in enumerate("xyz")),
-        *(_Variable(f"n{axis}", column("normals", i), attributes={"units": "1"}) for i, axis in enumerate("xyz")),
-        *(_Variable(name, column("colours", i), "u1") for i, name in enumerate(_COLOURS)),
-        *(_Variable(name, extra(name)) for name in cloud.extra_names),
-    ]
+def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
+    """Name, type, dimensions and attributes of each variable."""
+    units = dict.fromkeys("xyz", "m") | dict.fromkeys(_NORMALS, "1")
+    yield "reflectance", "<f4", ("point", "wavelength"), _REFLECTANCE_ATTRIBUTES
+    for name in ("x", "y", "z", *_NORMALS, *_COLOURS, *cloud.extra_names):
+        attributes = {"units": units[name]} if name in units else {}
+        yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
 
 
 def _write_netcdf(path: Path, cloud: CloudStream) -> None:
     h5netcdf = _import("netcdf")
-    variables = _variables(cloud)
     with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
         file.attrs.update(_TABLE_ATTRIBUTES)
         file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
         wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
         wavelength.attrs.update(_WAVELENGTH_ATTRIBUTES)
-        for variable in variables:
-            created = file.create_variable(variable.name, variable.dimensions, variable.dtype)
-            created.attrs.update(variable.attributes)
+        for name, dtype, dimensions, attributes in _variables(cloud):
+            file.create_variable(name, dimensions, dtype).attrs.update(attributes)
         for rows, chunk in cloud.placed():
-            for variable in variables:
-                file.variables[variable.name][rows] = variable.rows_of(chunk)
+            for name, values in _columns(chunk).items():
+                file.variables[name][rows] = values
 
 
 def _write_zarr(path: Path, cloud: CloudStream) -> None:
@@ -175,7 +167,6 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
     zarr = _import("zarr")
     sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
     chunk_sizes = sizes | {"point": max(1, min(CHUNK_POINTS, cloud.count))}
-    variables = _variables(cloud)
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,10 +184,10 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
             )
 
         create("wavelength", "<f8", ("wavelength",), _WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
-        arrays = [create(v.name, v.dtype, v.dimensions, v.attributes) for v in variables]
+        arrays = {variable[0]: create(*variable) for variable in _variables(cloud)}
         for rows, chunk in cloud.placed():
-            for variable, array in zip(variables, arrays, strict=True):
-                array[rows] = variable.rows_of(chunk)
+            for name, values in _columns(chunk).items():
+                arrays[name][rows] = values
         if path.exists():
             shutil.rmtree(path)
         os.replace(temporary, path)

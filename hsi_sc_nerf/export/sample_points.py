@@ -63,8 +63,9 @@ def sample_points(
         An iterator over the rows of a batch, their outward normals and their spectra.
 
     Example:
-        >>> for rows, outward, found in sample_points(run, points_m, normals, max_distance_m=0.003, max_views=4):
-        ...     spectra[rows] = found.spectra
+        >>> run, points = open_run(Path("config.yml")), read_points(Path("scan.ply"))
+        >>> batches = sample_points(run, points.positions(), points.normals(), max_distance_m=0.003, max_views=4)
+        >>> spectra = np.concatenate([found.spectra for _, _, found in batches])
     """
     frames = run.manager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
     poses = run.refined_poses_m()[frames]

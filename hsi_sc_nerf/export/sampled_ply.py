@@ -105,21 +105,16 @@ class SpectralColumns:
     """
 
     def __init__(self, points: PlyPoints, wavelengths_nm: Float[np.ndarray, "bands"], extra: tuple[str, ...]) -> None:
-        self._points = points
-        bands = band_property_names(wavelengths_nm)
+        self._points, self._bands = points, band_property_names(wavelengths_nm)
         vertices = points.content["vertex"].data
         self._normals_missing, self._colours_missing = not points.has(_NORMAL), not points.has(_COLOUR)
         added = [(name, "<f4") for name in _NORMAL if self._normals_missing]
         added += [(name, "u1") for name in _COLOUR if self._colours_missing]
-        kept = [name for name in vertices.dtype.names if name not in (*bands, *extra, *dict(added))]
-        layout = [*((name, vertices.dtype[name]) for name in kept), *added]
-        self._rows = np.zeros(len(points), [*layout, *((name, "<f4") for name in (*bands, *extra))])
+        kept = [name for name in vertices.dtype.names if name not in (*self._bands, *extra, *dict(added))]
+        added += [(name, "<f4") for name in (*self._bands, *extra)]
+        self._rows = np.zeros(len(points), [*((name, vertices.dtype[name]) for name in kept), *added])
         for name in kept:
             self._rows[name] = vertices[name]
-        # The bands are adjacent in memory, so one view of the bytes holds all of them.
-        offset = np.dtype(layout).itemsize
-        as_bytes = self._rows.view(np.uint8).reshape(len(points), -1)
-        self._spectra = as_bytes[:, offset : offset + 4 * len(bands)].view("<f4")
 
     def fill(
         self,
@@ -130,8 +125,7 @@ class SpectralColumns:
         extra: dict[str, Float[np.ndarray, "n"]],
     ) -> None:
         """Set spectra and extra columns of rows, and normals and pseudo-RGB if the file has none."""
-        self._spectra[rows] = spectra
-        columns = dict(extra)
+        columns = dict(zip(self._bands, spectra.T, strict=True)) | extra
         if self._normals_missing:
             columns |= zip(_NORMAL, normals.T, strict=True)
         if self._colours_missing:

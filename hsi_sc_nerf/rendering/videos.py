@@ -50,8 +50,9 @@ def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> 
         InputError: there is no such composite or index, or no band is near a wavelength that it needs.
 
     Example:
+        >>> run = open_run(Path("config.yml"))
         >>> ndvi = find_false_colour("NDVI", run.dataset.wavelengths_nm)
-        >>> picture = ndvi.colours(render_view(run.model, camera))
+        >>> picture = ndvi.colours(render_view(run.model, run.manager.eval_dataset.cameras[:1]))
     """
     names = {known.casefold(): known for known in (*COMPOSITES, *INDICES)}
     found = names.get(name.casefold())

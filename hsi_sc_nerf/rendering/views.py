@@ -47,7 +47,8 @@ def views_of_frames(run: TrainedRun, split: Literal["held-out", "training"]) -> 
     """The cameras of a split's frames, and the measured frames.
 
     Example:
-        >>> for name, camera in views_of_frames(open_run(Path("config.yml")), "held-out"):
+        >>> run = open_run(Path("config.yml"))
+        >>> for name, camera in views_of_frames(run, "held-out"):
         ...     view = render_view(run.model, camera)
     """
     manager = run.manager

@@ -91,8 +91,9 @@ def sample_surface_points(
         InputError: the model holds no object, or the region holds none of it.
 
     Example:
-        >>> dataset = run.manager.train_dataset
-        >>> renders = render_depth_maps(run.model, dataset.cameras, masks, rays_per_batch=4096)
+        >>> run = open_run(Path("config.yml"))
+        >>> masks = run.manager.train_pixel_sampler.masks
+        >>> renders = render_depth_maps(run.model, run.manager.train_dataset.cameras, masks, rays_per_batch=4096)
         >>> box = run.to_scene(run.dataset.object_box_m)
         >>> points = sample_surface_points(run.model, renders, 100_000, rays_per_batch=4096, box=box)
     """
@@ -120,7 +121,7 @@ def sample_surface_points(
         triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
         parts = even_points(mesh.vertices, triangles, num_points, keep, seed)
     if not parts:
-        raise InputError("no point of the object lies in the region that was asked for; make it larger.")
+        raise InputError("no point of the object lies in the selected region; make it larger.")
     return SurfacePoints.concatenate(parts)
 
 

@@ -24,7 +24,7 @@ NORMAL_VERTICES = 8
 
 
 class SurfaceMesh(Mesh):
-    """A mesh, in any unit, that gives its normals and its triangles near places."""
+    """A mesh in any unit, with its normals at points and its triangles near a box."""
 
     def normals_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Outward unit normals: area-weighted mean over the ``NORMAL_VERTICES`` nearest vertices."""

@@ -9,7 +9,6 @@ import pytest
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, stream
 from hsi_sc_nerf.export.formats import require_format, write_cloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
 
 WAVELENGTHS_NM = np.array([397.32, 400.2, 650.0, 1003.58])
 COUNT = 50
@@ -111,10 +110,3 @@ def test_pieces_with_other_columns_are_refused(tmp_path: Path) -> None:
     other = CloudStream(COUNT, pieces.wavelengths_nm, ("opacity",), pieces.chunks)
     with pytest.raises(ValueError, match="other columns"):
         write_cloud(tmp_path / "cloud", other, "ply")
-
-
-def test_ply_by_pieces_reads_back(tmp_path: Path) -> None:
-    written = cloud()
-    read = read_spectral_ply(write_cloud(tmp_path / "cloud", stream(written, 7), "ply"))
-    np.testing.assert_array_equal(read.spectra, written.spectra)
-    assert list(read.extra) == ["opacity", "views"]
