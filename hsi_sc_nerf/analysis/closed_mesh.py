@@ -14,42 +14,42 @@ from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 
-# Points that a quadric is fitted to lie a third of its radius apart: about thirty weigh in.
+# Smoothing radius over the spacing of thinned points: about thirty points determine a quadric.
 _THINNING = 3.0
-# Cubes of the thinning's size along the cloud's longest side, above which memory would not do.
+# Largest number of thinning cells along the cloud's longest side, for the sake of memory.
 _MOST_CUBES = 5000
 # Fraction of the triangles below which a connected piece is a speck.
 _SMALLEST_PIECE = 0.001
 NEIGHBOURS = 48
-"""The smallest number of points that a quadric is fitted to reliably is a few times its six coefficients."""
+"""Points that a quadric is fitted to: several times its six coefficients."""
 _CHUNK_POINTS = 1 << 14
-# Added to the normal equations, whose unknowns are scaled to about 1: few or collinear neighbours make a plane.
+# Added to the normal equations, so that few or collinear neighbours give a plane.
 _RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
 class MeshConfig:
-    """How the mesh is made."""
+    """How a cloud is closed to a mesh."""
 
     octree_depth: int = paper.POISSON_DEPTH
     """Depth of the Poisson reconstruction's octree: each step halves the mesh's triangles in size."""
     smoothing_radius_m: float = 0.002
-    """Bumps smaller than this, in metres, are taken for noise of the reconstruction and smoothed away."""
+    """Surface details smaller than this, in metres, are smoothed away as noise of the reconstruction."""
     base_height_m: float | None = None
-    """Height above the turntable's disc, in metres, of what the object stands on (the container's height): the
-    unseen base is closed there. Without it, where the cloud ends at its lowest."""
+    """Height of the object's base above the turntable's disc, in metres (the container's height), where the unseen
+    base is closed. Default: the lowest point of the cloud's edge."""
 
 
 def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], config: MeshConfig) -> Mesh:
-    """The closed surface of an object that stands upright, its base flat.
+    """The closed surface of an upright object with a flat base.
 
-    The points are thinned, half a smoothing radius of the surface's lower rim is left out, the others are smoothed,
-    the base that no camera saw is closed (`find_base`), and the whole goes through screened Poisson reconstruction
-    (Kazhdan and Hoppe 2013; Open3D), of which specks are left out.
+    The points are thinned, the lower rim (half a smoothing radius) is removed, the rest is smoothed, and the unseen
+    base is closed (`find_base`). Screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D) gives the mesh;
+    small pieces are removed.
 
     Args:
         points_m: the seen surface, z up.
-        normals: outward on the whole; single ones may be far off.
+        normals: mostly outward; single ones may be wrong.
         config: settings.
 
     Raises:
@@ -76,7 +76,7 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
             f"the cloud is too small for a smoothing radius of {config.smoothing_radius_m} m, which leaves "
             f"{len(points)} points; check that it is in metres, or lower the radius."
         )
-    # Over a surface that is open at its foot, and seen from there, outward normals add up to its volume.
+    # The divergence theorem: seen from the open foot, outward normals give a positive volume.
     from_foot = points - [*points[:, :2].mean(axis=0), points[:, 2].min()]
     if not np.einsum("pi,pi->", from_foot, facing) > 0.0:
         raise InputError("the cloud's normals do not point out of the object; flip them, or export the cloud again.")
@@ -100,10 +100,9 @@ def _poisson(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3
 
 
 def solid_pieces(mesh: Mesh) -> Mesh:
-    """The connected pieces that are solid and not tiny, without vertices that none of their triangles uses.
+    """The connected pieces of positive volume that are not tiny, without unused vertices.
 
-    A stem that the cloud does not join to its fruit stays; specks, and bubbles inside the object, whose volume is
-    negative, go.
+    A stem apart from its fruit is kept; specks and bubbles inside the object (negative volume) are removed.
     """
     edges = mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     piece = connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.triangles[:, 0]]
@@ -116,9 +115,9 @@ def solid_pieces(mesh: Mesh) -> Mesh:
 
 
 def open_edges(mesh: Mesh) -> int:
-    """How many edges are not run along as often one way as the other; a mesh with none encloses a volume.
+    """Number of edges whose triangles do not cancel in direction; a mesh without such edges encloses a volume.
 
-    Unlike `Mesh.is_watertight`, this lets four triangles meet in an edge, as where two parts of a surface touch.
+    Unlike `Mesh.is_watertight`, this allows four triangles at an edge, where two parts of a surface touch.
     """
     t = mesh.triangles.astype(np.int64)
     start, end = t.ravel(), np.roll(t, -1, axis=1).ravel()
@@ -129,10 +128,7 @@ def open_edges(mesh: Mesh) -> int:
 def thinned(
     points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], cell_m: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-    """One point for each cube of side ``cell_m`` that holds points: the mean of their places and of their normals.
-
-    The normals that come out are no longer than 1; they say which side is outside.
-    """
+    """Voxel downsampling: mean position and mean normal (not longer than 1) of the points in each cell."""
     cells = np.floor((points_m - points_m.min(axis=0)) / cell_m).astype(np.int64)
     shape = cells.max(axis=0) + 1
     _, cell = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(shape)), return_inverse=True)
@@ -144,23 +140,22 @@ def thinned(
 def smoothed(
     points_m: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"], radius_m: float
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Each point moved on to the quadric that fits its neighbours best, and the quadric's normal there.
+    """Move each point onto the quadric that fits its neighbours best.
 
     Moving least squares (Alexa et al. 2003, "Computing and Rendering Point Set Surfaces"): a plane by principal
     components, over it a quadric by weighted least squares. A quadric, unlike a mean, does not shrink what is curved.
 
     Args:
         points_m: positions, at least three.
-        facing: vectors that point outwards on the whole; how long they are and how they scatter does not matter.
-        radius_m: neighbours at this distance weigh exp(-2); smaller features are smoothed away. At least a few of
-            the nearest `NEIGHBOURS` points count however sparse the cloud is.
+        facing: vectors of any length that mostly point outwards.
+        radius_m: neighbours at this distance have the weight exp(-2); smaller features are smoothed away. In sparse
+            parts the distance to the twelfth neighbour is used instead.
 
     Returns:
         Positions, and unit normals on the side of ``facing``.
     """
-    places, normals = np.empty((len(points_m), 3)), np.empty((len(points_m), 3))
+    positions, normals = np.empty((len(points_m), 3)), np.empty((len(points_m), 3))
     tree = cKDTree(points_m)
-    # What the quadrics' sides are told apart by has to be steadier than the normals of single points.
     count = min(NEIGHBOURS, len(points_m))
     for start in range(0, len(points_m), _CHUNK_POINTS):
         chunk = slice(start, start + _CHUNK_POINTS)
@@ -168,18 +163,18 @@ def smoothed(
         scale_m = np.maximum(radius_m, distance_m[:, min(count - 1, NEIGHBOURS // 4)])[:, None]
         weight = np.exp(-2.0 * (distance_m / scale_m) ** 2)
         outwards = np.einsum("pk,pkj->pj", weight, facing[neighbour])
-        # Points of the other side of something thin are none of this surface.
+        # Leaves out points on the other side of a thin part.
         weight *= np.einsum("pkj,pj->pk", facing[neighbour], outwards) > 0
         offset = (points_m[neighbour] - points_m[chunk, None]) / scale_m[..., None]
         height, normals[chunk] = _quadric(offset, weight, outwards)
-        places[chunk] = points_m[chunk] + scale_m * height
-    return places, normals
+        positions[chunk] = points_m[chunk] + scale_m * height
+    return positions, normals
 
 
 def _quadric(
     offset: Float[np.ndarray, "p k 3"], weight: Float[np.ndarray, "p k"], outwards: Float[np.ndarray, "p 3"]
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """From the origin to the fitted quadric along the plane's normal, and the quadric's unit normal there."""
+    """Offset from the origin to the fitted quadric, and the quadric's unit normal there."""
     total = np.maximum(weight.sum(axis=1), 1e-30)
     centred = offset - (np.einsum("pk,pkj->pj", weight, offset) / total[:, None])[:, None]
     _, axes = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", weight, centred, centred))

@@ -1,4 +1,8 @@
-"""Reference spectra by name: an ENVI spectral library or a CSV table, brought to the bands of a cloud."""
+"""Named reference spectra from an ENVI spectral library or a CSV table, resampled to the bands of a cloud.
+
+Libraries are read here and not by SPy, whose reader ignores the header's offset and knows only one spelling of the
+file type.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +18,20 @@ from spectral.io import envi
 from hsi_sc_nerf.capture.envi_header import check_layout, mended_fields, number_in, wavelengths_of
 from hsi_sc_nerf.errors import InputError
 
-# Micrometres without a unit are told by their size: no band of a camera is below 100 nm.
+# Wavelengths of a table that are all below this are in micrometres.
 _SMALLEST_NM = 100.0
-# The USGS library has -1.23e34 where it has no reflectance ("deleted channels").
+# The USGS library marks "deleted channels" by -1.23e34.
 _DELETED = -1e20
 
 
 @dataclass(frozen=True)
 class SpectralLibrary:
-    """Named reference spectra; those of equal name are references of one class.
+    """Named reference spectra; spectra of one name are references of one class.
 
     Attributes:
-        names: of each spectrum.
+        names: one for each spectrum.
         wavelengths_nm: band centres.
-        spectra: reflectance; NaN where the library has none.
+        spectra: reflectance; NaN where it is missing.
     """
 
     names: tuple[str, ...]
@@ -35,11 +39,11 @@ class SpectralLibrary:
     spectra: Float[np.ndarray, "references bands"]
 
     def at(self, wavelengths_nm: Float[np.ndarray, "other"]) -> SpectralLibrary:
-        """The library at a cloud's wavelengths, straight between its own.
+        """The library at a cloud's wavelengths, by linear interpolation.
 
         Raises:
-            InputError: the library does not reach as far as the wavelengths (1 nm of grace), has no reflectance at
-                one, or there is only one, at which no spectrum differs from another by its angle.
+            InputError: the library does not cover the wavelengths (to within 1 nm), lacks reflectance at one of them,
+                or there is only one, at which spectral angles are not defined.
         """
         if len(wavelengths_nm) < 2:
             raise InputError("the cloud has one band, which tells no classes; give one with more, or no --library.")
@@ -83,7 +87,7 @@ class SpectralLibrary:
 def read_library(path: Path) -> SpectralLibrary:
     """Read an ENVI spectral library (``.sli`` with its header, or the header) or a CSV table.
 
-    The table's first column is the wavelength in nm (in µm if its numbers are below 100), each other column a
+    The table's first column is the wavelength in nm (in µm if all numbers are below 100), each other column is a
     spectrum with its name in the first line.
 
     Raises:
@@ -118,7 +122,7 @@ def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 
 def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """A library is a header's image of one band: a line a spectrum, a sample a wavelength."""
+    """An ENVI library is an image of one band: each line a spectrum, each sample a wavelength."""
     header, data = _envi_pair(path)
     fields = mended_fields(header)
     if "library" not in str(fields.get("file type", "")).lower():
@@ -163,5 +167,5 @@ def _envi_pair(path: Path) -> tuple[Path, Path]:
 
 
 def _ending(base: Path, ending: str) -> list[Path]:
-    """``base`` with the ending in small and in capital letters."""
+    """``base`` with the ending in lower and upper case."""
     return [base.with_name(base.name + one) for one in (ending, ending.upper())]

@@ -1,4 +1,4 @@
-"""The mesh from four sides, in composites, indices and classes; spectra of regions. One PNG a function."""
+"""Pictures of a spectral mesh: composites, indices and classes from four sides; spectra of regions."""
 
 from __future__ import annotations
 
@@ -24,18 +24,15 @@ from hsi_sc_nerf.spectra.indices import INDICES, index_values
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
 _LABEL_IN = 1.4
-"""What the label beside a row needs."""
+"""Height of a row's label."""
 _GREY = 0.85
-"""What was not seen."""
+"""Grey value of unseen surface."""
 _NEAR_WHITE = 0.97
-"""What is in no class."""
+"""Grey value of surface in no class."""
 
 
 class SideViews:
-    """Parallel projections of a mesh, seen from the sides; each pixel knows its triangle.
-
-    What is flat stands in the middle of pictures that are twice as wide as high.
-    """
+    """Parallel projections of a mesh from the four `SIDES_DEG`, as barycentric coordinates of each pixel."""
 
     def __init__(self, mesh: Mesh, height_px: int = _HEIGHT_PX) -> None:
         self._mesh = mesh
@@ -60,7 +57,7 @@ class SideViews:
             self.sides.append((hit, triangle, np.stack([1.0 - u - v, u, v], axis=-1)))
 
     def of(self, values: Float[np.ndarray, "v *channels"]) -> list[Float[np.ndarray, "h w *channels"]]:
-        """Values at vertices as pictures, a side each, mixed linearly within triangles; NaN beside the object."""
+        """Pictures of vertex values, one a side, interpolated within triangles; NaN beside the object."""
         pictures = []
         for hit, triangle, barycentric in self.sides:
             corners = values[self._mesh.triangles[triangle]]
@@ -72,7 +69,7 @@ class SideViews:
 
 @rc_context(STYLE)
 def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
-    """The named composites in rows, the sides in columns; what was not seen is grey.
+    """The named composites in rows, the sides in columns; unseen surface is grey.
 
     Args:
         path: the PNG file.
@@ -84,7 +81,7 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits:
     for name in traits.composites[WHOLE]:
         one = COMPOSITES[name]
         values = composite(surface.spectra, surface.wavelengths_nm, one.wavelengths_nm, name).astype(float)
-        # Bands of dark tissue would be hard to make out; the brightest percent may be cut.
+        # Brightened, so that dark tissue can be seen; the brightest percent is clipped.
         values = np.clip(values / np.percentile(values[surface.seen], 99.0), 0.0, 1.0)
         values[~surface.seen] = _GREY
         label = f"{name}\n{', '.join(f'{nm:g}' for nm in one.wavelengths_nm)} nm"
@@ -94,7 +91,7 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits:
 
 @rc_context(STYLE)
 def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
-    """The named indices as colour maps, in rows, the sides in columns; what was not seen is grey.
+    """The named indices as colour maps in rows, the sides in columns; unseen surface is grey.
 
     The scale of each goes from its 1st to its 99th percentile on this surface.
     """
@@ -135,7 +132,7 @@ def _draw_rows(
 def draw_classes(
     path: Path, names: Sequence[str], labels: Int[np.ndarray, "v"], surface: SpectralMesh, views: SideViews
 ) -> None:
-    """The classes on the surface, with their areas; white is in no class, grey was not seen."""
+    """The classes on the surface, with their areas; white is in no class, grey is unseen."""
     colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = _GREY

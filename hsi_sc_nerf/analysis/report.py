@@ -42,24 +42,24 @@ def write_page(
 
     Args:
         path: the file.
-        title: what was measured.
+        title: name of the cloud.
         size: of the object.
-        spread: standard deviation of each size; None where none was asked for.
-        watertight: whether the mesh is closed; without it, the volume means nothing.
-        traits: what the spectra tell.
+        spread: standard deviation of each size; None if it was not determined.
+        watertight: whether the mesh encloses a volume.
+        traits: from the spectra.
         pictures: file names by caption.
     """
     closed_cm2 = (size.area_m2 - traits.seen_m2) * _CM2_PER_M2
     parts = [f"# Traits of {title}", "## Size", _size_table(size, spread)]
     state = "watertight" if watertight else "NOT watertight, so its volume cannot be trusted"
     uncertain = (
-        " ± is the standard deviation that random halves of the cloud tell: it does not hold errors that many points "
-        "share, as those of scale, poses or training."
+        " ± is the standard deviation from random halves of the cloud. It does not include errors that points have "
+        "in common, such as those of scale, poses or training."
         if spread
         else ""
     )
     parts.append(
-        f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, the base above all, were not seen but closed."
+        f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
         f"{uncertain}"
     )
     if traits.classes is not None:
@@ -159,14 +159,14 @@ def _class_tables(traits: Traits) -> list[str]:
     ]
     return [
         "## Classes",
-        "By angle: all places whose spectral angle to the class is the smallest, and at most "
-        f"{classes.threshold_rad:g} rad. By mixture: all places of which the class makes up more than half, their "
-        "spectra taken for mixtures of the library's; where the library has all that the surface is made of, these "
-        "tell spots with soft edges better.",
+        "By angle: surface whose spectral angle to the class is the smallest, and at most "
+        f"{classes.threshold_rad:g} rad. By mixture: surface where the class's fraction exceeds one half, by linear "
+        "unmixing with the library. If the library holds all materials of the surface, areas by mixture are better "
+        "for spots with soft edges.",
         markdown_table(
-            ["class", "by angle, cm²", "of what was seen", "regions", "by mixture, cm²", "of what was seen"], rows
+            ["class", "by angle, cm²", "of seen area", "regions", "by mixture, cm²", "of seen area"], rows
         ),
-        f"The largest {len(listed)} of {len(classes.regions)} connected regions, with their middles:",
+        f"The largest {len(listed)} of {len(classes.regions)} connected regions, with their centres:",
         markdown_table(["class", "area, cm²", "x, mm", "y, mm", "z, mm"], listed),
     ]
 

@@ -28,9 +28,9 @@ class SpectralMesh:
 
     Attributes:
         mesh: metres, object frame.
-        spectra: reflectance; at vertices that were not seen, of the nearest points that were.
+        spectra: reflectance; unseen vertices have that of the nearest seen points.
         wavelengths_nm: band centres.
-        seen: which vertices have points near them whose spectra were used; the closed base has none.
+        seen: vertices with points of the cloud nearby; False on the closed base.
     """
 
     mesh: Mesh
@@ -47,16 +47,15 @@ class SpectralMesh:
 def with_spectra(
     mesh: Mesh, cloud: SpectralCloud, seen_within_m: float, max_incidence_deg: float = np.inf
 ) -> SpectralMesh:
-    """Give each vertex the mean spectrum of the `NEIGHBOURS` nearest points, near ones weighing more.
+    """Give each vertex the distance-weighted mean spectrum of the `NEIGHBOURS` nearest points.
 
-    Points whose spectrum is not finite are left out: `hsi-sc-nerf sample` writes NaN where no view sees a point.
+    Points whose spectrum is not finite are ignored; `hsi-sc-nerf sample` writes NaN where no view sees a point.
 
     Args:
         mesh: in the frame of the cloud.
-        cloud: the points it was made from.
-        seen_within_m: a vertex with no point as near as this was not seen.
-        max_incidence_deg: points whose column `INCIDENCE` is larger are left out: their pixels smear the surface, and
-            at its rim show what lies beside it.
+        cloud: the points that the mesh was made from.
+        seen_within_m: vertices without a point at this distance are unseen.
+        max_incidence_deg: points with a larger `INCIDENCE` are ignored, because their pixels are mixed.
 
     Raises:
         InputError: that leaves no point.
@@ -85,9 +84,9 @@ def with_spectra(
 
 
 def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
-    """Write the mesh as a spectral PLY whose points are the vertices, followed by the triangles.
+    """Write a spectral PLY whose points are the vertices, with triangles.
 
-    Columns beside the bands: ``seen`` (1 where there are spectra, 0 on what was closed) and those in ``extra``.
+    Columns beside the bands: ``seen`` (1 where spectra were measured, 0 on the closed base) and those in ``extra``.
 
     Raises:
         InputError: the file cannot be written.

@@ -35,15 +35,15 @@ class Classes:
 
     Attributes:
         names: of the classes.
-        labels: number of each vertex's class; -1 where it is in none or was not seen.
+        labels: class of each vertex by spectral angle; -1 where it is in no class or unseen.
         threshold_rad: largest spectral angle of a class's spectra to its reference.
         areas_m2: of each class.
-        unclassified_m2: seen, but in no class.
-        mixture_labels: number of the class that makes up more than half of each vertex, its spectrum taken for a
-            mixture of the library's; -1 where none does, where it is no such mixture, or was not seen.
-        mixture_areas_m2: of each class by these.
-        mixture_unclassified_m2: seen, but in no class by these.
-        regions: connected regions, the largest first.
+        unclassified_m2: seen area in no class.
+        mixture_labels: class whose fraction in each vertex's spectrum, by linear unmixing, exceeds one half; -1 where
+            no class does, where the spectrum is no mixture of the library's, or unseen.
+        mixture_areas_m2: of each class by ``mixture_labels``.
+        mixture_unclassified_m2: seen area in no class by ``mixture_labels``.
+        regions: connected regions, in descending order of area.
     """
 
     names: tuple[str, ...]
@@ -67,13 +67,13 @@ class MeanAndSd:
 
 @dataclass(frozen=True)
 class Traits:
-    """What the spectra of a surface tell.
+    """Traits of a surface from its spectra.
 
     Attributes:
-        seen_m2: area that was seen; the rest is the closed base.
-        spectra: of the whole seen surface, each class and each picked region.
-        indices: of each region, by the names of region and index.
-        composites: reflectance in each composite's three bands, by the names of region and composite.
+        seen_m2: seen area; the rest is the closed base.
+        spectra: of the whole seen surface, each class and each region of interest.
+        indices: by the names of region and index.
+        composites: reflectance in three bands, by the names of region and composite.
         classes: None without a library.
     """
 
@@ -89,15 +89,16 @@ def classified(
 ) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 
-    A class is what the library has under one name. By angle, a place belongs to the class of its nearest reference;
-    by mixture, to the class that holds most of it: a blurred edge stays where it was, because half is half.
+    Library spectra of one name are references of one class. By angle, a vertex belongs to the class of the reference
+    with the smallest spectral angle; by mixture, to the class with a fraction above one half, which keeps blurred
+    edges in place.
 
     Raises:
         InputError: the library does not cover the bands.
     """
     references = library.at(surface.wavelengths_nm).spectra
     names = tuple(dict.fromkeys(library.names))
-    # The last entry is what the index -1 finds.
+    # Index -1 finds the last entry.
     class_of = np.array([*(names.index(name) for name in library.names), UNCLASSIFIED])
     spectra = surface.spectra[surface.seen]
     labels, mixture_labels = (np.full(len(surface.seen), UNCLASSIFIED) for _ in range(2))
@@ -124,27 +125,29 @@ def classified(
 
 
 def known_composites(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Composite]:
-    """Those of the named composites that the bands can show."""
+    """The named composites whose bands are available."""
     return [one for one in COMPOSITES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
 
 
 def known_indices(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[SpectralIndex]:
-    """Those of the named indices that the bands have."""
+    """The named indices whose bands are available."""
     return [one for one in INDICES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
 
 
-def analyse(surface: SpectralMesh, picked: Sequence[RegionOfInterest] = (), classes: Classes | None = None) -> Traits:
-    """Spectra, indices and composites of the whole seen surface, of each class on it and of the picked regions.
+def analyse(
+    surface: SpectralMesh, regions: Sequence[RegionOfInterest] = (), classes: Classes | None = None
+) -> Traits:
+    """Spectra, indices and composites of the whole seen surface, its classes and the regions of interest.
 
     Raises:
-        InputError: two regions have one name, a picked region holds no seen surface, or nothing was seen.
+        InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
     """
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
     if classes is not None:
         chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
-    for region in picked:
+    for region in regions:
         if region.name in chosen:
             raise InputError(f"two regions are named {region.name}; give each picked region a name of its own.")
         chosen[region.name] = region.of(surface)
@@ -172,12 +175,12 @@ def analyse(surface: SpectralMesh, picked: Sequence[RegionOfInterest] = (), clas
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """What lies within a radius of a point.
+    """The surface within a radius of a point.
 
     Attributes:
         name: of the region.
-        centre_m: object frame.
-        radius_m: around it.
+        centre_m: centre, object frame.
+        radius_m: of the sphere.
     """
 
     name: str
@@ -185,7 +188,7 @@ class RegionOfInterest:
     radius_m: float
 
     def of(self, surface: SpectralMesh) -> Bool[np.ndarray, "v"]:
-        """Which seen vertices lie in it.
+        """The seen vertices in the region.
 
         Raises:
             InputError: none does.
@@ -262,7 +265,7 @@ def read_regions(path: Path) -> list[RegionOfInterest]:
 
 
 def region_of_interest(name: str, x_m: float, y_m: float, z_m: float, radius_m: float) -> RegionOfInterest:
-    """A region from its five words.
+    """A region from its name, centre and radius.
 
     Raises:
         InputError: the radius is not more than 0, or a number is not finite.

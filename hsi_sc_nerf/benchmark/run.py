@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.models.staged_trainer import StagedTrainer
 
 Clock = Literal["wall", "cpu"]
-"""Wall time, or the processor's time over all threads of a process, which other work on a machine hardly changes."""
+"""Wall time, or processor time over all threads, which other work on the machine hardly changes."""
 
-# The first steps of a stage build caches and tables.
+# Iterations at the start of a stage that are not timed, because they build caches.
 _WARM_UP_STEPS = 2
 _REHEARSAL_ITERATIONS = 20
 _REHEARSAL_FRACTION = 0.05
@@ -35,16 +35,16 @@ _RENDERING_SPEEDS = ("num_rays_per_sec", "fps")
 
 @dataclass(frozen=True)
 class Job:
-    """What one process has to do.
+    """Work of one process.
 
     Attributes:
         method: nerfstudio method of this package.
         words: as after ``ns-train METHOD``.
         data: the packed dataset.
         output_dir: where the training run is kept.
-        iterations: length of the run; None: find out how many fit into ``train_seconds``, and train nothing.
-        train_seconds: time to fill; None where ``iterations`` is given.
-        clock: what ``train_seconds`` are of.
+        iterations: length of the run; None: only determine how many fit into ``train_seconds``.
+        train_seconds: time to fill; None if ``iterations`` is given.
+        clock: that ``train_seconds`` refer to.
         checkpoints: fractions of the run at which it is evaluated, beside the stages' ends.
         threads: CPU threads.
         held_out_views: how many held-out views are evaluated, evenly spread; None for all.
@@ -64,7 +64,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """How a run did at one of its steps.
+    """Measurements of a run at one of its steps.
 
     Attributes:
         iteration: iterations done.
@@ -132,9 +132,9 @@ def build_trainer(config: Any, job: Job, iterations: int, output_dir: Path) -> S
 
 
 class HeldOutViews:
-    """Some of the held-out views, evenly spread, each read when its turn comes.
+    """Some of the held-out views, evenly spread, read one at a time.
 
-    nerfstudio's own loader of chosen views says that it is as long as the whole dataset.
+    nerfstudio's own loader of selected views has the length of the whole dataset.
 
     Args:
         loader: of all held-out views.
@@ -204,10 +204,10 @@ def train(job: Job) -> dict[str, Any]:
 
 
 def rehearse(job: Job) -> dict[str, Any]:
-    """How many iterations fill ``train_seconds``: gives ``iterations`` and ``iteration_seconds``.
+    """Determine how many iterations fill ``train_seconds``; returns ``iterations`` and ``iteration_seconds``.
 
-    A whole run of 20 iterations tells how many fit into a twentieth of the time; a whole run of so many, stages and
-    all, tells how long an iteration takes in the mean.
+    A run of 20 iterations estimates how many fit into a twentieth of the time; a run of that length, with all stages,
+    gives the mean time of an iteration.
     """
     assert job.train_seconds is not None
     seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS)
@@ -263,10 +263,10 @@ def mean_iteration_seconds(times: Sequence[float], stage_ends: Sequence[int]) ->
 
 
 class TrainingClock:
-    """Seconds of wall and of processor time since it was made, pauses left out.
+    """Wall and processor seconds since its creation, without pauses.
 
     Args:
-        wait: called before each reading, so that what a GPU has still to do is counted where it belongs.
+        wait: called before each reading, to finish the work of a GPU.
         wall: clock of wall time, seconds.
         cpu: clock of this process's processor time over all threads, seconds.
     """
@@ -287,7 +287,7 @@ class TrainingClock:
 
     @contextmanager
     def paused(self) -> Iterator[tuple[float, float]]:
-        """What is done within counts on neither clock; gives the readings before it."""
+        """Pause both clocks; yields the readings before."""
         wall, cpu = self.read()
         yield wall, cpu
         self._wait()
@@ -295,7 +295,7 @@ class TrainingClock:
 
 
 def main(job_path: Path, result_path: Path) -> None:
-    """Do the job; the result appears whole or not at all."""
+    """Run the job in ``job_path`` and write its result."""
     import torch
     from threadpoolctl import threadpool_limits
 

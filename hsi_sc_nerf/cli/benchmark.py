@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf benchmark``: what accuracy costs in time, by configuration."""
+"""``hsi-sc-nerf benchmark``: accuracy over training time of several configurations."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
 
 @dataclass(frozen=True)
 class BenchmarkCommand:
-    """Train several configurations on one session and compare how accurate they are after which time.
+    """Train several configurations on one session and compare their accuracy over training time.
 
-    Each trains in a process of its own. What is finished is not trained again; a run that was stopped starts anew.
+    Each configuration trains in its own process. It is skipped if it was already trained on the same data with the
+    same settings, machine and package versions. A stopped run starts again.
     """
 
     data: tyro.conf.Positional[Path]
@@ -46,19 +47,19 @@ class BenchmarkCommand:
     output_dir: Path
     """Folder for the runs and for benchmark.csv, .md, .json and .png."""
     configurations: tuple[str, ...] = tuple(CONFIGURATIONS)
-    """Which of the known configurations to train: paper is the published recipe, ours is this package's, and
-    the others are ours with one departure from the paper taken away, or one option that ours does without."""
+    """Known configurations to train: paper is the published recipe, ours is this package's; each of the others
+    changes one setting of ours."""
     sets: tuple[str, ...] = ()
-    """Configurations of your own, each "NAME=BASE WORDS": the words change BASE (ours where it is left out) as they
-    would behind `ns-train METHOD`, for example "fine=paper --pipeline.model.max-res 1024"."""
+    """Configurations of your own, each "NAME=BASE WORDS": the words change BASE (default: ours) as they would behind
+    `ns-train METHOD`, for example "fine=paper --pipeline.model.max-res 1024"."""
     common: str = ""
-    """Words that every configuration gets, joined to the option by an equals sign, for example
+    """Words for every configuration, joined to the option by an equals sign, for example
     --common="--pipeline.datamanager.train-num-rays-per-batch 1024"."""
     train_seconds: float = 600.0
-    """Time for training each configuration; how many iterations fill it is found by a rehearsal."""
+    """Training time of each configuration; a short rehearsal determines how many iterations fit."""
     clock: Clock = "wall"
-    """What --train-seconds and the picture count: wall time, or the processor's time over all threads (cpu), which is
-    fairer on a machine that does other work beside."""
+    """Unit of --train-seconds and the picture: wall time, or processor time over all threads (cpu), which is fairer
+    on a machine that also does other work."""
     iterations: int | None = None
     """The same number of iterations for each configuration instead of the same time."""
     checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
@@ -66,10 +67,10 @@ class BenchmarkCommand:
     held_out_views: int | None = None
     """Evaluate this many of the held-out views, evenly spread, instead of all."""
     threads: int | None = None
-    """CPU threads of each run; all cores where it is not given."""
+    """CPU threads of each run. Default: all cores."""
 
     def main(self) -> None:
-        """Train what is missing, write the results, show the table.
+        """Train the missing configurations, write the results, print the table.
 
         Raises:
             InputError: a name, a word, a number or the data cannot be used, or a run failed.
@@ -79,14 +80,13 @@ class BenchmarkCommand:
 
         runs = train_all(chosen, self)
         console = Console()
-        # Broken numbers cannot be read: rather let the terminal wrap.
         console.width = max(console.width, TABLE_WIDTH)
         console.print(results_table(runs))
         console.print(f"Everything, and the picture: {escape(str(self.output_dir / 'benchmark.md'))}", soft_wrap=True)
 
 
 def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[BenchmarkRun]:
-    """Train the configurations that are not finished and write the results of all after each.
+    """Train the unfinished configurations and write all results after each.
 
     Raises:
         InputError: a setting cannot be used, or runs failed; the others' results are written all the same.
@@ -95,7 +95,6 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     console = Console(stderr=True)
     data = _packed(command.data)
     machine = describe_machine()
-    # What a finished run must agree in to count as this one's.
     identity = {"machine": machine, "data_sha256": hashlib.sha256((data / TRANSFORMS_NAME).read_bytes()).hexdigest()}
     jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}
     contents = {
@@ -140,7 +139,7 @@ def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> l
 
 
 def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -> None:
-    """Refuse now what would fail after hours."""
+    """Refuse settings that would fail later."""
     names = [configuration.name for configuration in configurations]
     twice = {name for name in names if names.count(name) > 1}
     if not names or twice:
@@ -190,7 +189,7 @@ def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) ->
 
 
 def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
-    """Rehearse where the time is given, then train; what either finds is kept with the job that it belongs to."""
+    """Rehearse if a time is given, then train; results are kept with their job."""
     iterations = job.iterations
     if iterations is None:
         found = _finished(folder / "rehearsal.json", job, identity)
@@ -206,28 +205,28 @@ def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
     return _process(folder, "result", replace(job, iterations=iterations), job, identity)
 
 
-def _process(folder: Path, name: str, doing: Job, asked: Job, identity: dict[str, Any]) -> dict[str, Any]:
-    """Do a job in a process of its own; what it finds is kept as ``NAME.json`` with the job that was asked for."""
+def _process(folder: Path, name: str, job: Job, key: Job, identity: dict[str, Any]) -> dict[str, Any]:
+    """Run ``job`` in its own process; the result is kept as ``NAME.json`` with ``key``."""
     log = folder.parent / "logs" / f"{folder.name}-{name}.log"
     for needed in (folder, log.parent):
         make_folder(needed)
     with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY_PREFIX) as temporary:
         job_path, found_path = Path(temporary, "job.json"), Path(temporary, "found.json")
-        write_json(job_path, asdict(doing))
+        write_json(job_path, asdict(job))
         module = "hsi_sc_nerf.benchmark.run"
         run_step(f"{name} of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
         found = json.loads(found_path.read_text(encoding="utf-8"))
-    write_json(folder / f"{name}.json", {"job": asdict(asked), **identity, **found})
+    write_json(folder / f"{name}.json", {"job": asdict(key), **identity, **found})
     return found
 
 
 def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] | None:
-    """What an earlier call found for the same job on the same machine and data; None if there is no such thing."""
+    """Result of an earlier call for the same job, machine and data; None if there is none."""
     if not path.is_file():
         return None
     content = json.loads(path.read_text(encoding="utf-8"))
-    wanted = json.loads(json.dumps({"job": asdict(job), **identity}))
-    return content if wanted.items() <= content.items() else None
+    expected = json.loads(json.dumps({"job": asdict(job), **identity}))
+    return content if expected.items() <= content.items() else None
 
 
 def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf compare``: how well a reconstruction fits a reference."""
+"""``hsi-sc-nerf compare``: accuracy of a reconstruction against a reference."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CompareCommand:
     cloud: tyro.conf.Positional[Path]
     """The reconstruction, in metres: a point cloud (PLY) or a mesh (PLY, OBJ, STL)."""
     reference: tyro.conf.Positional[Path]
-    """What it is compared with: a cloud or mesh likewise, or the folder of a simulated session with known truth."""
+    """The reference: a cloud or mesh, or the folder of a simulated session, whose true surface is known."""
     output_dir: Path
     """Folder for the results."""
     config: Annotated[CompareConfig, tyro.conf.arg(name="")] = field(default_factory=CompareConfig)

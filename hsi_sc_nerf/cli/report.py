@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf report``: one HTML file that tells how a run came about and how good it is."""
+"""``hsi-sc-nerf report``: one HTML file on the quality of a run."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ class ReportCommand:
     the training, the calibration, the masks, the poses. It opens in any browser, without a network."""
 
     run: tyro.conf.Positional[Path]
-    """Folder of the run, the one that holds config.yml; or that file."""
+    """Folder of the run that holds config.yml, or that file."""
     output: Path | None = None
-    """The HTML file; report.html in the run's folder where it is not given."""
+    """The HTML file. Default: report.html in the run's folder."""
     cloud: Path | None = None
-    """Point cloud (PLY) of the run to show. Where it is not given, point_cloud.ply in the run's folder is shown or,
-    where there is none, the surface is sampled from the model."""
+    """Point cloud (PLY) of the run. Default: point_cloud.ply in the run's folder, or, if there is none, points
+    sampled from the model."""
     comparison: Path | None = None
-    """comparison.json that `hsi-sc-nerf compare` made; the one in the run's folder where it is not given."""
+    """comparison.json of `hsi-sc-nerf compare`. Default: the one in the run's folder."""
     traits: Path | None = None
-    """traits.json that `hsi-sc-nerf traits` made; the one in the run's folder where it is not given."""
+    """traits.json of `hsi-sc-nerf traits`. Default: the one in the run's folder."""
     views: int | None = None
-    """Render this many of the held-out views, evenly spread, instead of all."""
+    """Number of held-out views to render, evenly spread. Default: all."""
     points: int = 50_000
-    """Points of the object to show; 50 000 make about 5 MB."""
+    """Number of points to show; 50 000 need about 5 MB."""
 
     def main(self) -> None:
-        """Write the report and tell where it is.
+        """Write the report and print its path.
 
         Raises:
             InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.

@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf traits``: a spectral cloud in, what a plant scientist reports out."""
+"""``hsi-sc-nerf traits``: size, spectra, indices and classes from a spectral cloud."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ class TraitsCommand:
     output_dir: Path
     """Folder to write the results to."""
     data: Path | None = None
-    """The dataset that the cloud was reconstructed from: tells how high the container is that the object stands on,
-    unless --mesh.base-height-m does."""
+    """The dataset that the cloud was reconstructed from. The height of its container is the default of
+    --mesh.base-height-m."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
-    """How the mesh is made."""
+    """Settings of the mesh."""
     splits: int = 6
-    """How often the cloud is split into random halves, which are meshed apart, for the uncertainty of the sizes; 0
-    leaves it out."""
+    """Number of random splits of the cloud into halves, which are meshed separately for the uncertainty of the sizes;
+    0 for none."""
     max_incidence_deg: float = MAX_INCIDENCE_DEG
-    """Spectra come from points that a camera sees at no more than this many degrees from the front: pixels that meet
-    the surface obliquely smear it, and at its rim show what lies beside it. Sizes come from all points."""
+    """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees, because
+    oblique pixels are mixed. Sizes come from all points."""
     library: Path | None = None
     """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
     nm, then a column a spectrum). Spectra of one name are references of one class."""
     classes: tuple[str, ...] = ()
-    """Names of the library's spectra to use; all where none is named."""
+    """Names of the library's spectra to use. Default: all."""
     angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD
-    """Largest spectral angle, in radians, between a place's spectrum and its class's."""
+    """Largest spectral angle, in radians, between a spectrum and its class."""
     smallest_region_cm2: float = 0.05
     """Connected regions of a class below this area are not listed (their area still counts)."""
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
-    """A region to report the spectrum of: its name, x, y and z of its middle and its radius, all in metres; give it
-    again for each region."""
+    """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
+    region."""
     roi_file: Path | None = None
-    """More such regions, as a YAML file with lines like `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
+    """More regions of interest: a YAML file of lines such as `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
 
     def main(self) -> None:
         """Measure and write.
@@ -100,7 +100,7 @@ class TraitsCommand:
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
 
     def _check(self) -> None:
-        """Refuse now what would fail after minutes."""
+        """Refuse settings that would fail later."""
         if self.splits < 0:
             raise InputError(f"--splits is {self.splits}; give 0 for none, or more.")
         if not 4 <= self.mesh.octree_depth <= 12:
@@ -113,7 +113,7 @@ class TraitsCommand:
             raise InputError("--classes names spectra of a library; give it with --library.")
 
     def _base_height_m(self) -> float | None:
-        """Height of what the object stands on, where it is known."""
+        """Height of the object's base above the turntable, if it is known."""
         if self.mesh.base_height_m is not None or self.data is None:
             return self.mesh.base_height_m
         from hsi_sc_nerf.packed.dataset import open_packed
@@ -124,7 +124,7 @@ class TraitsCommand:
     def _write(
         self, surface: SpectralMesh, size: Size, spread: Size | None, traits: Traits, config: MeshConfig
     ) -> None:
-        """Pictures, the mesh and tables; the page, which names them, comes last."""
+        """Write pictures, mesh and tables, and last the page that links them."""
         from hsi_sc_nerf.analysis import pictures, report
         from hsi_sc_nerf.analysis.closed_mesh import open_edges
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh

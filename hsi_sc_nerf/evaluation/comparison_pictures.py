@@ -1,4 +1,4 @@
-"""A comparison as pictures: curves over the threshold, and both shapes coloured by distance."""
+"""Pictures of a comparison: curves over the threshold, and both surfaces coloured by distance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PANEL_IN = 2.5
 
 
 def colour_limit_m(*distances_m: Float[np.ndarray, "n"]) -> float:
-    """Where the colours end: the largest 95th percentile, so that a few outliers do not make all the rest dark."""
+    """Upper end of the colour scale: the largest 95th percentile, so that outliers do not darken the rest."""
     return max(float(np.percentile(distances, 95)) for distances in distances_m) or 1e-6
 
 
@@ -37,10 +37,10 @@ def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], 
     """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
 
     Args:
-        path: The PNG file.
-        curves: What to draw.
-        knee: Threshold (metres) and F-score (percent) of the curve's knee.
-        chosen: Of the threshold that was asked for, which may lie beyond the curves.
+        path: the PNG file.
+        curves: over the threshold.
+        knee: threshold (metres) and F-score (percent) of the curve's knee.
+        chosen: likewise of ``--threshold-m``, which may lie beyond the curves.
     """
     figure = new_figure(6.0, 3.4)
     axes = figure.subplots()
@@ -63,28 +63,28 @@ def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], 
 
 @rc_context(STYLE)
 def draw_distances(
-    path: Path, shapes: Sequence[tuple[str, Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]], limit_m: float
+    path: Path, surfaces: Sequence[tuple[str, Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]], limit_m: float
 ) -> None:
-    """Points coloured by distance, each shape from two sides, in parallel projection and to one scale.
+    """Points coloured by distance, each surface from two sides, in parallel projection and to one scale.
 
     Args:
-        path: The PNG file.
-        shapes: Title, points and their distances, in metres.
-        limit_m: Where the colours end.
+        path: the PNG file.
+        surfaces: title, points and their distances, in metres.
+        limit_m: upper end of the colour scale.
     """
-    low, high = _extent([points for _, points, _ in shapes])
+    low, high = _extent([points for _, points, _ in surfaces])
     width, height = 1000 * (high[1] - low[1]), 1000 * (high[2] - low[2])
     inch_per_mm = _PANEL_IN / max(width, height)
-    panels = len(shapes) * len(_SIDES)
+    panels = len(surfaces) * len(_SIDES)
     figure = new_figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 0.9)
     rows = figure.subplots(1, panels, squeeze=False, sharey=True)[0]
     for index, (axes, (title, points, distances)) in enumerate(
-        zip(rows, (shape for shape in shapes for _ in _SIDES), strict=True)
+        zip(rows, (surface for surface in surfaces for _ in _SIDES), strict=True)
     ):
         side, sign = _SIDES[index % len(_SIDES)]
         stride = math.ceil(len(points) / _DRAWN_POINTS)
         order = np.argsort(sign * points[::stride, 0])
-        # A side shows about half of the points; twice their spacing leaves hardly a gap.
+        # Each side shows about half of the points; dots of twice their spacing leave few gaps.
         dot_mm = 2.2 * math.sqrt(2.0 * width * height / len(order))
         drawn = _scatter(
             axes,
@@ -106,17 +106,25 @@ def draw_distances(
 
 
 def _extent(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[np.ndarray, np.ndarray]:
-    """Of what is drawn, a few outliers left out."""
+    """Lower and upper bounds of the points, without outliers."""
     low, high = np.percentile(np.concatenate(clouds), (0.1, 99.9), axis=0)
     margin = 0.05 * float((high - low).max())
     return low - margin, high + margin
 
 
 def _scatter(
-    axes: Axes, places: Float[np.ndarray, "n 2"], distances: Float[np.ndarray, "n"], limit: float, size: float
+    axes: Axes, positions: Float[np.ndarray, "n 2"], distances: Float[np.ndarray, "n"], limit: float, size: float
 ) -> PathCollection:
     axes.set_axisbelow(True)
-    across, up = places.T
+    horizontal, vertical = positions.T
     return axes.scatter(
-        across, up, c=distances, s=size, cmap=INDEX_COLOURS, vmin=0, vmax=limit, linewidths=0, rasterized=True
+        horizontal,
+        vertical,
+        c=distances,
+        s=size,
+        cmap=INDEX_COLOURS,
+        vmin=0,
+        vmax=limit,
+        linewidths=0,
+        rasterized=True,
     )

@@ -1,4 +1,4 @@
-"""A comparison's results: tables on the screen and in Markdown, JSON, pictures, the cloud with its distances."""
+"""Results of a comparison: tables, Markdown page, JSON, pictures, and the cloud with its distances."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def score_rows(comparison: Comparison) -> list[list[str]]:
 
 
 def distance_rows(comparison: Comparison) -> list[list[str]]:
-    """Statistics of the distances, both ways."""
+    """Statistics of the distances in both directions."""
     return [
         [label, *(f"{1000 * value:.3f}" for value in asdict(distance_statistics(distances)).values())]
         for label, distances in (
@@ -60,7 +60,7 @@ def screen_tables(comparison: Comparison) -> list[Table]:
 
 
 def summary(comparison: Comparison) -> dict[str, Any]:
-    """Every figure, in metres and percent, as JSON takes it."""
+    """All figures in metres and percent, for JSON."""
     forth, back = comparison.to_reference_m, comparison.to_cloud_m
     curves = {key: values.tolist() for key, values in asdict(comparison.curves).items()}
     return {
@@ -117,11 +117,11 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
             for name in ("knee", "chosen")
         )
         draw_curves(curves, comparison.curves, knee, chosen)
-        shapes = [
+        surfaces = [
             ("cloud", comparison.cloud.points_m, comparison.to_reference_m),
             ("reference", comparison.reference.points_m, comparison.to_cloud_m),
         ]
-        draw_distances(pictures, shapes, limit_m)
+        draw_distances(pictures, surfaces, limit_m)
         write_distance_ply(cloud, comparison.cloud.points_m, comparison.to_reference_m, limit_m)
         page.write_text(_page(comparison, figures, cloud_name, reference_name, limit_m), encoding="utf-8")
 
@@ -184,8 +184,8 @@ def _alignment_sentences(alignment: dict[str, Any]) -> str:
     return (
         f"The cloud was aligned by {methods[alignment['method']]}: turned by {alignment['turn_deg']:.2f} degrees, "
         f"scaled by {alignment['scale']:.5f}. RMS after ICP: {rms}, of the "
-        f"{100 * alignment['matched_fraction']:.1f} % of its points within {1000 * alignment['within_m']:.2f} mm."
-        f"{ambiguous}"
+        f"{100 * alignment['matched_fraction']:.1f} % of its points within "
+        f"{1000 * alignment['within_m']:.2f} mm.{ambiguous}"
     )
 
 

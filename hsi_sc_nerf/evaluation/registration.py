@@ -21,33 +21,33 @@ if TYPE_CHECKING:
     import open3d
 
 NEARLY_CONVERGED = 1e-3
-"""Share of the object's radius: while a start is searched for, a round that moves no point further is the last."""
+"""Fraction of the object's radius: the search for a start ends with a round that moves no point further."""
 MOST_POINTS = 50_000
-"""Points of the reference that take part."""
+"""Points of the reference that are used."""
 SEARCHED_POINTS = 10_000
-"""Points of the reference that take part while a start is searched for."""
+"""Points of the reference that are used while a start is searched for."""
 JUDGED_POINTS = 20_000
-"""Points that tell good fits from bad ones."""
+"""Points by which fits are compared."""
 RESTARTS = 3
 TURN_DEG = 30.0
 SIGNIFICANT = 4.0
-"""A fit is worse than the best one if it is by so many standard errors."""
+"""A fit is worse than the best one if it differs by this many standard errors."""
 SAME_TURN_DEG = 10.0
 ROUNDS = 50
 CONVERGED = 1e-5
-"""Share of the object's radius: a round that moves no point further is the last."""
+"""Fraction of the object's radius: the rounds end when no point moves further."""
 NEIGHBOURS = 30
-"""Points to a tangent plane."""
+"""Points that a tangent plane is fitted to."""
 MOVED_POINTS = 20_000
-"""Points of the cloud that take part in the last rounds."""
+"""Points of the cloud that are used in the last rounds."""
 SEARCH_POINTS = 1_000
-"""Points of the cloud that find the way in the first rounds."""
+"""Points of the cloud that are used in the first rounds."""
 FEWEST_PAIRS = 10
 
 
 @dataclass(frozen=True)
 class Rival:
-    """An attitude that cannot be told from the one that was taken, because the shape is (nearly) symmetric."""
+    """An attitude that fits as well as the one that was taken, because the shape is (nearly) symmetric."""
 
     turn_deg: float
     """Between the two."""
@@ -59,13 +59,13 @@ class Rival:
 
 @dataclass(frozen=True)
 class Registration:
-    """How a cloud was brought into the reference's frame."""
+    """Transform of a cloud into the reference's frame."""
 
     transform: Similarity
     within_m: float
-    """Points further from the reference than this took no part in the last round."""
+    """Points further from the reference than this were not used in the last round."""
     rival: Rival | None = None
-    """What features found besides; None also where only closest points were sought."""
+    """Found by features only."""
 
 
 def refine(
@@ -75,16 +75,18 @@ def refine(
     with_scale: bool = False,
     seed: int = 0,
 ) -> Registration:
-    """Iterative closest points from a start that is roughly right.
-
-    Point to tangent plane (Chen and Medioni 1992), with a scale if asked for.
+    """Iterative closest points, point to tangent plane (Chen and Medioni 1992), from a roughly correct start.
 
     Args:
-        cloud_m: What moves.
-        reference_m: What stays; the denser the better.
-        start: The identity if not given.
-        with_scale: Estimate a scale, too.
-        seed: Of the points drawn, where there are more than take part.
+        cloud_m: moves.
+        reference_m: stays.
+        start: default: the identity.
+        with_scale: also estimate a scale.
+        seed: of the random subsets of the points.
+
+    Example:
+        >>> shifted_m = reference_m + [0.002, 0.0, 0.0]
+        >>> refine(shifted_m, reference_m).transform(shifted_m)  # close to reference_m
     """
     target = Target.of(drawn(reference_m, MOST_POINTS, seed))
     return Registration(*refined(cloud_m, target, start or Similarity(), with_scale, seed))
@@ -99,16 +101,16 @@ def align_by_features(
 ) -> Registration:
     """Align clouds that lie anywhere: fast point feature histograms (Rusu et al. 2009), RANSAC, `refine`.
 
-    The best of several tries is then turned about the cloud's principal axes, in steps of 30 degrees, and refined
-    from there: a turn that fits better takes its place, and one that fits as well, within four standard errors of the
-    mean squared distance, is reported as a rival: the shape does not say how it lies.
+    The best of several tries is then rotated about the cloud's principal axes in steps of 30 degrees and refined from
+    there. A rotation that fits better replaces it. One that fits as well, within four standard errors of the mean
+    squared distance, is reported as a rival: the shape does not determine the attitude.
 
     Args:
-        cloud_m: What moves.
-        reference_m: What stays.
-        with_scale: Estimate a scale, too; it starts at the ratio of the clouds' robust radii.
-        seed: Of all that is random.
-        track: Wrapped around the starts while they are refined, for a progress bar.
+        cloud_m: moves.
+        reference_m: stays.
+        with_scale: also estimate a scale; it starts at the ratio of the clouds' robust radii.
+        seed: of everything random.
+        track: wraps the starts while they are refined, for a progress bar.
     """
     import open3d
 
@@ -120,19 +122,19 @@ def align_by_features(
     thinned = reference.thinned(SEARCHED_POINTS)
     judged_cloud, judged_reference = (drawn(target.points, JUDGED_POINTS, seed) for target in (cloud, reference))
 
-    def found_from(start: Similarity) -> Similarity:
+    def approached_from(start: Similarity) -> Similarity:
         return approached(few, thinned, start, with_scale, NEARLY_CONVERGED * radius)
 
-    def judged(transform: Similarity) -> _Fit:
+    def fit_of(transform: Similarity) -> _Fit:
         # Both ways, so that a cloud shrunk into a corner does not fit.
         forth = reference.off_plane(transform(judged_cloud), radius / 10)
         back = cloud.off_plane(transform.inverse()(judged_reference), radius / 10 / transform.scale)
         return _Fit(transform, np.concatenate([forth, transform.scale * back]) ** 2)
 
     matched = _matched_features(sized(cloud.points), reference.points, radius, with_scale)
-    start = min((judged(found_from(found.after(sized))) for found in matched), key=_Fit.misfit)
-    best = judged(refined(cloud_m, reference, start.transform, with_scale, seed)[0])
-    turned = [judged(found_from(best.transform.after(turn))) for turn in track(_turns(cloud.points))]
+    start = min((fit_of(approached_from(found.after(sized))) for found in matched), key=_Fit.misfit)
+    best = fit_of(refined(cloud_m, reference, start.transform, with_scale, seed)[0])
+    turned = [fit_of(approached_from(best.transform.after(turn))) for turn in track(_rotations(cloud.points))]
     best, *others = sorted([best, *turned], key=_Fit.misfit)
     rivals = ((other, other.transform.after(best.transform.inverse()).turn_deg()) for other in others)
     rival = next(
@@ -160,8 +162,8 @@ class _Fit:
         return bool(more.mean() > SIGNIFICANT * more.std() / np.sqrt(len(more)))
 
 
-def _turns(cloud: np.ndarray) -> list[Similarity]:
-    """Turns about the three principal axes through the cloud's centre."""
+def _rotations(cloud: np.ndarray) -> list[Similarity]:
+    """Rotations about the three principal axes through the cloud's centre."""
     centre = np.median(cloud, axis=0)
     axes = np.linalg.svd(cloud - centre, full_matrices=False)[2]
     turns = []
@@ -197,7 +199,7 @@ def _matched_features(cloud: np.ndarray, reference: np.ndarray, radius: float, w
         )
         return Similarity.from_matrix(found.transformation)
 
-    # Fruit has few features that match both ways; Open3D then takes those of one way, and warns.
+    # Fruit has few mutual matches; Open3D then warns and uses one-way matches.
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         return [tried() for _ in range(RESTARTS)]
 
@@ -217,7 +219,7 @@ def _features(
 
 @dataclass(frozen=True)
 class Target:
-    """Points with what closest-point rounds need of them."""
+    """Reference points with their normals and search tree."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -229,7 +231,7 @@ class Target:
         return cls(points, np.asarray(with_normals(points).normals), cKDTree(points))
 
     def thinned(self, count: int) -> Target:
-        """About so many of the points, with the normals of all of them."""
+        """About ``count`` of the points, with the normals that all points give."""
         chosen = slice(None, None, max(1, len(self.points) // count))
         return Target(self.points[chosen], self.normals[chosen], cKDTree(self.points[chosen]))
 
@@ -243,23 +245,22 @@ class Target:
 
 
 def robust_radius(points: Float[np.ndarray, "n 3"]) -> float:
-    """Median distance of the points from their median: a sphere's radius, and hardly touched by outliers."""
+    """Median distance of the points from their median, which outliers hardly change; for a sphere, its radius."""
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def refined(
     cloud: Float[np.ndarray, "n 3"], target: Target, start: Similarity, with_scale: bool, seed: int
 ) -> tuple[Similarity, float]:
-    """Closest-point rounds from a start that is roughly right, to the end; and within which distance pairs counted.
+    """All closest-point rounds, and the largest distance of the pairs in the last round (metres).
 
-    Pairs count that are closer than a third of the object's radius in the first rounds, and closer than three robust
-    standard deviations in the last, so that outliers and what the reference lacks do not pull.
+    The first rounds pair points closer than a third of the object's radius, the last ones points closer than three
+    robust standard deviations, so that neither outliers nor parts missing in the reference bias the result.
     """
     radius = robust_radius(target.points)
     few, many = (drawn(cloud, count, seed) for count in (SEARCH_POINTS, MOVED_POINTS))
     transform = approached(few, target, start, with_scale, CONVERGED * radius)
     off = target.off_plane(transform(many), radius / 10)
-    # The points' spacing bounds how close a closest point can be expected to be.
     within = min(radius / 10, 3 * 1.4826 * float(np.median(off)) + 2 * _spacing(target))
     return _closest_point_rounds(many, target, transform, within, with_scale, CONVERGED * radius), within
 
@@ -267,7 +268,7 @@ def refined(
 def approached(
     cloud: Float[np.ndarray, "n 3"], target: Target, start: Similarity, with_scale: bool, converged_m: float
 ) -> Similarity:
-    """The first rounds, to pairs at most a tenth of the radius apart, until no point moves further than a bound."""
+    """The first rounds: pairs up to a third, then up to a tenth of the radius apart."""
     radius = robust_radius(target.points)
     transform = start
     for within in (radius / 3, radius / 10):
@@ -298,10 +299,10 @@ def plane_step(
     normals: Float[np.ndarray, "n 3"],
     with_scale: bool = False,
 ) -> Similarity:
-    """The small motion that brings points nearest to their planes in the least-squares sense.
+    """One Gauss-Newton step of point-to-plane registration.
 
-    Linearised in the rotation (and the scale) about the points' centre; what the planes do not determine stays as it
-    is. Low 2004, "Linear Least-Squares Optimization for Point-to-Plane ICP Surface Registration".
+    Linearised in the rotation (and the scale) about the points' centre; motions that the planes do not determine stay
+    0. Low 2004, "Linear Least-Squares Optimization for Point-to-Plane ICP Surface Registration".
     """
     centre = points.mean(axis=0)
     arms = points - centre
@@ -309,7 +310,7 @@ def plane_step(
     if with_scale:
         columns.append(np.einsum("ij,ij->i", arms, normals)[:, None])
     size = float(np.sqrt(np.mean(arms**2))) or 1.0
-    # Turns and stretches in units of length, so that one bound tells which motions are undetermined.
+    # Rotation and scale in units of length, so that one bound finds the undetermined motions.
     units = np.array([size] * 3 + [1.0] * 3 + [size] * with_scale)
     design = np.concatenate(columns, axis=1) / units
     off = np.einsum("ij,ij->i", on_plane - points, normals)
@@ -320,7 +321,7 @@ def plane_step(
 
 
 def with_normals(points: np.ndarray) -> open3d.geometry.PointCloud:
-    """A cloud with normals that point away from its centre."""
+    """An Open3D cloud with normals that point away from its centre."""
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -332,13 +333,13 @@ def with_normals(points: np.ndarray) -> open3d.geometry.PointCloud:
 
 
 def _spacing(target: Target) -> float:
-    """Median distance to the next point."""
+    """Median distance between neighbouring points."""
     few = target.points[:: max(1, len(target.points) // SEARCH_POINTS)]
     return float(np.median(target.tree.query(few, k=2)[0][:, 1]))
 
 
 def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
-    """At most so many of the points, chosen by chance."""
+    """A random subset of at most ``count`` points."""
     points = np.asarray(points, float)
     if len(points) <= count:
         return points

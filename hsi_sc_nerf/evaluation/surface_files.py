@@ -1,4 +1,4 @@
-"""Read what is compared: meshes (PLY, OBJ, STL) and point clouds (PLY), whoever wrote them."""
+"""Read meshes (PLY, OBJ, STL) and point clouds (PLY) of any program."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ FORMATS = (".ply", ".obj", ".stl")
 
 
 def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Vertices, in the file's units, and triangles; a point cloud has 0 of these. Polygons are cut into fans.
+    """Vertices, in the file's unit, and triangles (none for a point cloud). Polygons are triangulated as fans.
 
     Raises:
-        InputError: the file is missing, is of another kind, cannot be read, has no points, or points at no finite
-            place.
+        InputError: the file is missing, has another format, cannot be read, or has no points or points that are not
+            finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -28,7 +28,7 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
         raise InputError(f"{path}: is no file that can be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
     try:
         vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
-    except Exception as error:  # the readers fail in every way there is
+    except Exception as error:  # readers raise errors of many types
         raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
     if not len(vertices):
         raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
@@ -38,7 +38,7 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
 
 
 def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    # Mapped, not read: of a spectral cloud's hundreds of columns three are wanted.
+    # Memory-mapped: only three of a spectral cloud's hundreds of columns are read.
     content = PlyData.read(path)
     vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
     return vertices, ply_triangles(content)

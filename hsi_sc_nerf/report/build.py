@@ -1,4 +1,4 @@
-"""The report of a run, gathered and written."""
+"""Collect and write the report of a run."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CLOUD_POINTS = 50_000
 
 @dataclass(frozen=True)
 class ReportSources:
-    """What a report is made of, beside the run.
+    """Inputs of a report beside the run.
 
     Attributes:
         cloud: PLY of the run; None: ``point_cloud.ply`` in the run's folder, or else the surface is sampled.
@@ -60,7 +60,10 @@ class ReportSources:
 
 
 def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
-    """Write the report of the run in ``folder``, whole or not at all.
+    """Write the report of the run in ``folder``, completely or not at all.
+
+    Example:
+        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
 
     Raises:
         InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
@@ -70,7 +73,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     comparison_path = _given_or_beside(sources.comparison, folder / "comparison.json", "hsi-sc-nerf compare")
     traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
     comparison, traits = (read_json(path) if path else None for path in (comparison_path, traits_path))
-    # What they lack is told before minutes are spent on rendering.
+    # Before the slow rendering, so that unusable files are refused at once.
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
 
     run = _opened(folder)
@@ -112,7 +115,7 @@ def object_section(cloud: SpectralCloud, points: int) -> Section:
 
 
 def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path | None:
-    """The file that was asked for, or the one in the run's folder where there is one."""
+    """The given file, or the one in the run's folder if it exists."""
     if given is None:
         return beside if beside.is_file() else None
     if not given.is_file():
@@ -136,7 +139,7 @@ def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralClo
 
 
 def _rendered(run: TrainedRun, count: int) -> Sequence[HeldOutView]:
-    """Held-out views, with a bar that tells the time left."""
+    """Held-out views, with a progress bar."""
     from hsi_sc_nerf.report.held_out_views import render_held_out
 
     views: list[HeldOutView] = []

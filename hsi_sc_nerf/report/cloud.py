@@ -1,4 +1,4 @@
-"""A spectral cloud made small enough for a page: fewer points, and spectra as numbers of 16 bits in a basis."""
+"""A spectral cloud compressed for the page: fewer points, and spectra as 16-bit coefficients of a basis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hsi_sc_nerf.spectra.indices import INDICES, index_values
 
 _INT16 = 32767
 _MISSING = 65535
-# Neither a screen nor an instrument shows less reflectance than this.
+# Below the resolution of screens and of the instrument.
 TOLERANCE = 5e-4
 MAX_RANK = 32
 
@@ -49,15 +49,12 @@ class CompressedSpectra:
 def compress_spectra(
     spectra: Float[np.ndarray, "n bands"], tolerance: float = TOLERANCE, max_rank: int = MAX_RANK
 ) -> CompressedSpectra:
-    """Principal components as many as it takes to bring the root mean square error of every band below ``tolerance``.
-
-    Spectra of natural surfaces need few: they are smooth. Noise needs all, so there is a largest rank; what was lost
-    is told.
+    """Principal components, as many as every band's root mean square error needs to fall below ``tolerance``.
 
     Args:
         spectra: reflectance, finite.
         tolerance: reflectance.
-        max_rank: most components to take.
+        max_rank: largest number of components.
     """
     mean = spectra.mean(axis=0, dtype=float)
     centred = spectra - mean
@@ -78,7 +75,7 @@ def compress_spectra(
 
 
 def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], float, float]:
-    """Values in 65535 steps from their smallest to their largest, which follow; NaN and infinity are 65535."""
+    """Values as 16-bit counts, and their smallest and largest value; NaN and infinity become 65535."""
     finite = np.isfinite(values)
     low, high = (float(f(values[finite])) for f in (np.min, np.max)) if finite.any() else (0.0, 1.0)
     fractions = (np.where(finite, values, low) - low) / ((high - low) or 1.0)
@@ -86,7 +83,7 @@ def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], f
 
 
 def thinned(cloud: SpectralCloud, max_points: int, seed: int = 0) -> SpectralCloud:
-    """At most ``max_points`` of the points that have a whole spectrum, drawn at random: an even cloud stays even.
+    """A random subset of at most ``max_points`` of the points with a complete spectrum.
 
     Raises:
         InputError: no point has a whole spectrum.
@@ -124,7 +121,7 @@ def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequen
 
 
 def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str, Any]:
-    """What the page's viewer reads (``templates/cloud_data.js``), ready for JSON.
+    """Data of the page's viewer (``templates/cloud_data.js``), for JSON.
 
     Args:
         cloud: the points to show (`thinned`).

@@ -28,7 +28,7 @@ _FLAGGED = {
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """What a JSON file holds; None where there is no such file.
+    """Content of a JSON file; None if it does not exist.
 
     Raises:
         InputError: it is no JSON object.
@@ -50,7 +50,7 @@ def _picture(dataset: PackedDataset, name: str, alt: str) -> list[Markup]:
 
 
 def calibration_section(dataset: PackedDataset) -> Section:
-    """How counts became reflectance, and what that costs in certainty."""
+    """Calibration from counts to reflectance, and the uncertainty of reflectance."""
     found = read_json(dataset.root / "calibration.json")
     blocks: list[Block] = []
     if found is None:
@@ -91,7 +91,7 @@ def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Tabl
             f"{len(dataset.wavelengths_nm)}, {dataset.wavelengths_nm.min():.1f} to "
             f"{dataset.wavelengths_nm.max():.1f} nm",
         ),
-        ("bands left out", f"{len(dataset.bad_bands_nm)}"),
+        ("excluded bands", f"{len(dataset.bad_bands_nm)}"),
         ("white reference", source.get(str(found.get("white_source")), str(found.get("white_source")))),
     ]
     if white:
@@ -102,16 +102,16 @@ def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Tabl
     if noise:
         rows.append(("read noise, median over bands", f"{np.median(noise['read_noise_counts']):.2f} counts"))
         rows.append(("counts per photo-electron", f"{noise['counts_per_electron']:.3f}"))
-    rows.append(("drift of the lamps", _drift_in_words(drift)))
-    return Table("How counts became reflectance.", ("", "found"), rows)
+    rows.append(("drift of the lamps", _drift_text(drift)))
+    return Table("Calibration from counts to reflectance.", ("", "found"), rows)
 
 
-def _drift_in_words(drift: Mapping[str, Any]) -> str:
+def _drift_text(drift: Mapping[str, Any]) -> str:
     if not drift.get("measured"):
         return f"not measured: {drift.get('reason', 'no reason is given')}"
     factors = np.array(list(drift["factor"].values()))
-    words = f"largest {100.0 * np.abs(factors.mean(axis=1) - 1.0).max():.2f} % (mean over bands)"
-    return f"{words}, {'corrected' if drift.get('corrected') else 'not corrected'}, p = {drift['p_value']:.2g}"
+    text = f"largest {100.0 * np.abs(factors.mean(axis=1) - 1.0).max():.2f} % (mean over bands)"
+    return f"{text}, {'corrected' if drift.get('corrected') else 'not corrected'}, p = {drift['p_value']:.2g}"
 
 
 def _values(dataset: PackedDataset) -> int:
@@ -141,7 +141,7 @@ def _flagged_values(dataset: PackedDataset, found: Mapping[str, Any]) -> list[Fi
 
 
 def masks_section(dataset: PackedDataset) -> Section:
-    """Which pixels are the object."""
+    """The object's masks."""
     areas_px: Int[np.ndarray, "frames"] = np.array([np.count_nonzero(frame.mask()) for frame in dataset.frames])
     usual, spread = float(np.median(areas_px)), float(areas_px.std())
     rows = [
@@ -160,7 +160,7 @@ def masks_section(dataset: PackedDataset) -> Section:
     )
     blocks: list[Block] = [
         Table("The object's masks.", ("", "found"), rows),
-        Figure([chart], "Pixels of the object in each frame. A frame that stands out is worth a look below."),
+        Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
     ]
     pictures = _picture(dataset, "masks.png", "Contact sheet of all frames with the outlines of their masks")
     if pictures:
@@ -172,7 +172,7 @@ def masks_section(dataset: PackedDataset) -> Section:
 
 
 def poses_section(dataset: PackedDataset) -> Section:
-    """Where the camera stood, and how sure that is."""
+    """Poses of the camera and their uncertainty."""
     found = read_json(dataset.root / "poses.json")
     if found is None:
         missing = Missing("The dataset has no poses.json, so nothing is known of how its poses were found.", _PROCESS)
@@ -216,7 +216,7 @@ def poses_section(dataset: PackedDataset) -> Section:
 
 
 def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What poses.json tells, as far as it does."""
+    """The entries of poses.json that are there."""
     error, frames, scale = (found.get(key) or {} for key in ("reprojection_error_px", "frames", "scale"))
     uncertainty, steps, lens = (found.get(key) or {} for key in ("uncertainty", "steps_deg", "intrinsics"))
     candidates: list[tuple[str, str, Any]] = [
@@ -234,6 +234,6 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("uncertainty of the distance", "{:.2f} %", uncertainty.get("distance_percent")),
         ("scale by", "{}", scale.get("source") or ("as given" if found.get("metric") else "none: not in metres")),
         ("uncertainty of the scale", "{:.3f} %", scale.get("uncertainty_percent")),
-        ("sightings thrown out", "{}", len(found.get("outliers") or ())),
+        ("rejected sightings", "{}", len(found.get("outliers") or ())),
     ]
     return [(name, pattern.format(value)) for name, pattern, value in candidates if value is not None]

@@ -35,7 +35,7 @@ _PLACE_RADIUS = 1.0 / 64.0
 
 @dataclass(frozen=True, eq=False)
 class HeldOutView:
-    """A held-out view as the report shows it.
+    """A held-out view in the report.
 
     Attributes:
         scores: of the view.
@@ -51,7 +51,7 @@ class HeldOutView:
 
 
 def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
-    """Render ``views`` of the held-out views, evenly spread, one after another; one cube is in memory at a time."""
+    """Render ``views`` of the held-out views, evenly spread; one cube is in memory at a time."""
     import torch
 
     manager, model = run.manager, run.model
@@ -164,10 +164,10 @@ def object_angles(views: Sequence[ViewScores]) -> Float[np.ndarray, "n"]:
     return angles[np.isfinite(angles)]
 
 
-def spread_of_views(count: int, wanted: int) -> list[int]:
-    """Indices of ``wanted`` of ``count`` views, evenly spread; all where there are no more."""
-    wanted = min(count, wanted)
-    return [(2 * i + 1) * count // (2 * wanted) for i in range(wanted)]
+def spread_of_views(count: int, number: int) -> list[int]:
+    """Indices of ``number`` of ``count`` views, evenly spread; at most all."""
+    number = min(count, number)
+    return [(2 * i + 1) * count // (2 * number) for i in range(number)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def place_spectra(
     radius_px: float,
     valid: Bool[np.ndarray, "h w bands"] | None = None,
 ) -> list[PlaceSpectra]:
-    """Spectra of the object's pixels within a circle round each place; values that are not valid count nowhere."""
+    """Spectra of the object's pixels within a circle around each place; invalid values are ignored."""
     lines, samples = np.indices(mask.shape)
     found = []
     for line, sample in places:

@@ -21,7 +21,7 @@ from hsi_sc_nerf.errors import InputError
 _PACKAGE = "hsi_sc_nerf.report"
 _SCRIPTS = ("cloud_data.js", "cloud_renderer.js", "cloud_controls.js")
 WIDEST_PX = 1600
-"""Wider pictures are made smaller: no screen shows more of them in a page."""
+"""Wider pictures are downscaled to this."""
 _QUALITY = 82
 
 
@@ -35,7 +35,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Missing:
-    """What there is not, and what to run to get it."""
+    """A missing result, and the command that makes it."""
 
     kind: ClassVar[str] = "missing"
     text: str
@@ -44,7 +44,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Warnings:
-    """What to be wary of, a sentence each."""
+    """Warnings, a sentence each."""
 
     kind: ClassVar[str] = "warnings"
     sentences: Sequence[str]
@@ -62,7 +62,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures or charts with a caption that tells their units."""
+    """Pictures or charts with a caption that states their units."""
 
     kind: ClassVar[str] = "figure"
     pictures: Sequence[Markup]
@@ -70,12 +70,12 @@ class Figure:
     titles: Sequence[str] = ()
     """Of each picture, where they have any."""
     columns: int = 1
-    """How many stand side by side on a wide screen."""
+    """Number of pictures side by side on a wide screen."""
 
 
 @dataclass(frozen=True)
 class Folded:
-    """What only some readers want to see, opened by a click."""
+    """Details that a click opens."""
 
     kind: ClassVar[str] = "folded"
     summary: str
@@ -141,17 +141,17 @@ def html_page(title: str, subtitle: str, key_figures: Sequence[KeyFigure], secti
 
 
 def _own_text(name: str) -> Markup:
-    """A file of this package, which goes into the page as it is."""
+    """A template file, which is not escaped."""
     return Markup((files(_PACKAGE) / "templates" / name).read_text(encoding="utf-8"))
 
 
 def embedded_array(image: UInt8[np.ndarray, "h w 3"], alt: str) -> Markup:
-    """An ``img`` of an array, without loss; the page shows its pixels as squares."""
+    """An ``img`` of an array, lossless; the page shows its pixels as squares."""
     return _img(Image.fromarray(np.ascontiguousarray(image)), alt, lossless=True, css_class="pixels")
 
 
 def embedded_file(path: Path, alt: str) -> Markup:
-    """An ``img`` of a picture file, made smaller where it is large.
+    """An ``img`` of a picture file, downscaled if it is large.
 
     Raises:
         InputError: the file is no readable picture.

@@ -21,9 +21,8 @@ _STATISTICS = {"mean_m": "mean", "median_m": "median", "rms_m": "RMS", "percenti
 _COMPARE_COMMAND = "hsi-sc-nerf compare CLOUD.ply REFERENCE --output-dir RUN"
 _UNITS = {"m": "m", "m2": "m²", "l": "L", "rad": "rad", "deg": "°", "nm": "nm", "percent": "%"}
 _TRAITS_COMMAND = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
-# What the user named: keys in these are no words of ours, whatever they end in or hold.
+# Keys in these are names that the user gave, not ours.
 _NAMES_IN = ("regions", "areas_m2", "mixture_areas_m2")
-# How traits were measured is no trait.
 _NOT_SHOWN = ("settings", "version")
 Row = tuple[str, str, str, str]
 
@@ -32,7 +31,7 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path | None
     """Precision, recall and F-score over the distance threshold (paper, section "Spatial Evaluation Metrics").
 
     Args:
-        comparison: what ``comparison.json`` holds; None where there is none.
+        comparison: content of ``comparison.json``; None if there is none.
         source: that file. The picture ``distances.png`` beside it is shown as well.
 
     Raises:
@@ -63,7 +62,7 @@ def comparison_key_figure(comparison: Mapping[str, Any]) -> KeyFigure:
 def _blocks(comparison: Mapping[str, Any]) -> list[Block]:
     found, scores = comparison["curves"], comparison["scores"]
     thresholds_mm = _MM_PER_M * np.array(found["thresholds_m"], float)
-    curves = [Curve(name, thresholds_mm, _as_long(found[key], thresholds_mm)) for key, name in _CURVES.items()]
+    curves = [Curve(name, thresholds_mm, _checked_curve(found[key], thresholds_mm)) for key, name in _CURVES.items()]
     marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in _SCORES}
     chart = line_chart(
         curves,
@@ -93,7 +92,7 @@ def _blocks(comparison: Mapping[str, Any]) -> list[Block]:
     ]
 
 
-def _as_long(values: Any, as_these: np.ndarray) -> np.ndarray:
+def _checked_curve(values: Any, as_these: np.ndarray) -> np.ndarray:
     array = np.array(values, float)
     if array.shape != as_these.shape:
         raise ValueError("a curve has not as many values as thresholds")
@@ -101,10 +100,10 @@ def _as_long(values: Any, as_these: np.ndarray) -> np.ndarray:
 
 
 def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None) -> Section:
-    """Whatever was found of the object's shape and spectra.
+    """The object's traits.
 
     Args:
-        traits: what ``traits.json`` holds; None where there is none.
+        traits: content of ``traits.json``; None if there is none.
         source: that file, for the error's text.
 
     Raises:
@@ -125,7 +124,7 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None)
 
 
 def _without_lists(content: Any) -> Any:
-    """Nested mappings without what they hold in lists of mappings."""
+    """Nested mappings without lists of mappings."""
     if not isinstance(content, Mapping):
         return content
     parts = {key: part for key, part in content.items() if not _lists_mappings(part)}
@@ -175,14 +174,14 @@ def trait_rows(
 
 
 def _split(key: str) -> tuple[str, str]:
-    """A key as words, and the unit that it ends in."""
+    """A key as words, and the unit of its ending."""
     stem, _, end = key.rpartition("_")
     word, unit = (stem, _UNITS[end]) if stem and end in _UNITS else (key, "")
     return word.replace("_", " "), unit
 
 
 def _text(value: Any) -> str:
-    """Numbers with four digits, lists with commas, nothing for nothing."""
+    """Text of a value: numbers with four digits, lists with commas, nothing for None."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -36,11 +36,11 @@ Scalars = dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 """Steps and values by TensorBoard's tag."""
 _CHECKPOINT = re.compile(r"step-(\d+)\.ckpt")
 MOST_POINTS = 400
-"""Longer curves are drawn as means over as many pieces: more would not be seen, and would make the page large."""
+"""Longer curves are averaged to this many points."""
 
 
 def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section:
-    """Curves of whatever was logged, with the ends of the stages.
+    """Curves of the logged scalars, with the ends of the stages.
 
     Args:
         scalars: `read_scalars` of the run.
@@ -82,7 +82,7 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
 
 
 def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
-    """Curves of the tags that were logged, but for those that stay tiny beside the largest."""
+    """Curves of the logged tags, without those that are tiny beside the largest."""
     found = {name: scalars[tag] for tag, name in tags.items() if tag in scalars}
     heights = {name: np.nanmax(np.abs(values), initial=0.0) for name, (_, values) in found.items()}
     least = _SMALLEST_FRACTION * max(heights.values(), default=0.0)
@@ -120,7 +120,7 @@ def package_versions() -> dict[str, str]:
 
 
 def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], machine: Mapping[str, str]) -> Section:
-    """What the run was made with.
+    """Settings of the run, machine and package versions.
 
     Args:
         settings: of the run (`flat_settings`).
@@ -142,7 +142,7 @@ def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], m
 
 
 def read_scalars(run: Path) -> Scalars:
-    """All scalars that the run logged, by tag; empty where it has no events. Of a resumed run, one value a step."""
+    """All logged scalars by tag; empty without events. A resumed run has one value a step."""
     if not any(run.glob("events.out.tfevents.*")):
         return {}
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
@@ -160,7 +160,7 @@ def read_scalars(run: Path) -> Scalars:
 def shortened(
     steps: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"], most: int = MOST_POINTS
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-    """Means of at most ``most`` pieces of equal length, the curve itself where it is no longer."""
+    """The curve averaged to at most ``most`` points."""
     if len(steps) <= most:
         return steps, values
     starts = np.arange(most) * len(steps) // most
@@ -169,7 +169,7 @@ def shortened(
 
 
 def stage_ends(run: Path) -> dict[str, int]:
-    """How many steps were done when each finished stage ended, by the stage's name, the first one first."""
+    """Steps done at the end of each finished stage, by its name, in order."""
     ends = {}
     for folder in run.glob("stage-*"):
         steps = [int(match[1]) for path in folder.iterdir() if (match := _CHECKPOINT.fullmatch(path.name))]

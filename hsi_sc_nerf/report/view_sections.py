@@ -60,7 +60,7 @@ def metric_key_figures(views: Sequence[ViewScores]) -> list[KeyFigure]:
 
 
 def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
-    """What was measured, what was rendered, and how they differ.
+    """Measured and rendered views, and maps of their differences.
 
     Args:
         views: those that were rendered.
@@ -78,7 +78,7 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
     ]
     for index in spread_of_views(len(views), PICTURED_VIEWS):
         view = views[index]
-        crop = around(view.scores.mask)
+        crop = crop_around(view.scores.mask)
         inside = torch.from_numpy(view.scores.mask[crop])
         maps = (
             (view.scores.angle_rad, ANGLE_DRAWN_RAD, ANGLE_COLOURS, "Map of the spectral angle"),
@@ -88,17 +88,17 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
             embedded_array(view.measured_rgb[crop], f"{view.scores.name} as measured, pseudo-RGB"),
             embedded_array(view.rendered_rgb[crop], f"{view.scores.name} as rendered, pseudo-RGB"),
         ]
-        for values, drawn, colours, words in maps:
+        for values, drawn, colours, label in maps:
             shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
             picture = to_8_bit(coloured(shown, drawn, colours).numpy())
-            pictures.append(embedded_array(picture, f"{words} of {view.scores.name}"))
+            pictures.append(embedded_array(picture, f"{label} of {view.scores.name}"))
         metrics = view.scores.metrics
         caption = f"{view.scores.name}: SAM {metrics['sam']:.4f} rad, RMSE {metrics['rmse']:.4f}."
         blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
     return Section("views", "Held-out views", blocks)
 
 
-def around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+def crop_around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     """Lines and samples of the mask with a margin; everything where it is empty."""
     lines, samples = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(lines):
@@ -153,7 +153,7 @@ def bands_section(
     angles = object_angles(views)
     if len(angles):
         charts["Spectral angle"] = _angle_histogram(angles)
-        caption += f" {_angles_in_words(angles)}"
+        caption += f" {_angle_sentence(angles)}"
     figure = Figure(list(charts.values()), caption, list(charts), columns=2)
     return Section("bands", "Accuracy by band and pixel", [figure])
 
@@ -171,7 +171,7 @@ def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
     )
 
 
-def _angles_in_words(angles: Float[np.ndarray, "n"]) -> str:
+def _angle_sentence(angles: Float[np.ndarray, "n"]) -> str:
     middle, high = np.percentile(angles, (50.0, 95.0))
     return (
         f"Spectral angle between measurement and rendering, {len(angles)} pixels of the object: mean "
@@ -233,7 +233,7 @@ def _spectrum_chart(
 
 def _marked(view: HeldOutView) -> UInt8[np.ndarray, "h w 3"]:
     """The measured picture round the object, enlarged, with a lettered ring at each place."""
-    lines, samples = around(view.scores.mask)
+    lines, samples = crop_around(view.scores.mask)
     crop = np.ascontiguousarray(view.measured_rgb[lines, samples])
     scale = max(1, round(_MARKED_PX / crop.shape[0]))
     image = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""Which bands of an instrument stand for the wavelengths that a formula names."""
+"""Bands of an instrument for the wavelengths of a formula."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Spectra = TypeVar("Spectra", np.ndarray, Tensor)
 """Reflectance, bands last: an array or a tensor on any device."""
 
 NEAR_NM = 10.0
-"""A band whose centre is this near stands for a wavelength; so does one nearer than half the distance of bands."""
+"""A band represents a wavelength if it is this near, or nearer than half the spacing of the bands."""
 FAR_NM = 30.0
-"""A band further away than this does not, however far apart the bands are."""
+"""Largest distance at which a band represents a wavelength."""
 
 
 def covered(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Sequence[float]) -> Bool[np.ndarray, "targets"]:
-    """Which of the wavelengths that one formula names have a band near enough to stand for them, and only for them.
+    """Which wavelengths of a formula have a band near them that no other of its wavelengths has.
 
-    Not those beyond the ends or in a gap; nor two that share a band, of which any ratio is 1 and any difference 0.
+    Two wavelengths with the same band are not covered, because their ratio would always be 1.
     """
     targets = np.asarray(targets_nm, float)
     spacing_nm = np.median(np.diff(np.sort(wavelengths_nm))) if len(wavelengths_nm) > 1 else 0.0
@@ -37,10 +37,10 @@ def covered(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Sequence[flo
 def require_bands(
     wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Sequence[float], what: str
 ) -> Int[np.ndarray, "targets"]:
-    """Index of the band that stands for each wavelength, which ``what`` is made of.
+    """Index of the band for each wavelength of ``what``.
 
     Raises:
-        InputError: a wavelength has no band near it, or none that stands for it alone.
+        InputError: a wavelength is not `covered`.
     """
     missing = np.asarray(targets_nm, float)[~covered(wavelengths_nm, targets_nm)]
     if len(missing):

@@ -1,4 +1,4 @@
-"""Named false-colour composites: three bands that make visible what the eye does not see."""
+"""Named false-colour composites of three bands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Composite:
     wavelengths_nm: tuple[float, float, float]
     """Shown as red, green, blue."""
     shows: str
-    """What it is good for."""
+    """What it makes visible."""
 
 
 COMPOSITES = {

@@ -14,22 +14,22 @@ from hsi_sc_nerf.spectra.bands import Spectra, require_bands
 
 @dataclass(frozen=True)
 class SpectralIndex:
-    """An index and how to draw it."""
+    """A spectral index."""
 
     name: str
     expression: str
-    """As it is printed: R800 is the reflectance at 800 nm."""
+    """Printed formula: R800 is the reflectance at 800 nm."""
     wavelengths_nm: tuple[float, ...]
     formula: Callable[..., Any]
     """Of the reflectances at ``wavelengths_nm``, in their order (`Spectra`)."""
     drawn_range: tuple[float, float]
-    """Values at the two ends of a colour map; those of plant tissue lie between."""
+    """Values at the two ends of a colour map; plant tissue lies between."""
     tells: str
     reference: str
 
 
 def ratio(numerator: Float[Spectra, "*shape"], denominator: Float[Spectra, "*shape"]) -> Float[Spectra, "*shape"]:
-    """``numerator / denominator``; NaN where the denominator is not positive: reflectance that dark has no ratio."""
+    """``numerator / denominator``; NaN where the denominator is not positive."""
     positive = denominator > 0
     with np.errstate(invalid="ignore"):
         return (numerator * positive) / (denominator * positive)
@@ -78,7 +78,7 @@ INDICES = {
 def index_values(
     index: SpectralIndex, spectra: Float[Spectra, "*shape bands"], wavelengths_nm: Float[np.ndarray, "bands"]
 ) -> Float[Spectra, "*shape"]:
-    """The index of each spectrum, from the bands nearest to its wavelengths; NaN where it is not defined.
+    """The index of each spectrum, from the bands nearest to its wavelengths; NaN where it is undefined.
 
     Args:
         index: which, one of ``INDICES`` or a new one.
@@ -87,6 +87,11 @@ def index_values(
 
     Raises:
         InputError: a wavelength of the index has no band near it.
+
+    Example:
+        >>> spectra = np.array([[0.05, 0.45]])
+        >>> index_values(INDICES["NDVI"], spectra, np.array([670.0, 800.0]))
+        array([0.8])
     """
     bands = require_bands(wavelengths_nm, index.wavelengths_nm, index.name)
     return index.formula(*(spectra[..., int(band)] for band in bands))

@@ -171,7 +171,7 @@ def test_command_refuses_what_it_cannot_use(tmp_path, settings, says):
 
 @pytest.mark.parametrize(("bands", "says"), [(slice(None), "covers the cloud"), (slice(3, 4), "has one band")])
 def test_a_library_that_does_not_fit_is_refused_before_the_work(tmp_path, monkeypatch, bands, says):
-    monkeypatch.setattr("hsi_sc_nerf.analysis.poisson.closed_mesh", None)
+    monkeypatch.setattr("hsi_sc_nerf.analysis.closed_mesh.closed_mesh", None)
     nothing = np.zeros((2, 3))
     spectra = np.ones((2, len(NM[bands])))
     cloud = SpectralCloud(nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
