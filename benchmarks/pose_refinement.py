@@ -34,6 +34,7 @@ from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.dataparser import scene_scaling
 from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
 from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.geometry.similarity import Similarity
 from hsi_sc_nerf.models.staged_trainer import StagedTrainer, StagedTrainerConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, write_transforms
 from hsi_sc_nerf.processing.process import process_session
@@ -185,15 +186,15 @@ class PoseRefinementBenchmark:
         frames = np.arange(len(refined))
         train = trainer.pipeline.datamanager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
         held_out = np.setdiff1d(frames, train)
-        fit = Similarity.between(refined[train], true_poses[train])
-        aligned = fit.poses(refined)
+        fit = align_poses(refined[train], true_poses[train])
+        aligned = transformed_poses(fit, refined)
         degrees = np.array([rotation_angle_deg(a, b) for a, b in zip(aligned, true_poses, strict=True)])
         mm = 1000 * np.linalg.norm(aligned[:, :3, 3] - true_poses[:, :3, 3], axis=1)
         mesh = truth.mesh()
         reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
         return {
             **{name: metrics[name] for name in ("sam", "rmse", "ssim", "psnr")},
-            "f_score": precision_recall_f_score(fit.points(_cloud_m(trainer)), reference).f_score,
+            "f_score": precision_recall_f_score(fit(_cloud_m(trainer)), reference).f_score,
             "train_deg": float(degrees[train].mean()),
             "train_mm": float(mm[train].mean()),
             "held_out_deg": float(degrees[held_out].mean()),
@@ -221,34 +222,22 @@ class PoseRefinementBenchmark:
         return trainer
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """Points x of one frame are ``scale * rotation @ x + shift`` in another."""
+def align_poses(poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
+    """The similarity that brings poses closest to a reference: first their orientations, then their positions."""
+    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], poses[:, :3, :3]))
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    turned, target = poses[:, :3, 3] @ rotation.T, reference[:, :3, 3]
+    centred = turned - turned.mean(axis=0)
+    scale = float(np.sum(centred * target) / np.sum(centred**2))
+    return Similarity(scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0))
 
-    rotation: Float[np.ndarray, "3 3"]
-    scale: float
-    shift: Float[np.ndarray, "3"]
 
-    @classmethod
-    def between(cls, poses: Float[np.ndarray, "n 4 4"], wanted: Float[np.ndarray, "n 4 4"]) -> Similarity:
-        """The one that brings poses closest to others: first their orientations, then their positions."""
-        left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", wanted[:, :3, :3], poses[:, :3, :3]))
-        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-        turned, there = poses[:, :3, 3] @ rotation.T, wanted[:, :3, 3]
-        centred = turned - turned.mean(axis=0)
-        scale = float(np.sum(centred * there) / np.sum(centred**2))
-        return cls(rotation, scale, there.mean(axis=0) - scale * turned.mean(axis=0))
-
-    def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points of the one frame in the other."""
-        return self.scale * points @ self.rotation.T + self.shift
-
-    def poses(self, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-        """Camera-to-world poses of the one frame in the other."""
-        moved = poses.copy()
-        moved[:, :3, :3] = self.rotation @ poses[:, :3, :3]
-        moved[:, :3, 3] = self.points(poses[:, :3, 3])
-        return moved
+def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Camera-to-world poses in the frame that the similarity leads to."""
+    moved = poses.copy()
+    moved[:, :3, :3] = similarity.rotation @ poses[:, :3, :3]
+    moved[:, :3, 3] = similarity(poses[:, :3, 3])
+    return moved
 
 
 @torch.no_grad()
@@ -257,7 +246,7 @@ def _refined_poses(trainer: StagedTrainer, dataset: PackedDataset) -> Float[np.n
     centre, scale = scene_scaling(dataset.scene_box_m)
     poses = dataset.camera_to_worlds
     poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
-    # Double precision, since micrometres and thousandths of a degree are asked for.
+    # Double precision, for micrometres and thousandths of a degree.
     refinement = copy.deepcopy(trainer.pipeline.model.camera_optimizer).cpu().double()
     refined = refinement.corrected(torch.arange(len(poses)), torch.from_numpy(poses)).numpy()
     refined[:, :3, 3] = refined[:, :3, 3] / scale + centre

@@ -6,7 +6,7 @@ Two rules hold for every function here:
   products and reciprocals of any finite input neither overflow nor vanish and nothing cancels. Results are float32
   (float64 for float64 input). Float64 input has nothing wider: it is good for magnitudes of 1e-150 to 1e150.
 - Finite input gives finite values and finite gradients; what would leave the range of its type stops at the largest
-  number of that type. NaN and infinity in the input are not hidden: they come out as they would anywhere else.
+  number of that type. NaN and infinity in the input are not hidden, but propagate to the output.
 
 A **zero spectrum** has no direction. Its cosine with anything is taken as 0, as in the paper's formulas with their
 small constant in the denominator: the spectral angle is pi / 2, one minus the cosine is 1, and the gradient is 0.
@@ -81,7 +81,7 @@ def safe_ratio(
 ) -> Float[Tensor, "*shape"]:
     """``numerator / denominator`` where ``|denominator| > minimum``, else ``fallback`` with gradient 0.
 
-    The shapes broadcast. A dead band of a white reference, for instance, divides nothing.
+    The shapes broadcast. A dead band of a white reference, for example, gives the fallback.
     """
     wide = widen(denominator)
     usable = ~(wide.abs() <= minimum)
@@ -112,10 +112,14 @@ def _direction(spectra: Tensor, dim: int, norm_floor: float) -> tuple[Tensor, Te
 def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: int = -1) -> Float[Tensor, "*rest"]:
     """Angle between spectra along ``dim``, radians in [0, pi] (Kruse et al. 1993; paper, Eq. SAM).
 
-    Not from the arc cosine, whose rounding hides angles below 3e-4 in float32, but from the difference and the sum
-    of the unit vectors, ``2 atan2(|u - v|, |u + v|)`` (Kahan, "How Futile are Mindless Assessments of Roundoff",
-    2006), which is accurate at every angle and does not depend on the spectra's scale. Against a zero spectrum the
-    angle is pi / 2. The gradient is 0 where the spectra are parallel, opposite or zero.
+    The angle is ``2 atan2(|u - v|, |u + v|)`` of the unit vectors (Kahan, "How Futile are Mindless Assessments of
+    Roundoff", 2006), accurate at every angle and independent of the spectra's scale. The arc cosine would lose angles
+    below 3e-4 to rounding in float32. The angle to a zero spectrum is pi / 2. The gradient is 0 where the spectra are
+    parallel, opposite or zero.
+
+    Example:
+        >>> spectral_angle(torch.tensor([1.0, 0.0]), torch.tensor([2.0, 2.0]))
+        tensor(0.7854)
     """
     u, u_short = _direction(widen(a), dim, 0.0)
     v, v_short = _direction(widen(b), dim, 0.0)
@@ -135,8 +139,8 @@ def one_minus_cosine(
         a: Spectra.
         b: Spectra of the same shape.
         dim: The dimension that holds the bands.
-        norm_floor: Norms below this count as this, which bounds the gradient, 1 / norm otherwise. Such a spectrum's
-            cosine shrinks to 0 with it. Spectra above the floor are not touched: scale does not matter.
+        norm_floor: Lower bound of the norms in the denominator, which bounds the gradient. The cosine of a spectrum
+            below it shrinks to 0 with the norm; spectra above it are not affected.
     """
     u, u_short = _direction(widen(a), dim, norm_floor)
     v, v_short = _direction(widen(b), dim, norm_floor)
@@ -146,9 +150,9 @@ def one_minus_cosine(
 def select_pixels(
     values: Float[Tensor, "*pixels bands"], mask: Bool[Tensor, "*pixels"] | None
 ) -> Float[Tensor, "n bands"]:
-    """The spectra of the pixels that the mask selects (all without one), one a row.
+    """The spectra of the pixels in the mask (None for all), one a row.
 
-    What is left out, NaN included, touches neither values nor gradients of what follows.
+    Other pixels, NaN included, affect neither values nor gradients.
 
     Raises:
         ValueError: the mask is not boolean, or its shape is not that of the pixels.
@@ -164,7 +168,7 @@ def select_pixels(
 
 
 def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | None = None) -> Float[Tensor, ""]:
-    """Mean over the selected values (all without a mask); 0 with gradient 0 where nothing is selected.
+    """Mean over the values in the mask (None for all); 0 with gradient 0 if there are none.
 
     Raises:
         ValueError: the mask is not boolean, or its shape is not that of the values.

@@ -11,7 +11,7 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 
 CELLS_PER_PIXEL = 2.0
 """Cells along what one pixel covers at the object. Four resolve more, but gain nothing at equal time
-(docs/dead_ends.md)."""
+(docs/notes/dead_ends.md)."""
 COARSEST_GRID = 16
 """Cells along the scene box in the first level, nerfacto's."""
 LEVEL_GROWTH = 1.38

@@ -25,7 +25,7 @@ from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
 BRIGHTNESS_GAIN = 0.05
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
-explains the views before a surface forms (docs/dead_ends.md)."""
+explains the views before a surface forms (docs/notes/dead_ends.md)."""
 
 
 class SpectralField(NerfactoField):

@@ -1,4 +1,4 @@
-"""Skip training steps that turn non-finite, and stop a run that keeps doing so."""
+"""Training steps with non-finite losses or gradients are skipped; too many in a row stop the run."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ class TrainingDivergedError(RuntimeError):
 
 
 def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
-    """Names of the tensors that hold an infinity or a NaN."""
+    """Names of the tensors that contain an infinity or a NaN."""
     if not values:
         return []
-    # The sum of a tensor is finite only if all its elements are; one transfer from the device for all.
+    # The sum of a tensor is finite only if all its elements are. Stacking the sums needs one transfer from the GPU.
     sums = torch.stack([value.detach().float().sum() for value in values.values()])
     return [name for name, finite in zip(values, torch.isfinite(sums).tolist(), strict=True) if not finite]
 
 
 class GuardedOptimizers(Optimizers):
-    """nerfstudio's optimisers, except that a step with a non-finite gradient changes nothing.
+    """nerfstudio's optimisers, which skip a step with a non-finite gradient.
 
     Attributes:
         skipped_groups: parameter groups whose gradient was not finite in the last step; empty after a good one.
@@ -36,9 +36,8 @@ class GuardedOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """Step the optimisers of ``param_groups``, or none of them.
 
-        With mixed precision the scaler skips steps itself, each optimiser's by itself, and halves its scale: that is
-        by design as long as the scale is large, and a skipped step like any other once it is below 1. It is noticed
-        at the step after it.
+        With mixed precision, the gradient scaler skips steps and halves its scale, as designed while the scale is
+        large. Once it is below 1, such a step counts as skipped, at the step after it.
         """
         if grad_scaler.is_enabled():
             scale = grad_scaler.get_scale()
@@ -58,10 +57,10 @@ class GuardedOptimizers(Optimizers):
 
 
 class NonFiniteGuard:
-    """Counts skipped steps in a row.
+    """Counter of consecutive skipped steps.
 
     Args:
-        limit: this many in a row end the run.
+        limit: number of consecutive skipped steps that ends the run.
     """
 
     def __init__(self, limit: int) -> None:
@@ -69,7 +68,7 @@ class NonFiniteGuard:
         self.in_a_row = 0
 
     def record(self, step: int, losses: Iterable[str], groups: Iterable[str]) -> str | None:
-        """Take note of a step; returns a sentence to print where it was skipped.
+        """Record a step; returns a sentence to print if it was skipped, else None.
 
         Args:
             step: the step.
@@ -79,12 +78,12 @@ class NonFiniteGuard:
         Raises:
             TrainingDivergedError: this was the last of ``limit`` skipped steps in a row.
         """
-        culprits = [f"loss {name}" for name in losses] or [f"gradient of {name}" for name in groups]
-        if not culprits:
+        causes = [f"loss {name}" for name in losses] or [f"gradient of {name}" for name in groups]
+        if not causes:
             self.in_a_row = 0
             return None
         self.in_a_row += 1
-        sentence = f"step {step} skipped: {', '.join(culprits)} not finite"
+        sentence = f"step {step} skipped: {', '.join(causes)} not finite"
         if self.in_a_row >= self.limit:
             raise TrainingDivergedError(
                 f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate, or look for "

@@ -35,7 +35,7 @@ class PoseRefinementConfig(CameraOptimizerConfig):
     """Degrees of freedom. turntable: the camera before the axis, and the table's angle in each frame. free: a
     rotation and a shift of each frame. free-discarded: the same, reset to zero after the first stage and never
     applied to held-out views, as in the paper's published code. off: none. auto: off for poses from markers, which
-    training does not improve (docs/poses.md), turntable for all others."""
+    training does not improve (docs/concepts/poses.md), turntable for all others."""
     angle_l2_penalty: float = 1e-2
     """Penalty on the frames' angle corrections (radians), in mode turntable."""
 

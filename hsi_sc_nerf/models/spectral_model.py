@@ -67,7 +67,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the proposal loss."""
     distortion_loss_mult: float = 0.02
     """Weight of the distortion loss, which concentrates the density along a ray. nerfacto's 0.002 leaves surfaces
-    thicker, and with 0.2 no surface forms (docs/accuracy_and_time.md)."""
+    thicker, and with 0.2 no surface forms (docs/validation/reconstruction.md)."""
     orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
     """Weight of the orientation loss on computed normals."""
     pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
