@@ -27,14 +27,14 @@ from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.processing.calibrated_frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.scores.calibration import CalibrationScore, score_calibration
+from hsi_sc_nerf.simulate.scores.processing import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
 FALLOFF = "{illumination_falloff: {edge_loss: 0.2}}"
 DRIFT = "{lamp_drift: {percent: -6, temperature_change_k: -80}}"
 SENSOR = (
-    "{bad_pixels: {dead_share: 0.001, hot_share: 0.001, dead_bands: 2}}",
+    "{bad_pixels: {dead_fraction: 0.001, hot_fraction: 0.001, dead_bands: 2}}",
     "gloss",
     "{saturation: {exposure_factor: 1.6}}",
     "{tarp_exposure: {exposure_factor: 0.6}}",
@@ -120,7 +120,7 @@ def _cells(score: CalibrationScore) -> list[str]:
         f"{score.noise_rms:.4f}",
         f"{score.error_over_uncertainty:.2f}",
         f"{100.0 * score.drift_rms:.3f}",
-        f"{100.0 * score.flagged_share:.2f}",
+        f"{100.0 * score.flagged_fraction:.2f}",
     ]
 
 

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.effects import EFFECTS
-from hsi_sc_nerf.simulate.frames import Capture, Simulation
+from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 
 COLUMNS = [
@@ -100,7 +100,7 @@ def _make(scene: Scene) -> _Made:
     )
 
 
-def _above_dark(capture: Capture) -> Float[np.ndarray, "lines samples bands"]:
+def _above_dark(capture: SimulatedCapture) -> Float[np.ndarray, "lines samples bands"]:
     return capture.counts.astype(float) - capture.dark.mean(axis=0)
 
 

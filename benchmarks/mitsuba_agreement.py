@@ -49,7 +49,7 @@ class Ours:
 
     Attributes:
         radiance: relative to the white tarp's, the chamber as bright as in Mitsuba.
-        weights: share of each material in each pixel; the last one is the chamber.
+        weights: fraction of each material in each pixel; the last one is the chamber.
         materials: their names.
         ray_grid: error of our evenly spaced rays (RMS), from two numbers of rays a pixel in even light.
         seconds: for light and frame together.
@@ -73,7 +73,7 @@ class Agreement:
         monte_carlo: the part of it that Mitsuba's random numbers explain.
         ray_grid: the part that our evenly spaced rays explain.
         bias: mean of Mitsuba minus ours, and its standard error.
-        bias_of_material: the same for each material, pixels weighted by its share.
+        bias_of_material: the same for each material, pixels weighted by its fraction.
         seconds: one rendering of ours, one of Mitsuba's.
     """
 

@@ -93,7 +93,7 @@ def show_table(
         ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
         ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
         ("reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"),
-        ("values flagged, %", f"{100 * processing.flagged_share:.2f}", "-"),
+        ("values flagged, %", f"{100 * processing.flagged_fraction:.2f}", "-"),
         ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
     ):
         steps_table.add_row(title, reached, target)

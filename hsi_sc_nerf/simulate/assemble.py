@@ -10,23 +10,23 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
+from hsi_sc_nerf.simulate import own_mesh, plants, target
 from hsi_sc_nerf.simulate.effects import of_stage
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
-from hsi_sc_nerf.simulate.objects import Cylinder, MaizeEar, Object, OwnMesh, Sphere
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
-from hsi_sc_nerf.simulate.scene import Camera, Scene
+from hsi_sc_nerf.simulate.scene import CameraSettings, Cylinder, MaizeEar, Object, OwnMesh, Scene, Sphere
 
 
-def intrinsics(camera: Camera) -> PinholeIntrinsics:
+def intrinsics(camera: CameraSettings) -> PinholeIntrinsics:
     """The pinhole camera of the scene: square image, principal point in its middle."""
     focal_px = camera.size_px / 2.0 / np.tan(np.deg2rad(camera.field_of_view_deg) / 2.0)
     centre = camera.size_px / 2.0
     return PinholeIntrinsics(camera.size_px, camera.size_px, focal_px, focal_px, centre, centre)
 
 
-def first_camera(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """Camera-to-world of the first frame: above the x axis, looking at the turntable's axis."""
+def first_camera(camera: CameraSettings) -> Float[np.ndarray, "4 4"]:
+    """CameraSettings-to-world of the first frame: above the x axis, looking at the turntable's axis."""
     elevation = np.deg2rad(camera.elevation_deg)
     aim = np.array([0.0, 0.0, camera.aim_height_m])
     return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
@@ -61,28 +61,28 @@ def object_part(scene: Scene) -> Part:
 def _object_on_zero(thing: Object, rng: np.random.Generator) -> Part:
     """The object, standing on z = 0."""
     if isinstance(thing, Sphere):
-        return _plain(shapes.sphere(thing.height_m), thing.material)
+        return _plain(sphere(thing.height_m), thing.material)
     if isinstance(thing, Cylinder):
-        return _plain(shapes.cylinder(thing.diameter_m, thing.height_m), thing.material)
+        return _plain(cylinder(thing.diameter_m, thing.height_m, SEGMENTS, VERTEX_SPACING_M), thing.material)
     if isinstance(thing, OwnMesh):
         mesh, weights = own_mesh.load(thing)
         return Part(mesh, thing.materials, weights)
     if isinstance(thing, MaizeEar):
-        shape = shapes.maize(thing.height_m, rng)
-        return Part(shape.mesh, texture.MAIZE_MATERIALS, texture.maize_weights(shape, thing, rng))
-    shape = {"pear": shapes.pear, "apple": shapes.apple}[thing.shape](thing.height_m, rng)
-    return Part(shape.mesh, texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng))
+        shape = plants.maize(thing.height_m, rng)
+        return Part(shape.mesh, plants.MAIZE_MATERIALS, plants.maize_weights(shape, thing, rng))
+    shape = {"pear": plants.pear, "apple": plants.apple}[thing.shape](thing.height_m, rng)
+    return Part(shape.mesh, plants.FRUIT_MATERIALS[thing.shape], plants.fruit_weights(shape, thing, rng))
 
 
-def support_parts(scene: Scene, step_m: float | None = None) -> list[Part]:
-    """Disc, container, and the markers on both; ``step_m`` as in `build_renderer`.
+def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
+    """Disc, container, and the markers on both; ``spacing_m`` as in `build_renderer`.
 
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
     parts = [
-        _plain(target.disc_mesh(scene.turntable, step_m), "disc"),
-        _plain(target.container_mesh(scene.container, step_m), "container_plastic"),
+        _plain(target.disc_mesh(scene.turntable, spacing_m), "disc"),
+        _plain(target.container_mesh(scene.container, spacing_m), "container_plastic"),
     ]
     on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
@@ -97,18 +97,18 @@ def build_renderer(
     thing: Part,
     offset_m: Float[np.ndarray, "3"] | float = 0.0,
     extra_materials: Sequence[str] = (),
-    step_m: float | None = None,
+    spacing_m: float | None = None,
 ) -> Renderer:
     """The renderer of the whole scene around its object (from `object_part`), its support shifted by ``offset_m``.
 
-    ``extra_materials`` get columns of their own, for what is seen where rays miss everything. With ``step_m`` the
+    ``extra_materials`` get columns of their own, for what is seen where rays miss everything. With ``spacing_m`` the
     same surfaces have vertices at most about so far apart (metres), for light that is computed there.
     """
-    support = support_parts(scene, step_m)
+    support = support_parts(scene, spacing_m)
     parts = [thing, *(replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support)]
-    if step_m is not None:
+    if spacing_m is not None:
         # The diagonal of a square of that side is left whole.
-        parts = [part.refined(1.5 * step_m) for part in parts]
+        parts = [part.refined(1.5 * spacing_m) for part in parts]
     return Renderer(parts, extra_materials=extra_materials)
 
 

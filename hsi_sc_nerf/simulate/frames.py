@@ -11,10 +11,9 @@ from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble, sensor
-from hsi_sc_nerf.simulate.colours import colour_spectra
 from hsi_sc_nerf.simulate.effects import of_stage, stages
 from hsi_sc_nerf.simulate.effects.stages import effect_rng
-from hsi_sc_nerf.simulate.light import Light
+from hsi_sc_nerf.simulate.light import Light, colour_spectra
 from hsi_sc_nerf.simulate.lighting import Lighting
 from hsi_sc_nerf.simulate.materials import endmembers, known_materials
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
@@ -22,7 +21,7 @@ from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_MATERIALS = ("white_tarp", "tarp_surround")
 TARP_MARGIN = 0.08
-"""Share of the image's side that the tarp leaves free along each edge."""
+"""Fraction of the image's side that the tarp leaves free along each edge."""
 PERFECT_DARK_LINES, DARK_LINES = 1, 64
 """Lines of a dark cube: of a perfect sensor, whose lines are all the same, and of any other."""
 WHITE_EXPOSURE = 0
@@ -34,7 +33,7 @@ LINES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
-class Capture:
+class SimulatedCapture:
     """One capture: what the instrument writes, and what it is made of.
 
     Attributes:
@@ -51,12 +50,12 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Frame(Capture):
+class SimulatedFrame(SimulatedCapture):
     """A capture of the object, and its truth, which is upright.
 
     Attributes:
-        material_weights: share of each material in each pixel, summing to 1.
-        coverage: share of each pixel that the object covers.
+        material_weights: fraction of each material in each pixel, summing to 1.
+        coverage: fraction of each pixel that the object covers.
         endmembers: of those materials at the start of the session and the header's wavelengths.
     """
 
@@ -121,7 +120,7 @@ class Simulation:
         """Integration time of the white tarp's capture."""
         return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=True)
 
-    def frame(self, number: int) -> Frame:
+    def frame(self, number: int) -> SimulatedFrame:
         """The capture of one frame of the plan."""
         elapsed = float(self.plan.elapsed[number])
         view = (self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens)
@@ -132,7 +131,7 @@ class Simulation:
             rendering = lighting.render(*view)
             weights, coverage, light_weights = rendering.material_weights, rendering.coverage, rendering.light_weights
         for cover in self._chamber:
-            # The wall's share goes to what stands before it.
+            # The wall's fraction goes to what stands before it.
             covered = weights + weights[..., -1:] * (cover - np.eye(len(self.materials))[-1])
             weights = exact_weights(covered.reshape(-1, len(self.materials))).reshape(weights.shape)
             if lighting is not None:
@@ -152,13 +151,13 @@ class Simulation:
             light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._seen_nm))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
-        return Frame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
+        return SimulatedFrame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
 
-    def white(self) -> Capture:
+    def white(self) -> SimulatedCapture:
         """The capture of the white tarp, before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
         light = self._on_sensor(Light(weights, self._seen_spectra(WHITE_MATERIALS)), elapsed=0.0)
-        return Capture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
+        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
 
     def _exposure_factor(self, of_white: bool) -> float:
         return math.prod(exposure.factor(of_white) for exposure in self._exposures)
@@ -169,8 +168,8 @@ class Simulation:
 
     def _renderer_of(self, thing: Part) -> Renderer:
         """The renderer of the object, perhaps deformed, on its support."""
-        step_m = LIGHT_STEP_M if of_stage(self._light, stages.SurfaceLightEffect) else None
-        return assemble.build_renderer(self.scene, thing, self.offset_m, self._chamber_materials, step_m)
+        spacing_m = LIGHT_STEP_M if of_stage(self._light, stages.SurfaceLightEffect) else None
+        return assemble.build_renderer(self.scene, thing, self.offset_m, self._chamber_materials, spacing_m)
 
     def _lit(self, renderer: Renderer) -> Lighting | None:
         """The light on the parts of a renderer, or None where it is even."""
@@ -235,7 +234,7 @@ class Simulation:
 
 
 def white_capture_weights(size_px: int) -> Float[np.ndarray, "lines samples 2"]:
-    """Shares of tarp and of its dark surround: the tarp fills most of the image."""
+    """Fractions of tarp and of its dark surround: the tarp fills most of the image."""
     edge = max(1, round(TARP_MARGIN * size_px))
     tarp = np.zeros((size_px, size_px), np.float32)
     tarp[edge:-edge, edge:-edge] = 1.0

@@ -1,16 +1,4 @@
-"""Light that is not even: from the effects of the stage `light` to the light that each pixel gets.
-
-Without these effects each point gets the irradiance 1, that of the white tarp, and so has its reflectance as its
-radiance. With them the light of a pixel is the mean over its rays of
-
-    chamber * chamber_lit + lamp * lamp_lit + mirrored
-
-where ``chamber_lit`` and ``lamp_lit``, as weights of colours, belong to the surface (`SurfaceLight`), and the factors
-``chamber`` and ``lamp`` and what is mirrored depend on where camera and lamp stand (`HitLight`).
-
-They act in this order: shading by the chamber, inter-reflection of what is so lit, translucency of what a matte
-surface would then send; the lamp takes its share from the chamber; gloss lies over it all.
-"""
+"""Uneven light: from the light effects of a scene to the light that each pixel receives."""
 
 from __future__ import annotations
 
@@ -21,51 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.colours import Colour
 from hsi_sc_nerf.simulate.effects.stages import LensEffect, LightEffect, SurfaceLightEffect, ViewLightEffect
+from hsi_sc_nerf.simulate.light import Colour, HitLight, even_light
 from hsi_sc_nerf.simulate.render import Hits, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceLight:
-    """Radiance of each point of a surface, the same in all directions.
-
-    Attributes:
-        surface: the points.
-        colours: names the columns; the first are the renderer's materials, in their order.
-        chamber_lit: under a chamber of radiance 1.
-        lamp_lit: under a lamp that gives each point the irradiance 1.
-    """
-
-    surface: Surface
-    colours: tuple[Colour, ...]
-    chamber_lit: Float[np.ndarray, "p colours"]
-    lamp_lit: Float[np.ndarray, "p colours"]
-
-    @property
-    def materials(self) -> Float[np.ndarray, "p materials"]:
-        """Share of each material at each point."""
-        return self.surface.renderer.weights[self.surface.vertex]
-
-
-@dataclass(frozen=True, eq=False)
-class HitLight:
-    """What becomes of a surface's light on its way to one camera, where its rays hit.
-
-    Attributes:
-        chamber: factor on the light that the chamber gives.
-        lamp: factor on the light that the lamp gives, its irradiance with it.
-        to_lamp: unit direction to the lamp, if there is one.
-        chamber_colour: of the chamber.
-        mirrored: further light at each hit, by its colour.
-    """
-
-    chamber: Float[np.ndarray, "hits"]
-    lamp: Float[np.ndarray, "hits"]
-    to_lamp: Float[np.ndarray, "3"] | None
-    chamber_colour: Colour
-    mirrored: tuple[tuple[Colour, Float[np.ndarray, "hits"]], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +20,8 @@ class Rendering:
     """What a camera sees.
 
     Attributes:
-        material_weights: share of each material in each pixel, summing to exactly 1.
-        coverage: share of each pixel that the object covers.
+        material_weights: fraction of each material in each pixel, summing to exactly 1.
+        coverage: fraction of each pixel that the object covers.
         light_weights: how much light of each colour each pixel gets.
         colours: of the light, the plain materials first.
     """
@@ -133,10 +80,3 @@ class Lighting:
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
         return light, colours
-
-
-def even_light(surface: Surface) -> SurfaceLight:
-    """Irradiance 1 everywhere."""
-    materials = surface.renderer.weights[surface.vertex]
-    colours = tuple(Colour((i,)) for i in range(len(surface.renderer.materials)))
-    return SurfaceLight(surface, colours, materials, materials)

@@ -1,6 +1,6 @@
 """The same scene rendered with Mitsuba 3, to check our own renderer against one that others wrote.
 
-Needs the optional extra ``hsi-sc-nerf[mitsuba]``. Geometry, poses and the materials' shares are the simulator's own;
+Needs the optional extra ``hsi-sc-nerf[mitsuba]``. Geometry, poses and the materials' fractions are the simulator's own;
 visibility, the paths of the light and the spectral film are Mitsuba's. Lights that Mitsuba makes of plain numbers
 have the spectrum of daylight, which ends at 830 nm there: every spectrum here is a table of its own.
 """
@@ -192,9 +192,9 @@ def _meshes(scene: Scene, part: Part) -> list[Any]:
 
 
 def _mixture(scene: Scene, names: list[str]) -> dict[str, Any]:
-    """A matte surface whose reflectance is the sum of the materials' in the shares at the mesh's vertices.
+    """A matte surface whose reflectance is the sum of the materials' in the fractions at the mesh's vertices.
 
-    Mitsuba interpolates shares between vertices as the simulator does, but only blends two surfaces by one share. Two
+    Mitsuba interpolates fractions between vertices as the simulator does, but only blends two surfaces by one fraction. Two
     materials are one blend. Of n materials each is blended with black and made n times as bright; the even blend of
     the n is then their sum.
     """
@@ -207,10 +207,12 @@ def _mixture(scene: Scene, names: list[str]) -> dict[str, Any]:
     mean: dict[str, Any] = {}
     for number, name in enumerate(names):
         bright = {"type": "diffuse", "reflectance": _material(scene, name, factor=float(len(names)))}
-        share = _blend(black, bright, {"type": "mesh_attribute", "name": f"vertex_{name}"})
-        mean = _blend(mean, share, 1.0 / (number + 1.0)) if mean else share
+        fraction = _blend(black, bright, {"type": "mesh_attribute", "name": f"vertex_{name}"})
+        mean = _blend(mean, fraction, 1.0 / (number + 1.0)) if mean else fraction
     return mean
 
 
-def _blend(first: dict[str, Any], second: dict[str, Any], share_of_second: dict[str, Any] | float) -> dict[str, Any]:
-    return {"type": "blendbsdf", "weight": share_of_second, "first": first, "second": second}
+def _blend(
+    first: dict[str, Any], second: dict[str, Any], fraction_of_second: dict[str, Any] | float
+) -> dict[str, Any]:
+    return {"type": "blendbsdf", "weight": fraction_of_second, "first": first, "second": second}

@@ -14,8 +14,8 @@ from plyfile import PlyData
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import snapped, subdivided, welded
-from hsi_sc_nerf.simulate.objects import OwnMesh
-from hsi_sc_nerf.simulate.texture import padded_shares, sampled
+from hsi_sc_nerf.simulate.scene import OwnMesh
+from hsi_sc_nerf.simulate.texture import padded_fractions, sampled
 
 Y_UP_FORMATS = (".gltf", ".glb")
 """glTF's specification has y up; PLY and OBJ say nothing, and z is up in most tools that write them."""
@@ -24,7 +24,7 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 HEIGHTS_M = (0.01, 0.5)
 WIDEST_M = 1.0
 SAME_PLACE = 1e-6
-"""Vertices closer than this share of the mesh's size are one point (exporters repeat vertices along UV seams)."""
+"""Vertices closer than this fraction of the mesh's size are one point (exporters repeat vertices along UV seams)."""
 TEXTURE_SPACING_M = 0.001
 """Edges are cut to at most this before a texture is sampled at vertices."""
 CHANNELS = 3
@@ -41,14 +41,14 @@ class _Surface:
 
 
 def load(thing: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
-    """The mesh in metres, standing on z = 0 with its bounding box centred on the axis, and its materials' shares.
+    """The mesh in metres, standing on z = 0 with its bounding box centred on the axis, and its materials' fractions.
 
-    Shares are interpolated linearly between vertices; where they come from a texture, triangles are cut first so
+    Fractions are interpolated linearly between vertices; where they come from a texture, triangles are cut first so
     that no edge is longer than `TEXTURE_SPACING_M`. Triangles come out counter-clockwise seen from outside.
 
     Raises:
         InputError: a file is missing or cannot be read; it has no triangles, is not closed, or is not of a size
-            that fits on the turntable; the materials' shares, UVs or colours are missing or do not fit.
+            that fits on the turntable; the materials' fractions, UVs or colours are missing or do not fit.
     """
     surface = _read_surface(thing)
     vertices = _stood(surface.vertices, thing)
@@ -60,10 +60,10 @@ def load(thing: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
     elif (given := _vertex_weights(thing)) is not None:
         if len(given) != len(vertices):
             raise InputError(f"{thing.mesh_file}: its vertices and its faces do not fit together; export it again.")
-        weights = _shares(given, f"{thing.mesh_file}: the weights of some vertices")
+        weights = _fractions(given, f"{thing.mesh_file}: the weights of some vertices")
     elif surface.colours is not None:
         _check_channels(thing, "vertex colours")
-        weights = _shares(
+        weights = _fractions(
             surface.colours[:, : len(thing.materials)], f"{thing.mesh_file}: the colours of some vertices"
         )
     else:
@@ -143,7 +143,7 @@ def _stood(vertices: Float[np.ndarray, "v 3"], thing: OwnMesh) -> Float[np.ndarr
 def _textured(
     thing: OwnMesh, vertices: Float[np.ndarray, "v 3"], surface: _Surface
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "w materials"]]:
-    """Vertices and triangles fine enough for the texture, and the shares that it gives them."""
+    """Vertices and triangles fine enough for the texture, and the fractions that it gives them."""
     path = thing.weight_texture
     assert path is not None
     _check_channels(thing, "a weight texture")
@@ -157,13 +157,15 @@ def _textured(
             pixels = np.asarray(image.convert("RGB"), float)[..., : len(thing.materials)]
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read as an image ({error}); give a PNG with shares as colours."
+            f"{path}: cannot be read as an image ({error}); give a PNG with fractions as colours."
         ) from error
     if len(channels) < CHANNELS and channels != ("P",):
-        raise InputError(f"{path}: is grey, but the shares of materials are its red, green and blue; save it as RGB.")
+        raise InputError(
+            f"{path}: is grey, but the fractions of materials are its red, green and blue; save it as RGB."
+        )
     fine, triangles = subdivided(np.column_stack([vertices, surface.uv]), surface.triangles, TEXTURE_SPACING_M)
-    weights = sampled(padded_shares(pixels), fine[:, 3:])
-    return fine[:, :3], triangles, _shares(weights, f"{path}: the texture where some of the surface lies")
+    weights = sampled(padded_fractions(pixels), fine[:, 3:])
+    return fine[:, :3], triangles, _fractions(weights, f"{path}: the texture where some of the surface lies")
 
 
 def _vertex_weights(thing: OwnMesh) -> Float[np.ndarray, "v materials"] | None:
@@ -191,10 +193,10 @@ def _check_channels(thing: OwnMesh, what: str) -> None:
         )
 
 
-def _shares(weights: Float[np.ndarray, "v materials"], what: str) -> Float[np.ndarray, "v materials"]:
-    """Weights of any scale as shares that sum to 1."""
+def _fractions(weights: Float[np.ndarray, "v materials"], what: str) -> Float[np.ndarray, "v materials"]:
+    """Weights of any scale as fractions that sum to 1."""
     if not (np.isfinite(weights).all() and (weights >= 0.0).all()):
-        raise InputError(f"{what} are negative or no numbers; give each material's share, 0 or more.")
+        raise InputError(f"{what} are negative or no numbers; give each material's fraction, 0 or more.")
     total = weights.sum(axis=-1, keepdims=True)
     if not (total > 0.0).all():
         raise InputError(f"{what} are 0 for every material; give each point a material.")

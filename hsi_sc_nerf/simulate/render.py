@@ -1,19 +1,18 @@
-"""Ray casting: what each pixel sees, and which materials, in which shares."""
+"""Ray casting: what each pixel sees, and which materials, in which fractions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
-import open3d as o3d
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
-from hsi_sc_nerf.simulate.effects.stages import LensEffect
 from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19
@@ -23,9 +22,18 @@ WEIGHT_STEPS = 2048
 """Weights are multiples of 1 / 2048, which float16 holds exactly, so that stored weights sum to exactly 1."""
 
 
+class Lens(Protocol):
+    """A hashable model of a lens that bends the rays of the pinhole camera."""
+
+    def straighten(
+        self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
+    ) -> Float[np.ndarray, "*n 2"]:
+        """Where the pinhole camera sees what the lens brings to these pixel coordinates."""
+
+
 @dataclass(frozen=True)
 class Part:
-    """A mesh with shares of materials at its vertices, in the object frame."""
+    """A mesh with fractions of materials at its vertices, in the object frame."""
 
     mesh: Mesh
     materials: tuple[str, ...]
@@ -50,7 +58,7 @@ class Hits:
         origins, directions: of all rays.
         ray: the rays that hit something, by index; what follows has one entry for each of them.
         triangle: of the renderer's.
-        barycentric: share of each of the triangle's corners.
+        barycentric: fraction of each of the triangle's corners.
         distance_m: along the ray.
     """
 
@@ -161,9 +169,9 @@ class Renderer:
         intrinsics: PinholeIntrinsics,
         camera_to_world: Float[np.ndarray, "4 4"],
         supersampling: int,
-        lens: LensEffect | None = None,
+        lens: Lens | None = None,
     ) -> tuple[Float[np.ndarray, "h w materials"], Float[np.ndarray, "h w"]]:
-        """Material weights of each pixel (float32, summing to exactly 1) and the object's share of it.
+        """Material weights of each pixel (float32, summing to exactly 1) and the object's fraction of it.
 
         A pixel is the mean over ``supersampling`` x ``supersampling`` rays, evenly spaced (a box filter), which a
         ``lens`` bends.
@@ -180,7 +188,7 @@ class Renderer:
         intrinsics: PinholeIntrinsics,
         camera_to_world: Float[np.ndarray, "4 4"],
         supersampling: int,
-        lens: LensEffect | None = None,
+        lens: Lens | None = None,
     ) -> Iterator[tuple[slice, Hits]]:
         """What the rays of a camera hit: some lines of the image after the others, to keep the memory small."""
         lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
@@ -196,9 +204,9 @@ class Renderer:
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
     ) -> Hits:
         """Where rays first hit a part; directions are of unit length."""
-        hits = self._scene.cast_rays(_ray_tensor(origins, directions))
-        triangle = hits["primitive_ids"].numpy()
-        ray = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
+        hits = self._scene.cast_rays(_rays(origins, directions))
+        distance_m = hits["t_hit"].numpy()
+        ray = np.flatnonzero(np.isfinite(distance_m))
         u, v = hits["primitive_uvs"].numpy()[ray].T
         return Hits(
             renderer=self,
@@ -206,28 +214,27 @@ class Renderer:
             directions=directions,
             rays_per_pixel=rays_per_pixel,
             ray=ray,
-            triangle=triangle[ray],
+            triangle=hits["primitive_ids"].numpy()[ray],
             barycentric=np.stack([1.0 - u - v, u, v]),
-            distance_m=hits["t_hit"].numpy()[ray],
+            distance_m=distance_m[ray],
         )
 
     def is_free(
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
     ) -> Bool[np.ndarray, "rays"]:
         """Whether rays hit nothing."""
-        return ~self._scene.test_occlusions(_ray_tensor(origins, directions)).numpy()
+        return ~self._scene.test_occlusions(_rays(origins, directions)).numpy()
 
     def material_weights(self, hits: Hits) -> Float[np.ndarray, "pixels materials"]:
-        """Share of each material in each pixel, summing to exactly 1."""
+        """Fraction of each material in each pixel, summing to exactly 1."""
         weights = hits.mix(self.triangles, len(self.weights)) @ self.weights
         weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
         return exact_weights(weights)
 
 
-def _ray_tensor(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> o3d.core.Tensor:
-    rays = np.empty((len(directions), 6), np.float32)
-    rays[:, :3], rays[:, 3:] = origins, directions
-    return o3d.core.Tensor.from_numpy(rays)
+def _rays(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> np.ndarray:
+    """Rays as Open3D takes them: origin and direction in one row, single precision."""
+    return np.concatenate([origins, directions], axis=1, dtype=np.float32)
 
 
 def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray, "n materials"]:
@@ -243,7 +250,7 @@ def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray
 
 @lru_cache(maxsize=16)
 def _camera_rays(
-    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int, lens: LensEffect | None
+    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int, lens: Lens | None
 ) -> Float[np.ndarray, "rays 3"]:
     """Directions, in the camera's axes, of the rays through some lines; a pixel's rays follow one another.
 

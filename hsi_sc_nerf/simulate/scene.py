@@ -9,26 +9,101 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import yaml
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 from hsi_sc_nerf.simulate.effects import read_effects
-from hsi_sc_nerf.simulate.materials import MATERIALS, Material
-from hsi_sc_nerf.simulate.objects import Cylinder, Object, OwnMesh, Sphere
-from hsi_sc_nerf.simulate.own_materials import read_materials
-from hsi_sc_nerf.simulate.reading import between, check_ranges, read_dataclass
+from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 
 SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
 
 
 @dataclass(frozen=True)
-class Camera:
+class Fruit:
+    """A pear or an apple; lengths in metres, fractions in [0, 1]."""
+
+    shape: Literal["pear", "apple"]
+    height_m: float = between(0.01, 0.5)
+    """With the stem."""
+    blush: float = between(0.0, 1.0, default=0.0)
+    """Fraction of blush where it is strongest."""
+    lenticel_diameter_m: float = between(0.0, 0.02, default=0.0)
+    """Diameter of the pale dots on the skin; 0 leaves them out."""
+    bruise_diameter_m: float = between(0.0, 0.1, default=0.0)
+    """Diameter of the bruise; 0 leaves it out."""
+
+
+@dataclass(frozen=True)
+class MaizeEar:
+    """A husked maize ear that stands on its shank."""
+
+    shape: Literal["maize"]
+    height_m: float = between(0.01, 0.5)
+    coloured_kernels: float = between(0.0, 1.0, default=0.0)
+    """Fraction of kernels that are purple, and again as many that are white."""
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere of one material, for checks: its area is pi d², its volume pi d³ / 6."""
+
+    shape: Literal["sphere"]
+    height_m: float = between(0.01, 0.5)
+    """Its diameter d."""
+    material: str = "matte_white"
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder of one material, for checks: its area is pi d (d / 2 + h), its volume pi d² h / 4."""
+
+    shape: Literal["cylinder"]
+    height_m: float = between(0.01, 0.5)
+    diameter_m: float = between(0.01, 0.5)
+    material: str = "matte_grey"
+
+
+@dataclass(frozen=True)
+class OwnMesh:
+    """A closed triangle mesh from a file, and where the materials lie on it.
+
+    Of several materials the fractions come from ``weight_texture``, else from the file: PLY vertex properties
+    ``weight_NAME``, one a material, else vertex colours whose red, green and blue are the fractions of the first,
+    second and third material.
+    """
+
+    shape: Literal["mesh"]
+    mesh_file: Path
+    """PLY, OBJ, glTF or GLB; a path relative to the scene file."""
+    materials: tuple[str, ...]
+    """Names of built-in materials, or of those that the scene file defines."""
+    weight_texture: Path | None = None
+    """An image laid on by the mesh's UVs; its channels are fractions, in the order of ``materials`` (at most three)."""
+    height_m: float | None = between(0.01, 0.5, default=None)
+    """The mesh is scaled to be as tall as this; without it, lengths in the file are metres."""
+    up_axis: Literal["by_format", "y", "z"] = "by_format"
+    """The file's axis that points up; by format it is y in glTF and GLB, z in PLY and OBJ."""
+
+    def in_folder(self, folder: Path) -> OwnMesh:
+        """The same object with its paths taken relative to ``folder``."""
+        texture = self.weight_texture
+        return replace(
+            self, mesh_file=folder / self.mesh_file, weight_texture=None if texture is None else folder / texture
+        )
+
+
+Object: TypeAlias = Fruit | MaizeEar | Sphere | Cylinder | OwnMesh
+
+
+@dataclass(frozen=True)
+class CameraSettings:
     """A camera that stands still and looks at a point on the turntable's axis."""
 
     elevation_deg: float = between(0.0, 85.0)
@@ -43,7 +118,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Turntable:
+class TurntableSettings:
     """The disc and how it turns."""
 
     disc_diameter_m: float = between(0.01, 2.0)
@@ -54,7 +129,7 @@ class Turntable:
 
 
 @dataclass(frozen=True)
-class Container:
+class ContainerSettings:
     """The cylinder that the object stands on."""
 
     diameter_m: float = between(0.01, 1.0, default=paper.CONTAINER_DIAMETER_M)
@@ -62,7 +137,7 @@ class Container:
 
 
 @dataclass(frozen=True)
-class Markers:
+class MarkerSettings:
     """The ArUco markers, all of one size: some around the container, some on the disc."""
 
     side_m: float = between(0.002, 0.5)
@@ -73,14 +148,14 @@ class Markers:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorSettings:
     """A perfect push-broom sensor: counts are linear in light, without noise."""
 
     bands: int = between(3, 2048, default=paper.BANDS)
     bit_depth: int = between(8, 16, default=12)
     lamp_temperature_k: float = between(1500.0, 10000.0, default=3000.0)
     white_level: float = between(0.05, 1.0, default=0.82)
-    """Counts of the white tarp in its brightest band, as a share of the largest count."""
+    """Counts of the white tarp in its brightest band, as a fraction of the largest count."""
     dark_level: int = between(0, 1000, default=120)
     """Counts without light."""
     full_well_electrons: float = between(100.0, 1e7, default=30_000.0)
@@ -93,13 +168,13 @@ class Scene:
 
     name: str
     object: Object
-    camera: Camera
-    turntable: Turntable
-    markers: Markers
+    camera: CameraSettings
+    turntable: TurntableSettings
+    markers: MarkerSettings
     materials: dict[str, Material] = dataclasses.field(default_factory=dict)
     """What the scene defines itself; a built-in material of the same name is replaced."""
-    container: Container = Container()
-    sensor: Sensor = Sensor()
+    container: ContainerSettings = ContainerSettings()
+    sensor: SensorSettings = SensorSettings()
     effects: tuple[Any, ...] = ()
     """Physical effects beyond a matte object under even light that a perfect sensor sees (`effects.EFFECTS`)."""
     seed: int = between(0, 2**31 - 1, default=0)

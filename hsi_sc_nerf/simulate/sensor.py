@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.lamps import lamp_photons
-from hsi_sc_nerf.simulate.scene import Sensor
+from hsi_sc_nerf.simulate.light import lamp_photons
+from hsi_sc_nerf.simulate.scene import SensorSettings
 
 
 def band_centres_nm(bands: int) -> Float[np.ndarray, "bands"]:
@@ -30,7 +30,7 @@ def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.n
 
 
 def white_signal(
-    sensor: Sensor, wavelengths_nm: Float[np.ndarray, "*samples bands"]
+    sensor: SensorSettings, wavelengths_nm: Float[np.ndarray, "*samples bands"]
 ) -> Float[np.ndarray, "*samples bands"]:
     """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count.
 
@@ -50,18 +50,18 @@ def white_signal(
 
 
 def _electrons_of_white(
-    sensor: Sensor, wavelengths_nm: Float[np.ndarray, "*samples bands"]
+    sensor: SensorSettings, wavelengths_nm: Float[np.ndarray, "*samples bands"]
 ) -> Float[np.ndarray, "*samples bands"]:
     """In arbitrary units."""
     return lamp_photons(wavelengths_nm, sensor.lamp_temperature_k) * quantum_efficiency(wavelengths_nm)
 
 
-def largest_count(sensor: Sensor) -> int:
+def largest_count(sensor: SensorSettings) -> int:
     """Where the digitiser stops."""
     return 2**sensor.bit_depth - 1
 
 
-def digitise(counts: Float[np.ndarray, "*n"], sensor: Sensor) -> UInt16[np.ndarray, "*n"]:
+def digitise(counts: Float[np.ndarray, "*n"], sensor: SensorSettings) -> UInt16[np.ndarray, "*n"]:
     """Whole counts from 0 to the largest; what it is given is overwritten."""
     np.rint(counts, out=counts)
     return np.clip(counts, 0, largest_count(sensor), out=counts).astype(np.uint16)

@@ -17,8 +17,8 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
-from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
-from hsi_sc_nerf.simulate.frames import Capture, Simulation
+from hsi_sc_nerf.simulate.effects.optics import ImageRotation
+from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_REFERENCE = "white_reference"
@@ -145,7 +145,7 @@ def _session_values(simulation: Simulation) -> dict[str, object]:
     }
 
 
-def _write_capture(session_dir: Path, name: str, capture: Capture, simulation: Simulation) -> None:
+def _write_capture(session_dir: Path, name: str, capture: SimulatedCapture, simulation: Simulation) -> None:
     folder = session_dir / name / "capture"
     for prefix, cube in (("", capture.counts), ("DARKREF_", capture.dark)):
         write_cube(

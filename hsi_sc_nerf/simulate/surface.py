@@ -1,4 +1,4 @@
-"""The surface of all parts as points that light can be computed at, and what each of them sees around it."""
+"""Points on the surface of all parts: what each point sees around it, and diffusion of light between them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
-from hsi_sc_nerf.simulate.diffusion import diffused
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
 CREASE_DEG = 40.0
 """Facets that meet at more than this have points of their own along the edge: light changes at once there."""
 POINTS_AT_ONCE = 4096
-COVER_DISTANCE_M, COVER_SHARE = 0.001, 0.6
-"""A point is covered if this share of what it sees is seen from behind or, on the object's support, is so near."""
+COVER_DISTANCE_M, COVER_FRACTION = 0.001, 0.6
+"""A point is covered if this fraction of what it sees is seen from behind or, on the object's support, is so near."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+COLUMNS_AT_ONCE = 8
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class Surroundings:
     """What the points of a surface see in the half space above them, weighted by the cosine to the normal.
 
     Attributes:
-        free: share of directions in which nothing but the chamber is seen, in [0, 1].
-        seen: share of each point of the surface in what each point sees; what is seen from behind is left out.
+        free: fraction of directions in which nothing but the chamber is seen, in [0, 1].
+        seen: fraction of each point of the surface in what each point sees; what is seen from behind is left out.
     """
 
     free: Float[np.ndarray, "p"]
@@ -62,7 +63,7 @@ class Surface:
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "p"]:
-        """Each point's share of the surface: a third of each of its triangles."""
+        """Each point's fraction of the surface: a third of each of its triangles."""
         thirds = np.linalg.norm(self._doubled_normals(), axis=1) / 6.0
         return self._over_corners(np.repeat(thirds, 3)[:, None])[:, 0]
 
@@ -121,7 +122,7 @@ class Surface:
             free[some] = 1.0 - np.bincount(hits.pixel, minlength=count) / directions
             near = (hits.distance_m < COVER_DISTANCE_M) & ~self.is_object[some][hits.pixel]
             covered[some] = (
-                np.bincount(hits.pixel, hits.is_behind | near, minlength=count) >= COVER_SHARE * directions
+                np.bincount(hits.pixel, hits.is_behind | near, minlength=count) >= COVER_FRACTION * directions
             )
             seen.append(hits.mix(self.triangles, points, (~hits.is_behind).astype(np.float32)))
         uncover = self._from_uncovered_neighbours(covered)
@@ -176,7 +177,7 @@ def split_at_creases(
 
 
 def cosine_directions(directions: int, turn: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p directions 3"]:
-    """Directions about +z, each standing for the same share of the cosine-weighted half space (Malley's method).
+    """Directions about +z, each standing for the same fraction of the cosine-weighted half space (Malley's method).
 
     They lie above the points of a Fibonacci spiral on the unit disc, turned by ``turn`` (radians).
     """
@@ -193,3 +194,50 @@ def _frames(normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
     tangent = np.cross(helper, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-30)
     return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
+
+
+def diffused(
+    vertices: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    values: Float[np.ndarray, "v c"],
+    width_m: float,
+) -> Float[np.ndarray, "v c"]:
+    """Values at the vertices, each spread over the surface around it.
+
+    Solves (1 - w² / 2 Laplacian) u = values with linear finite elements, so that a point becomes a spot whose
+    standard deviation along each direction of a flat surface is ``width_m``: the steady state of light that wanders
+    and is lost on its way (the diffusion approximation, in two dimensions). Each column's total over the surface is
+    kept, and none exceeds its largest value or falls below its smallest.
+    """
+    laplacian, areas_m2 = cotangent_laplacian(vertices, triangles)
+    # A vertex of no triangle keeps its value.
+    areas_m2 = np.where(areas_m2 > 0.0, areas_m2, areas_m2.mean())
+    matrix = scipy.sparse.diags_array(areas_m2) + 0.5 * width_m**2 * laplacian
+    factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    spread = np.zeros_like(values)
+    used = np.flatnonzero(values.any(axis=0))
+    for first in range(0, len(used), COLUMNS_AT_ONCE):
+        columns = used[first : first + COLUMNS_AT_ONCE]
+        spread[:, columns] = factors.solve(areas_m2[:, None] * values[:, columns].astype(float))
+    return spread
+
+
+def cotangent_laplacian(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[scipy.sparse.csr_array, Float[np.ndarray, "v"]]:
+    """Stiffness matrix of linear finite elements (positive semidefinite), and each vertex's fraction of the area.
+
+    Negative cotangents, of triangles with an obtuse angle, count as 0: values then stay within their range.
+    """
+    size = len(vertices)
+    matrix = scipy.sparse.csr_array((size, size))
+    areas_m2 = np.zeros(size)
+    for k in range(3):
+        apex, start, end = (triangles[:, (k + i) % 3] for i in range(3))
+        u, v = vertices[start] - vertices[apex], vertices[end] - vertices[apex]
+        doubled = np.linalg.norm(np.cross(u, v), axis=1)
+        half_cotangent = 0.5 * np.maximum(np.einsum("nk,nk->n", u, v), 0.0) / np.maximum(doubled, 1e-30)
+        matrix += scipy.sparse.csr_array((half_cotangent, (start, end)), shape=(size, size))
+        areas_m2 += np.bincount(apex, doubled / 6.0, minlength=size)
+    matrix = matrix + matrix.T
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(matrix.sum(axis=1)) - matrix), areas_m2

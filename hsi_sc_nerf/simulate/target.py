@@ -13,7 +13,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
-from hsi_sc_nerf.simulate.scene import Container, Markers, Turntable
+from hsi_sc_nerf.simulate.scene import ContainerSettings, MarkerSettings, TurntableSettings
 
 PLAQUE_STANDOFF_M = 0.0005
 PLAQUE_THICKNESS_M = 0.0003
@@ -31,7 +31,7 @@ MarkerFrame = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre, unit u, unit 
 
 
 def marker_frames(
-    markers: Markers, container: Container, turntable: Turntable
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
 ) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
     """Centre, right and up of each marker on the container and on the disc, by marker number, object frame.
 
@@ -76,13 +76,15 @@ def marker_frames(
     return on_container, on_disc
 
 
-def marker_layout(markers: Markers, container: Container, turntable: Turntable) -> MarkerLayout:
+def marker_layout(
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
+) -> MarkerLayout:
     """The four corners of each marker's black square in OpenCV's order, metres, object frame."""
     on_container, on_disc = marker_frames(markers, container, turntable)
     return {number: _corners(frame, markers.side_m) for number, frame in (on_container | on_disc).items()}
 
 
-def marker_mesh(frame: MarkerFrame, number: int, markers: Markers) -> tuple[Mesh, np.ndarray]:
+def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tuple[Mesh, np.ndarray]:
     """A marker as flat squares, one a module, in its frame of white paper; and which vertices are ink."""
     dictionary = aruco_dictionary(markers)
     modules = dictionary.markerSize + 2
@@ -99,7 +101,7 @@ def marker_mesh(frame: MarkerFrame, number: int, markers: Markers) -> tuple[Mesh
     return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
 
 
-def plaque_back(frame: MarkerFrame, markers: Markers) -> Mesh:
+def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
     """The back of a plaque, so that ink is not seen through the paper."""
     centre, u, v = frame
     behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
@@ -107,19 +109,19 @@ def plaque_back(frame: MarkerFrame, markers: Markers) -> Mesh:
     return quads(corners[None])
 
 
-def container_mesh(container: Container, step_m: float | None = None) -> Mesh:
-    """The container with its flat lid, standing on the disc; ``step_m`` as in `mesh.cylinder`."""
-    return cylinder(container.diameter_m, container.height_m, step_m=step_m)
+def container_mesh(container: ContainerSettings, spacing_m: float | None = None) -> Mesh:
+    """The container with its flat lid, standing on the disc; ``spacing_m`` as in `mesh.cylinder`."""
+    return cylinder(container.diameter_m, container.height_m, spacing_m=spacing_m)
 
 
-def disc_mesh(turntable: Turntable, step_m: float | None = None) -> Mesh:
-    """The turntable's disc, just below the markers that lie in z = 0; ``step_m`` as in `mesh.cylinder`."""
-    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, step_m=step_m).moved(
+def disc_mesh(turntable: TurntableSettings, spacing_m: float | None = None) -> Mesh:
+    """The turntable's disc, just below the markers that lie in z = 0; ``spacing_m`` as in `mesh.cylinder`."""
+    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, spacing_m=spacing_m).moved(
         np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M])
     )
 
 
-def aruco_dictionary(markers: Markers) -> cv2.aruco.Dictionary:
+def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of the given name.
 
     Raises:
@@ -134,7 +136,7 @@ def aruco_dictionary(markers: Markers) -> cv2.aruco.Dictionary:
     return dictionary
 
 
-def paper_side_in_markers(markers: Markers) -> float:
+def paper_side_in_markers(markers: MarkerSettings) -> float:
     """Side of a marker's paper over the side of its black square."""
     return 1.0 + 2.0 * QUIET_ZONE_MODULES / (aruco_dictionary(markers).markerSize + 2)
 

@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.frames import Frame, Simulation
+from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
@@ -59,11 +59,11 @@ class Truth:
         return Mesh(vertices, np.stack(read["face"]["vertex_indices"]).astype(np.int32))
 
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
-        """Share of each material in each pixel, summing to 1."""
+        """Fraction of each material in each pixel, summing to 1."""
         return self._pixels(capture, "material_weights").astype(np.float32)
 
     def object_coverage(self, capture: str) -> Float[np.ndarray, "lines samples"]:
-        """Share of each pixel that the object covers, in [0, 1]."""
+        """Fraction of each pixel that the object covers, in [0, 1]."""
         return self._pixels(capture, "object").astype(np.float32)
 
     def reflectance(self, capture: str) -> Float[np.ndarray, "lines samples bands"]:
@@ -167,11 +167,11 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         np.savez_compressed(detector_path(session_dir), **maps)
 
 
-def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
+def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None:
     """Write what each pixel of one frame sees, whole or not at all.
 
     Weights are exact, being multiples of 1 / 2048 in float16. The light is written only where it is something else
-    than the materials in the weights' shares.
+    than the materials in the weights' fractions.
     """
     path = pixels_path(session_dir, capture)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,11 @@
-"""Small drawings for the viewer's panel: a plot of spectra, and a colour bar; as PNG in the text of a web page."""
+"""Plots, colour bars and Markdown for the viewer's control panel."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -14,6 +15,8 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from viser import GuiMarkdownHandle, ViserServer
 
 WIDTH_PX = 240
 """Width that the viewer shows pictures at."""
@@ -65,3 +68,30 @@ def _png(figure: Figure) -> bytes:
     memory = io.BytesIO()
     figure.savefig(memory, format="png")
     return memory.getvalue()
+
+
+class ViewerMarkdown(ViewerElement[str]):
+    """Markdown in the control panel.
+
+    Args:
+        first: what it shows at first; asked only when a viewer shows the panel.
+    """
+
+    gui_handle: GuiMarkdownHandle | None  # type: ignore[assignment]
+
+    def __init__(self, first: Callable[[], str] = str) -> None:
+        super().__init__(name="")
+        self.first = first
+
+    def show(self, content: str) -> None:
+        """Show something else, once it is in a panel."""
+        assert self.gui_handle is not None
+        self.gui_handle.content = content
+
+    def install(self, viser_server: ViserServer) -> None:
+        """Put it into the panel."""
+        self._create_gui_handle(viser_server)
+
+    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+        # A root for relative paths of pictures, of which there are none, spares a warning of each picture.
+        self.gui_handle = viser_server.gui.add_markdown(self.first(), image_root=Path())

@@ -1,16 +1,18 @@
-"""The controls of the spectral viewer and the pictures that they ask for."""
+"""The controls of the spectral viewer and the images that they select."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.viewer.viewer_elements import (
     ViewerCheckbox,
     ViewerClick,
@@ -36,17 +38,16 @@ from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
-from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
-from hsi_sc_nerf.viewer.picking import PickedPoint, pick
+from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.training_views import TrainingViews
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle
 
-Outputs = dict[str, Tensor]
+    from hsi_sc_nerf.models.spectral_model import SpectralModel
 
+Outputs = dict[str, Tensor]
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
 
@@ -260,3 +261,47 @@ def _object_frame(viewer: Viewer) -> tuple[float, Float[Tensor, "3 4"]]:
     """Scale and transform that brought metres in the object frame into the scene."""
     parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
     return parsed.dataparser_scale, parsed.dataparser_transform
+
+
+@dataclass(frozen=True, eq=False)
+class PickedPoint:
+    """What a ray meets."""
+
+    position: Float[Tensor, "3"]
+    """Where half of the ray is absorbed, scene units."""
+    opacity: float
+    spectrum: Float[Tensor, "bands"]
+    """As the picture shows it: the background has the fraction that the object lets through."""
+
+
+def pick(
+    model: SpectralModel,
+    origin: Float[Tensor, "3"],
+    direction: Float[Tensor, "3"],
+    metadata: dict[str, Float[Tensor, "1 ..."]],
+) -> PickedPoint:
+    """Render one ray in evaluation mode, and leave the model in the mode that it was in.
+
+    Args:
+        model: the model, which nobody else may train or render with meanwhile.
+        origin: of the ray, scene units.
+        direction: of the ray, of any length.
+        metadata: what tells the model which frame the ray belongs to, if any.
+    """
+    unit = direction / direction.norm()
+    rays = RayBundle(
+        origins=origin[None],
+        directions=unit[None],
+        pixel_area=torch.ones(1, 1),
+        camera_indices=torch.zeros(1, 1, dtype=torch.long),
+        metadata={"directions_norm": torch.ones(1, 1), **metadata},
+    )
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            outputs = model(rays.to(model.device))
+    finally:
+        model.train(was_training)
+    depth, opacity, spectrum = (outputs[name][0].cpu() for name in ("depth", "accumulation", "spectral"))
+    return PickedPoint(origin + unit * depth, float(opacity), spectrum)

@@ -12,7 +12,7 @@ from hsi_sc_nerf.packed.uncertainty import (
     reflectance_uncertainty,
     typical_uncertainty,
 )
-from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
+from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise
 from hsi_sc_nerf.simulate.effects.stages import ReadoutContext
 
 DARK_LEVEL, ELECTRONS_PER_COUNT, READ_ELECTRONS = 120.0, 7.3, 40.0

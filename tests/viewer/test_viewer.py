@@ -18,8 +18,7 @@ from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.plotting.false_colour import BLANK, angle_to_measured, coloured, frame_pixels
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
-from hsi_sc_nerf.viewer.panel import SpectralPanel
-from hsi_sc_nerf.viewer.picking import pick
+from hsi_sc_nerf.viewer.panel import SpectralPanel, pick
 from hsi_sc_nerf.viewer.training_views import TrainingViews
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

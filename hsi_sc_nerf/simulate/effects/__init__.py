@@ -6,11 +6,18 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
-from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile, TarpExposure
-from hsi_sc_nerf.simulate.effects.gloss import Gloss
-from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
-from hsi_sc_nerf.simulate.effects.lamp import Lamp
+from hsi_sc_nerf.settings_file import check_ranges, read_dataclass
+from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection, TexturedBackground
+from hsi_sc_nerf.simulate.effects.detector import (
+    BadPixels,
+    DarkPattern,
+    PhotonNoise,
+    ReadNoise,
+    Saturation,
+    SpectralSmile,
+    TarpExposure,
+)
+from hsi_sc_nerf.simulate.effects.illumination import DriftingLamps, IlluminationFalloff, Lamp
 from hsi_sc_nerf.simulate.effects.motion import (
     AngleJitter,
     AxisTilt,
@@ -21,14 +28,9 @@ from hsi_sc_nerf.simulate.effects.motion import (
     RepeatedFrames,
     Wobble,
 )
-from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
-from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur
-from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
-from hsi_sc_nerf.simulate.effects.shading import ChamberShading, InterReflection
+from hsi_sc_nerf.simulate.effects.object import Deformation, Drying, Gloss, Translucency
+from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
 from hsi_sc_nerf.simulate.effects.stages import Effect
-from hsi_sc_nerf.simulate.effects.surroundings import TexturedBackground
-from hsi_sc_nerf.simulate.effects.translucency import Translucency
-from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
 
 _ORDER: tuple[type[Effect], ...] = (
     PartialTurn,
@@ -47,7 +49,7 @@ _ORDER: tuple[type[Effect], ...] = (
     Gloss,
     TexturedBackground,
     Drying,
-    LampDrift,
+    DriftingLamps,
     IlluminationFalloff,
     LensDistortion,
     OpticalBlur,

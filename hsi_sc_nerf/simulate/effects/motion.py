@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, PlacementEffect
-from hsi_sc_nerf.simulate.reading import between
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The lens: what is not sharp, and what is not straight."""
+"""Effects of the lens and of the camera's orientation: blur, distortion, rotated images."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.special import ive
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect
-from hsi_sc_nerf.simulate.reading import between
+from hsi_sc_nerf.settings_file import between
+from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect, OrientationEffect
 
 Coefficients = tuple[float, float, float, float]
 NEWTON_STEPS = 20
@@ -128,3 +128,20 @@ def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> 
         step_y = (xx * missing_y - xy * missing_x) / determinant
         found = found + np.stack([step_x, step_y], axis=-1)
     return None
+
+
+@dataclass(frozen=True)
+class ImageRotation(OrientationEffect):
+    """The camera's slit stands upright and scans sideways, as a SPECIM IQ's: the file holds the image on its side.
+
+    The sensor stays as it is: its line is the samples of every cube, and a dark cube has no up. So the image is
+    turned before it meets the sensor, and patterns, smile and noise lie in the file as they do without this effect.
+    """
+
+    name: ClassVar[str] = "image_rotation"
+    quarter_turns: int = between(1, 3, default=1)
+    """Counter-clockwise turns by 90 degrees from the upright image to the file (``np.rot90``'s k)."""
+
+    def orient(self, image: np.ndarray) -> np.ndarray:
+        """Turn an upright image (lines, samples, ...) to how it lies in the file."""
+        return np.ascontiguousarray(np.rot90(image, self.quarter_turns))

@@ -32,7 +32,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.simulate.lighting import HitLight, SurfaceLight
+    from hsi_sc_nerf.simulate.light import HitLight, SurfaceLight
     from hsi_sc_nerf.simulate.materials import Material
     from hsi_sc_nerf.simulate.render import Hits
 
@@ -61,7 +61,7 @@ class FramePlan:
     Attributes:
         room_camera: camera-to-world of the camera that stands still, for a turntable at angle 0.
         angles_deg: the turntable's true angle in each frame, positive counter-clockwise.
-        elapsed: time of each frame as a share of the session, 0 to 1.
+        elapsed: time of each frame as a fraction of the session, 0 to 1.
         nominal_step_deg: what the operator believes the step to be, positive.
         direction: what the operator believes the turn to be, seen from above.
         tilts: rotation of the turntable's axis out of its place in each frame, or None where it keeps its place.
@@ -169,7 +169,7 @@ class ChamberEffect(Effect):
     def cover(
         self, size_px: int, materials: tuple[str, ...], rng: np.random.Generator
     ) -> Float[np.ndarray, "lines samples materials"]:
-        """What each pixel sees where it sees the chamber: shares of ``materials`` that sum to 1."""
+        """What each pixel sees where it sees the chamber: fractions of ``materials`` that sum to 1."""
         raise NotImplementedError
 
 

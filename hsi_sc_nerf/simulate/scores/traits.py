@@ -31,7 +31,7 @@ class TrueSurface:
     Attributes:
         materials: names.
         mesh: metres, object frame.
-        weights: share of each material at each vertex.
+        weights: fraction of each material at each vertex.
         endmembers: reflectance of each material.
         wavelengths_nm: band centres.
     """
@@ -57,11 +57,11 @@ class TrueSurface:
         return (self.weights[chosen] @ self.endmembers).astype(np.float32)
 
     def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the surface's nearest place to each point: unit normal, shares of materials, and distance (m)."""
+        """Of the surface's nearest place to each point: unit normal, fractions of materials, and distance (m)."""
         found = self._scene().compute_closest_points(np.asarray(points_m, np.float32))
         triangle, uv = found["primitive_ids"].numpy().astype(np.int64), found["primitive_uvs"].numpy()
-        share = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
-        weights = np.einsum("nc,ncm->nm", share, self.weights[self.mesh.triangles[triangle]])
+        fraction = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+        weights = np.einsum("nc,ncm->nm", fraction, self.weights[self.mesh.triangles[triangle]])
         normals = found["primitive_normals"].numpy().astype(float)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         return normals, weights, np.linalg.norm(found["points"].numpy() - points_m, axis=1)
@@ -109,5 +109,5 @@ class TrueSurface:
 
 
 def relative_rms(measured: Float[np.ndarray, "bands"], true: Float[np.ndarray, "bands"]) -> float:
-    """Root mean square of a spectrum's error as a share of the root mean square of the true spectrum."""
+    """Root mean square of a spectrum's error as a fraction of the root mean square of the true spectrum."""
     return float(np.sqrt(np.mean(np.square(measured - true)) / np.mean(np.square(true))))

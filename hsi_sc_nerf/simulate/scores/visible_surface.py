@@ -13,7 +13,7 @@ from hsi_sc_nerf.meshes.mesh import ray_scene
 from hsi_sc_nerf.simulate.truth import Truth
 
 COVERED = 0.5
-"""Share of a pixel that the object must cover for the pixel to show it."""
+"""Fraction of a pixel that the object must cover for the pixel to show it."""
 LIFT_M = 1e-5
 """How far above its own surface a point's line of sight starts."""
 

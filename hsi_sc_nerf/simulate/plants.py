@@ -1,19 +1,18 @@
-"""Shapes that stand on z = 0: sphere, cylinder; pear, apple, maize ear (surfaces of revolution, bent and dented)."""
+"""Pear, apple and maize ear: their shapes, which stand on z = 0, and where their materials lie."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.mesh import revolve
-
-SEGMENTS = 336
-VERTEX_SPACING_M = 0.0005
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, revolve, steps
+from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar
+from hsi_sc_nerf.simulate.texture import over, smooth_noise, smoothstep
 
 # (radius, height) in units of the whole object's height; the body is smooth, the stem is a tube on top of it.
 PEAR_BODY = np.array(
@@ -36,56 +35,44 @@ MAIZE_EAR = np.array(
         (0.146, 0.45), (0.138, 0.60), (0.124, 0.74), (0.103, 0.86), (0.070, 0.95), (0.035, 0.99), (0.0, 1.0),
     ]
 )  # fmt: skip
-
 MAIZE_ROWS = 14
 MAIZE_KERNEL_PITCH_M = 0.0052
 MAIZE_KERNEL_RELIEF_M = 0.0022
 MAIZE_KERNEL_SPAN = (0.085, 0.975)
-"""Share of the ear's height that carries kernels; below is the shank with the rest of the husk."""
+"""Fraction of the ear's height that carries kernels; below is the shank with the rest of the husk."""
+FRUIT_MATERIALS = {
+    "pear": ("pear_skin", "pear_blush", "lenticel", "bruise", "stem"),
+    "apple": ("apple_skin", "apple_blush", "lenticel", "bruise", "stem"),
+}
+MAIZE_MATERIALS = ("kernel_yellow", "kernel_white", "kernel_purple", "cob", "husk")
+LENTICELS_PER_CM2 = 3.0
+STREAK_STRETCH = np.array([1.0, 1.0, 0.15])
 
 
 @dataclass(frozen=True)
-class Shape:
+class PlantMesh:
     """A closed mesh and, for each vertex, what part of the object it belongs to."""
 
     mesh: Mesh
     stem: Float[np.ndarray, "v"]
-    """Share of stem (fruit) or of husk (maize), in [0, 1]."""
+    """Fraction of stem (fruit) or of husk (maize), in [0, 1]."""
     kernel: Int[np.ndarray, "v"] | None = None
     """Number of the kernel that the vertex belongs to (maize)."""
     groove: Float[np.ndarray, "v"] | None = None
-    """Share of the cob seen between kernels, in [0, 1] (maize)."""
+    """Fraction of the cob seen between kernels, in [0, 1] (maize)."""
 
 
-def sphere(diameter_m: float) -> Mesh:
-    """A sphere; every vertex lies on it, so that area and volume come out at most 0.02 % too small."""
-    radius_m = diameter_m / 2.0
-    rings = max(SEGMENTS // 2, _steps(np.pi * radius_m))
-    latitude = np.linspace(-np.pi / 2.0, np.pi / 2.0, rings + 1)
-    profile = np.stack([radius_m * np.cos(latitude), radius_m * (1.0 + np.sin(latitude))], axis=-1)
-    profile[[0, -1], 0] = 0.0
-    return revolve(profile, SEGMENTS)
-
-
-def cylinder(diameter_m: float, height_m: float) -> Mesh:
-    """An upright cylinder; area and volume come out less than 0.01 % too small."""
-    r = diameter_m / 2.0
-    corners = np.array([[0.0, 0.0], [r, 0.0], [r, height_m], [0.0, height_m]])
-    sides = [np.linspace(a, b, _steps(float(np.linalg.norm(b - a))) + 1) for a, b in pairwise(corners)]
-    return revolve(np.concatenate([sides[0], sides[1][1:], sides[2][1:]]), SEGMENTS)
-
-
-def pear(height_m: float, rng: np.random.Generator) -> Shape:
+def pear(height_m: float, rng: np.random.Generator) -> PlantMesh:
     """A pear with a bent neck, stem included in ``height_m``."""
     return _fruit(PEAR_BODY, PEAR_STEM, height_m, rng, lobes=3, lobe_depth=0.012, bend=0.055)
 
 
-def apple(height_m: float, rng: np.random.Generator) -> Shape:
+def apple(height_m: float, rng: np.random.Generator) -> PlantMesh:
     """An apple with five faint lobes, stem included in ``height_m``."""
     return _fruit(APPLE_BODY, APPLE_STEM, height_m, rng, lobes=5, lobe_depth=0.014, bend=0.03)
 
 
-def maize(height_m: float, rng: np.random.Generator) -> Shape:
+def maize(height_m: float, rng: np.random.Generator) -> PlantMesh:
     """A husked maize ear that stands on its shank, its kernels in staggered rows as real relief."""
     profile = _resample(_smooth(MAIZE_EAR, closed_top=True) * height_m)
     mesh = revolve(profile, SEGMENTS)
@@ -100,7 +87,7 @@ def maize(height_m: float, rng: np.random.Generator) -> Shape:
     along_offset = 2.0 * (along - np.floor(along)) - 1.0
     dome = np.sqrt((1.0 - across_offset**4) * (1.0 - along_offset**4))
 
-    low, high = (share * height_m for share in MAIZE_KERNEL_SPAN)
+    low, high = (fraction * height_m for fraction in MAIZE_KERNEL_SPAN)
     fade = smoothstep((z - low) / 0.004) * smoothstep((high - z) / 0.012)
     # Kernels shrink with the ear towards its tip.
     relief = MAIZE_KERNEL_RELIEF_M * fade * np.minimum(1.0, radius / (0.12 * height_m))
@@ -108,7 +95,7 @@ def maize(height_m: float, rng: np.random.Generator) -> Shape:
     factor = np.divide(radius + relief * (dome * wobble - 0.6), radius, out=np.ones_like(radius), where=radius > 0)
     vertices = mesh.vertices * np.stack([factor, factor, np.ones_like(factor)], axis=-1)
     bent = _bend(vertices, height_m, 0.03, rng)
-    return Shape(
+    return PlantMesh(
         mesh=Mesh(_stand(bent, height_m), mesh.triangles),
         stem=1.0 - smoothstep((z - low + 0.002) / 0.003),
         kernel=row * (int(along.max()) + 2) + np.floor(along).astype(int),
@@ -125,7 +112,7 @@ def _fruit(
     lobes: int,
     lobe_depth: float,
     bend: float,
-) -> Shape:
+) -> PlantMesh:
     """Body and stem as one closed surface, out of round by a few percent, its base flattened to stand."""
     body_profile = _resample(_smooth(body, closed_top=False) * height_m)
     profile = np.concatenate([body_profile, _resample(stem * height_m)])
@@ -138,7 +125,7 @@ def _fruit(
     swell = 1.0 + 0.02 * np.cos(2.0 * azimuth + phase[0]) + lobe_depth * np.cos(lobes * azimuth + phase[1])
     vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
     vertices = _bend(vertices, height_m, bend, rng)
-    return Shape(mesh=Mesh(_stand(vertices, height_m), mesh.triangles), stem=on_stem.astype(float))
+    return PlantMesh(mesh=Mesh(_stand(vertices, height_m), mesh.triangles), stem=on_stem.astype(float))
 
 
 def _stand(vertices: Float[np.ndarray, "v 3"], height_m: float) -> Float[np.ndarray, "v 3"]:
@@ -171,13 +158,8 @@ def _smooth(nodes: Float[np.ndarray, "n 2"], *, closed_top: bool) -> Float[np.nd
 def _resample(profile: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Points along a profile every `VERTEX_SPACING_M`, its ends kept."""
     position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
-    wanted = np.linspace(0.0, position[-1], _steps(position[-1]) + 1)
+    wanted = np.linspace(0.0, position[-1], steps(position[-1]) + 1)
     return np.stack([np.interp(wanted, position, profile[:, i]) for i in range(2)], axis=-1)
-
-
-def _steps(length_m: float) -> int:
-    """Into how many steps of at most `VERTEX_SPACING_M` a length is cut."""
-    return max(1, int(np.ceil(length_m / VERTEX_SPACING_M)))
 
 
 def _cylindrical(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,7 +168,64 @@ def _cylindrical(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarr
     return np.hypot(x, y), np.arctan2(y, x) % (2.0 * np.pi), z
 
 
-def smoothstep(x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """0 below 0, 1 above 1, smooth between."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
+def fruit_weights(shape: PlantMesh, fruit: Fruit, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
+    """Fractions of skin, blush, lenticel, bruise and stem (in the order of `FRUIT_MATERIALS`)."""
+    points = shape.mesh.vertices
+    height = points[:, 2] / fruit.height_m
+    skin, blush, lenticel, bruise, stem = np.eye(5)
+    weights = np.tile(skin, (len(points), 1))
+
+    # One sunny side that fades out, with mottles and with streaks that run from top to bottom.
+    sun = rng.uniform(0.0, 2.0 * np.pi)
+    facing = np.cos(np.arctan2(points[:, 1], points[:, 0]) - sun)
+    streaks = smooth_noise(points * STREAK_STRETCH, 0.0045, rng)
+    mottle = smooth_noise(points, 0.018, rng)
+    sunny = smoothstep(0.48 + 0.50 * facing + 0.16 * mottle + 0.16 * streaks - 0.3 * np.abs(height - 0.45))
+    weights = over(weights, blush, fruit.blush * sunny)
+    # Skin is never one colour: a little blush pigment comes and goes everywhere.
+    weights = over(weights, blush, fruit.blush * 0.25 * smoothstep(0.5 + smooth_noise(points, 0.010, rng)))
+
+    if fruit.lenticel_diameter_m > 0.0:
+        weights = over(weights, lenticel, 0.85 * speckle(shape, fruit.lenticel_diameter_m, rng))
+    if fruit.bruise_diameter_m > 0.0:
+        azimuth = sun + np.pi * rng.uniform(0.6, 0.9)
+        side = np.argmin(
+            np.abs(_wrapped(np.arctan2(points[:, 1], points[:, 0]) - azimuth)) + 8.0 * np.abs(height - 0.48)
+        )
+        distance = np.linalg.norm(points - points[side], axis=1)
+        ragged = distance * (1.0 + 0.18 * smooth_noise(points, 0.012, rng))
+        weights = over(weights, bruise, 0.9 * smoothstep((fruit.bruise_diameter_m / 2.0 - ragged) / 0.004 + 0.5))
+    return over(weights, stem, shape.stem)
+
+
+def maize_weights(shape: PlantMesh, ear: MaizeEar, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
+    """Fractions of yellow, white and purple kernel, cob and husk (in the order of `MAIZE_MATERIALS`)."""
+    assert shape.kernel is not None
+    assert shape.groove is not None
+    yellow, white, purple, cob, husk = np.eye(5)
+    kernels = int(shape.kernel.max()) + 1
+    draw = rng.uniform(size=kernels)
+    is_purple = draw < ear.coloured_kernels
+    is_white = draw > 1.0 - ear.coloured_kernels
+    of_kernel = np.tile(yellow, (kernels, 1))
+    of_kernel = over(of_kernel, white, rng.uniform(0.0, 0.35, kernels) + 0.6 * is_white)
+    of_kernel = over(of_kernel, purple, np.where(is_purple, rng.uniform(0.6, 0.95, kernels), 0.0))
+    weights = over(of_kernel[shape.kernel], cob, 0.9 * shape.groove)
+    return over(weights, husk, shape.stem)
+
+
+def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
+    """Round dots scattered evenly by area, of diameters within 30 % of ``diameter_m``; 1 inside, 0 outside."""
+    vertices, triangles = shape.mesh.vertices, shape.mesh.triangles
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    count = int(LENTICELS_PER_CM2 * shape.mesh.area_m2() * 1e4)
+    centres = a[rng.choice(len(triangles), count, p=areas / areas.sum())]
+    radii = diameter_m / 2.0 * rng.uniform(0.7, 1.3, count)
+    distance, nearest = cKDTree(centres).query(vertices)
+    return smoothstep((radii[nearest] - distance) / (0.4 * diameter_m) + 0.5)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """An angle in radians brought into (-pi, pi]."""
+    return np.angle(np.exp(1j * angle))
