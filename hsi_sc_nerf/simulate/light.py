@@ -17,26 +17,25 @@ SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
 
 
 def lamp_photons(wavelengths_nm: Float[np.ndarray, "*shape"], temperature_k: float) -> Float[np.ndarray, "*shape"]:
-    """Photon spectrum of a tungsten lamp, relative: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
+    """Relative photon spectrum of a tungsten lamp: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
     exponent = SECOND_RADIATION_CONSTANT_NM_K / (wavelengths_nm * temperature_k)
     return (wavelengths_nm / 1000.0) ** -4 / np.expm1(exponent)
 
 
 @dataclass(frozen=True)
 class Colour:
-    """Light of the white tarp that was reflected by each of some materials, and of some bands only.
+    """A spectrum: the product of the reflectances of some materials and of a factor over wavelength.
 
     Attributes:
-        materials: columns of the endmembers whose reflectances are multiplied, in rising order; of none, it is white.
-        bands: (wavelength in nm, factor) of points between which the factor runs straight, level outside them;
-            without any, the factor is 1.
+        materials: columns of the endmembers whose reflectances are multiplied, ascending; white if empty.
+        bands: (wavelength in nm, factor) nodes of a polyline, constant outside its range; factor 1 if empty.
     """
 
     materials: tuple[int, ...]
     bands: tuple[tuple[float, float], ...] = ()
 
     def reflected_by(self, material: int) -> Colour:
-        """The colour after one more reflection."""
+        """The colour after a reflection by one more material."""
         return Colour(tuple(sorted((*self.materials, material))), self.bands)
 
     def spectrum(
@@ -44,7 +43,7 @@ class Colour:
         endmembers: Float[np.ndarray, "*samples materials bands"],
         wavelengths_nm: Float[np.ndarray, "*samples bands"],
     ) -> Float[np.ndarray, "*samples bands"]:
-        """Its radiance relative to the white tarp's."""
+        """Radiance of the colour."""
         spectrum = np.ones(wavelengths_nm.shape)
         for material in self.materials:
             spectrum = spectrum * endmembers[..., material, :]
@@ -58,17 +57,17 @@ def colour_spectra(
     endmembers: Float[np.ndarray, "*samples materials bands"],
     wavelengths_nm: Float[np.ndarray, "*samples bands"],
 ) -> Float[np.ndarray, "*samples colours bands"]:
-    """The spectra of several colours, stacked."""
+    """Spectra of several colours, stacked."""
     return np.stack([colour.spectrum(endmembers, wavelengths_nm) for colour in colours], axis=-2)
 
 
 @dataclass(frozen=True)
 class Light:
-    """``weights @ spectra``, times each of the illumination factors.
+    """Noise-free light on the sensor: ``weights @ spectra`` times all illumination factors.
 
     Attributes:
-        weights: how much of each colour each pixel sees.
-        spectra: of those colours, relative to the white tarp's; one table, or one for each sample of a line.
+        weights: amount of each colour in each pixel.
+        spectra: radiance of the colours: one table, or one for each sample of a line.
         illumination: factors that broadcast to (lines, samples, bands).
     """
 
@@ -79,20 +78,20 @@ class Light:
     def radiance(
         self, rows: slice | None = None, signal_of_white: Float[np.ndarray, "*samples bands"] | float = 1.0
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Radiance of some (by default all) lines, float32.
+        """Radiance of some lines, float32.
 
-        It is relative to the white tarp's under the lamps at the session's start; with ``signal_of_white`` (counts
-        above dark) it is in counts instead.
+        Args:
+            rows: image lines; all by default.
+            signal_of_white: counts above dark of the white tarp, for a radiance in counts.
         """
         rows = rows or slice(None)
         signal = np.asarray(signal_of_white)
         spectra = (self.spectra * (signal[..., None, :] if signal.ndim else signal)).astype(np.float32)
         weights = self.weights[rows].astype(np.float32, copy=False)
         if spectra.ndim == 2:
-            # One large product: many small ones lose their time between the cores.
+            # One large matrix product is faster than many small ones.
             radiance = (weights.reshape(-1, len(spectra)) @ spectra).reshape(*weights.shape[:2], -1)
         else:
-            # A table a sample: one product of matrices for each.
             radiance = np.matmul(weights.swapaxes(0, 1), spectra).swapaxes(0, 1).copy()
         for factor in self.illumination:
             radiance *= factor[rows] if len(factor) > 1 else factor
@@ -101,13 +100,13 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceLight:
-    """Radiance of each point of a surface, the same in all directions.
+    """Radiance of each point of a surface, equal in all directions, as weights of colours.
 
     Attributes:
         surface: the points.
-        colours: names the columns; the first are the renderer's materials, in their order.
-        chamber_lit: under a chamber of radiance 1.
-        lamp_lit: under a lamp that gives each point the irradiance 1.
+        colours: colour of each column; the first columns are the renderer's materials in their order.
+        chamber_lit: weights under a chamber of radiance 1.
+        lamp_lit: weights under a lamp of irradiance 1 at each point.
     """
 
     surface: Surface
@@ -123,14 +122,14 @@ class SurfaceLight:
 
 @dataclass(frozen=True, eq=False)
 class HitLight:
-    """What becomes of a surface's light on its way to one camera, where its rays hit.
+    """View-dependent factors on the light of a surface at the hits of one camera's rays.
 
     Attributes:
-        chamber: factor on the light that the chamber gives.
-        lamp: factor on the light that the lamp gives, its irradiance with it.
-        to_lamp: unit direction to the lamp, if there is one.
-        chamber_colour: of the chamber.
-        mirrored: further light at each hit, by its colour.
+        chamber: factor on the light of the chamber.
+        lamp: factor on the light of the lamp; includes its irradiance.
+        to_lamp: unit direction to the lamp; None without a lamp.
+        chamber_colour: colour of the chamber.
+        mirrored: mirrored light at each hit and its colour.
     """
 
     chamber: Float[np.ndarray, "hits"]
@@ -141,7 +140,7 @@ class HitLight:
 
 
 def even_light(surface: Surface) -> SurfaceLight:
-    """Irradiance 1 everywhere."""
+    """The light of a surface under the irradiance 1 at every point."""
     materials = surface.renderer.weights[surface.vertex]
     colours = tuple(Colour((i,)) for i in range(len(surface.renderer.materials)))
     return SurfaceLight(surface, colours, materials, materials)

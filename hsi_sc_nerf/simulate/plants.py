@@ -1,4 +1,4 @@
-"""Pear, apple and maize ear: their shapes, which stand on z = 0, and where their materials lie."""
+"""Pear, apple and maize ear: meshes that stand on z = 0, and the distribution of their materials."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hsi_sc_nerf.simulate.mesh import SEGMENTS, revolve, steps
 from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar
 from hsi_sc_nerf.simulate.texture import over, smooth_noise, smoothstep
 
-# (radius, height) in units of the whole object's height; the body is smooth, the stem is a tube on top of it.
+# Profiles of (radius, height) in units of the object's height; the body is a smooth curve, the stem a polyline.
 PEAR_BODY = np.array(
     [
         (0.0, 0.035), (0.06, 0.02), (0.15, 0.001), (0.25, 0.05), (0.315, 0.17), (0.325, 0.30), (0.28, 0.43),
@@ -39,7 +39,7 @@ MAIZE_ROWS = 14
 MAIZE_KERNEL_PITCH_M = 0.0052
 MAIZE_KERNEL_RELIEF_M = 0.0022
 MAIZE_KERNEL_SPAN = (0.085, 0.975)
-"""Fraction of the ear's height that carries kernels; below is the shank with the rest of the husk."""
+"""Range with kernels as fractions of the ear's height; shank and husk are below it."""
 FRUIT_MATERIALS = {
     "pear": ("pear_skin", "pear_blush", "lenticel", "bruise", "stem"),
     "apple": ("apple_skin", "apple_blush", "lenticel", "bruise", "stem"),
@@ -51,15 +51,15 @@ STREAK_STRETCH = np.array([1.0, 1.0, 0.15])
 
 @dataclass(frozen=True)
 class PlantMesh:
-    """A closed mesh and, for each vertex, what part of the object it belongs to."""
+    """A closed mesh and the organ of each vertex."""
 
     mesh: Mesh
     stem: Float[np.ndarray, "v"]
     """Fraction of stem (fruit) or of husk (maize), in [0, 1]."""
     kernel: Int[np.ndarray, "v"] | None = None
-    """Number of the kernel that the vertex belongs to (maize)."""
+    """Number of the kernel of each vertex (maize)."""
     groove: Float[np.ndarray, "v"] | None = None
-    """Fraction of the cob seen between kernels, in [0, 1] (maize)."""
+    """Fraction of cob between kernels, in [0, 1] (maize)."""
 
 
 def pear(height_m: float, rng: np.random.Generator) -> PlantMesh:
@@ -73,14 +73,14 @@ def apple(height_m: float, rng: np.random.Generator) -> PlantMesh:
 
 
 def maize(height_m: float, rng: np.random.Generator) -> PlantMesh:
-    """A husked maize ear that stands on its shank, its kernels in staggered rows as real relief."""
+    """A husked maize ear on its shank; staggered rows of kernels are part of the relief."""
     profile = _resample(_smooth(MAIZE_EAR, closed_top=True) * height_m)
     mesh = revolve(profile, SEGMENTS)
     radius, azimuth, z = _cylindrical(mesh.vertices)
 
     row_position = azimuth / (2.0 * np.pi) * MAIZE_ROWS + 0.25 * np.sin(2.0 * np.pi * z / height_m)
     row = np.floor(row_position).astype(int) % MAIZE_ROWS
-    # Rows start at heights of their own, neighbours about half a kernel apart.
+    # Neighbouring rows are shifted by about half a kernel.
     start = 0.5 * (np.arange(MAIZE_ROWS) % 2) + rng.uniform(-0.12, 0.12, MAIZE_ROWS)
     along = z / MAIZE_KERNEL_PITCH_M + start[row]
     across_offset = 2.0 * (row_position - np.floor(row_position)) - 1.0
@@ -113,7 +113,7 @@ def _fruit(
     lobe_depth: float,
     bend: float,
 ) -> PlantMesh:
-    """Body and stem as one closed surface, out of round by a few percent, its base flattened to stand."""
+    """Body and stem as one closed surface, out of round by a few percent, with a flat base."""
     body_profile = _resample(_smooth(body, closed_top=False) * height_m)
     profile = np.concatenate([body_profile, _resample(stem * height_m)])
     mesh = revolve(profile, SEGMENTS)
@@ -129,7 +129,7 @@ def _fruit(
 
 
 def _stand(vertices: Float[np.ndarray, "v 3"], height_m: float) -> Float[np.ndarray, "v 3"]:
-    """Sink the lowest 1 % of the height flat into z = 0, to rest on an area and not on a line; keep the height."""
+    """Flatten the lowest 1 % of the height, so that the object stands on an area; the height stays the same."""
     x, y, z = vertices.T
     z = np.maximum(z - z.min() - 0.01 * height_m, 0.0)
     return np.stack([x, y, z * height_m / z.max()], axis=-1)
@@ -138,14 +138,14 @@ def _stand(vertices: Float[np.ndarray, "v 3"], height_m: float) -> Float[np.ndar
 def _bend(
     vertices: Float[np.ndarray, "v 3"], height_m: float, amount: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "v 3"]:
-    """Shift the top sideways by ``amount`` of the height, growing with the square of height (volume is kept)."""
+    """Shear the top sideways by ``amount`` of the height, quadratic in height; the volume stays the same."""
     azimuth = rng.uniform(0.0, 2.0 * np.pi)
     shift = amount * height_m * (vertices[:, 2] / height_m) ** 2
     return vertices + np.stack([shift * np.cos(azimuth), shift * np.sin(azimuth), np.zeros_like(shift)], axis=-1)
 
 
 def _smooth(nodes: Float[np.ndarray, "n 2"], *, closed_top: bool) -> Float[np.ndarray, "m 2"]:
-    """A dense smooth curve through profile nodes, level where it meets the axis."""
+    """Dense smooth curve through the nodes of a profile, horizontal at the axis."""
     position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
     level_outwards = (1, np.array([1.0, 0.0]))
     top = (1, np.array([-1.0, 0.0])) if closed_top else (2, np.zeros(2))
@@ -156,10 +156,10 @@ def _smooth(nodes: Float[np.ndarray, "n 2"], *, closed_top: bool) -> Float[np.nd
 
 
 def _resample(profile: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """Points along a profile every `VERTEX_SPACING_M`, its ends kept."""
+    """Points along a profile at most `VERTEX_SPACING_M` apart, both ends included."""
     position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
-    wanted = np.linspace(0.0, position[-1], steps(position[-1]) + 1)
-    return np.stack([np.interp(wanted, position, profile[:, i]) for i in range(2)], axis=-1)
+    sampled = np.linspace(0.0, position[-1], steps(position[-1]) + 1)
+    return np.stack([np.interp(sampled, position, profile[:, i]) for i in range(2)], axis=-1)
 
 
 def _cylindrical(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -175,14 +175,14 @@ def fruit_weights(shape: PlantMesh, fruit: Fruit, rng: np.random.Generator) -> F
     skin, blush, lenticel, bruise, stem = np.eye(5)
     weights = np.tile(skin, (len(points), 1))
 
-    # One sunny side that fades out, with mottles and with streaks that run from top to bottom.
+    # Blush on the sunny side, with mottles and vertical streaks.
     sun = rng.uniform(0.0, 2.0 * np.pi)
     facing = np.cos(np.arctan2(points[:, 1], points[:, 0]) - sun)
     streaks = smooth_noise(points * STREAK_STRETCH, 0.0045, rng)
     mottle = smooth_noise(points, 0.018, rng)
     sunny = smoothstep(0.48 + 0.50 * facing + 0.16 * mottle + 0.16 * streaks - 0.3 * np.abs(height - 0.45))
     weights = over(weights, blush, fruit.blush * sunny)
-    # Skin is never one colour: a little blush pigment comes and goes everywhere.
+    # A little blush pigment varies everywhere on the skin.
     weights = over(weights, blush, fruit.blush * 0.25 * smoothstep(0.5 + smooth_noise(points, 0.010, rng)))
 
     if fruit.lenticel_diameter_m > 0.0:
@@ -215,7 +215,7 @@ def maize_weights(shape: PlantMesh, ear: MaizeEar, rng: np.random.Generator) -> 
 
 
 def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
-    """Round dots scattered evenly by area, of diameters within 30 % of ``diameter_m``; 1 inside, 0 outside."""
+    """Round dots, uniform by area, with diameters within 30 % of ``diameter_m``; 1 inside, 0 outside."""
     vertices, triangles = shape.mesh.vertices, shape.mesh.triangles
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -227,5 +227,5 @@ def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Fl
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """An angle in radians brought into (-pi, pi]."""
+    """Angle in radians wrapped to (-pi, pi]."""
     return np.angle(np.exp(1j * angle))

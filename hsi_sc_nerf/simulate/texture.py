@@ -1,4 +1,4 @@
-"""Tools that lay materials on a surface: mixing, smooth noise, and sampling of images."""
+"""Procedural and image textures: mixing of materials, smooth noise, and sampling of images."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
 PADDING_PX = 8
-"""How far into the unpainted part of a weight texture its painted islands are grown."""
+"""Distance by which painted islands of a weight texture are dilated."""
 
 
 def padded_fractions(image: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "h w m"]:
-    """An image whose channels are amounts of materials as fractions that sum to 1 (0 where nothing is painted).
+    """Normalise the channels of an image to fractions that sum to 1; unpainted texels stay 0.
 
-    Texels up to `PADDING_PX` beside a painted one take its fractions: UV islands end between texels.
+    Texels within `PADDING_PX` of a painted one get its fractions, because UV islands end between texels.
     """
     total = image.sum(axis=-1, keepdims=True)
     fractions = np.divide(image, total, out=np.zeros_like(image), where=total > 0.0)
@@ -22,26 +22,26 @@ def padded_fractions(image: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "h 
 
 
 def sampled(image: Float[np.ndarray, "h w m"], uv: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v m"]:
-    """Bilinear samples at UVs (origin at the image's lower left corner); the image repeats outside [0, 1]."""
+    """Bilinear samples at UVs with the origin in the lower left corner; the image repeats outside [0, 1]."""
     height, width = image.shape[:2]
     x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    across, down = (x - left)[:, None], (y - top)[:, None]
+    right, below = (x - left)[:, None], (y - top)[:, None]
     rows, columns = (top % height, (top + 1) % height), (left % width, (left + 1) % width)
-    upper, lower = (image[row, columns[0]] * (1.0 - across) + image[row, columns[1]] * across for row in rows)
-    return upper * (1.0 - down) + lower * down
+    upper, lower = (image[row, columns[0]] * (1.0 - right) + image[row, columns[1]] * right for row in rows)
+    return upper * (1.0 - below) + lower * below
 
 
 def over(
     weights: Float[np.ndarray, "v m"], material: Float[np.ndarray, "m"], fraction: Float[np.ndarray, "v"]
 ) -> Float[np.ndarray, "v m"]:
-    """Lay a material over others: it takes ``fraction`` of each point (clipped to [0, 1]), the rest keep theirs."""
+    """Cover ``fraction`` (clipped to [0, 1]) of each point with a material."""
     fraction = np.clip(fraction, 0.0, 1.0)[:, None]
     return weights * (1.0 - fraction) + material * fraction
 
 
 def smooth_noise(points: Float[np.ndarray, "v 3"], scale_m: float, rng: np.random.Generator) -> np.ndarray:
-    """A smooth random field of mean 0 and SD about 0.7 whose features are about ``scale_m`` wide."""
+    """Smooth random field with mean 0, standard deviation of about 0.7 and features of about ``scale_m``."""
     waves = 24
     directions = rng.normal(size=(waves, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -52,6 +52,6 @@ def smooth_noise(points: Float[np.ndarray, "v 3"], scale_m: float, rng: np.rando
 
 
 def smoothstep(x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """0 below 0, 1 above 1, smooth between."""
+    """Cubic step from 0 at x <= 0 to 1 at x >= 1."""
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

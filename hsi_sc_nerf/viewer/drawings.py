@@ -19,10 +19,10 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from viser import GuiMarkdownHandle, ViserServer
 
 WIDTH_PX = 240
-"""Width that the viewer shows pictures at."""
-_DPI = 3 * 96  # three dots to a pixel of the page: sharp on screens with many
+"""Width of images in the viewer's panel."""
+_DPI = 3 * 96  # three dots a pixel, sharp on high-resolution screens
 _STYLE: Any = {"font.size": 7, "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False}
-# Okabe and Ito's blue and vermilion, which colour-blind readers tell apart.
+# Blue and vermilion of Okabe and Ito, which colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00")
 
 
@@ -54,7 +54,7 @@ def colour_bar(drawn_range: tuple[float, float], colours: str, label: str) -> by
 
 
 def inline_image(png: bytes, text: str) -> str:
-    """Markdown that shows a picture, or ``text`` where pictures are not shown."""
+    """Markdown of an image with the alternative text ``text``."""
     return f"![{text}](data:image/png;base64,{base64.b64encode(png).decode()})"
 
 
@@ -74,7 +74,7 @@ class ViewerMarkdown(ViewerElement[str]):
     """Markdown in the control panel.
 
     Args:
-        first: what it shows at first; asked only when a viewer shows the panel.
+        first: gives the initial content; called when a viewer shows the panel.
     """
 
     gui_handle: GuiMarkdownHandle | None  # type: ignore[assignment]
@@ -84,14 +84,14 @@ class ViewerMarkdown(ViewerElement[str]):
         self.first = first
 
     def show(self, content: str) -> None:
-        """Show something else, once it is in a panel."""
+        """Replace the content; the element must be in a panel."""
         assert self.gui_handle is not None
         self.gui_handle.content = content
 
     def install(self, viser_server: ViserServer) -> None:
-        """Put it into the panel."""
+        """Add the element to the panel."""
         self._create_gui_handle(viser_server)
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
-        # A root for relative paths of pictures, of which there are none, spares a warning of each picture.
+        # An image root avoids one warning for each image.
         self.gui_handle = viser_server.gui.add_markdown(self.first(), image_root=Path())

@@ -183,7 +183,7 @@ def wall_and_floor(height_m=0.1):
 
 def test_wall_hides_its_form_factor_of_the_sky():
     surface, on_floor, _, hidden = wall_and_floor()
-    free = surface.surroundings(2048).free[on_floor]
+    free = surface.surroundings(2048).chamber_visibility[on_floor]
     np.testing.assert_allclose(free, 1.0 - hidden, atol=5e-3)
     assert free[0] == pytest.approx(0.5, abs=0.015)
 

@@ -234,7 +234,7 @@ def test_bad_meshes_get_one_sentence(tmp_path):
     vertices, triangles, _ = uv_sphere()
     refused(tmp_path, "there is no such file")
     (tmp_path / "ball.stl").write_text("solid")
-    refused(tmp_path, "is no mesh that can be read", "ball.stl")
+    refused(tmp_path, "not a mesh format", "ball.stl")
     for suffix in own_mesh.FORMATS:
         (tmp_path / f"broken{suffix}").write_bytes(b"ply\nnonsense\x00\xff")
         with pytest.raises(InputError, match=r"cannot be read as a mesh|has no triangles"):
@@ -275,6 +275,6 @@ def test_bad_textures_get_one_sentence(tmp_path):
     Image.new("RGB", (64, 64)).save(tmp_path / "fractions.png")
     refused(tmp_path, "are 0 for every material", "ball.obj", **texture)
     ramp(tmp_path / "fractions.png", 0)
-    refused(tmp_path, "can tell 3 materials apart", "ball.obj", ("a", "b", "c", "d"), **texture)
+    refused(tmp_path, "can represent 3 materials", "ball.obj", ("a", "b", "c", "d"), **texture)
     save_ply(tmp_path / "ball.ply", *surface[:2], {})
     refused(tmp_path, "has no UVs", **texture)

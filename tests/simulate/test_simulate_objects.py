@@ -188,10 +188,10 @@ def test_bad_materials_get_one_sentence(tmp_path, definition, sentence):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("", "is no table of numbers with the columns wavelength_nm and reflectance|must cover"),
-        ("nm,r\n390,0.1\n1010,0.2\n", "is no table of numbers with the columns"),
-        ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "is no table of numbers"),
-        ("wavelength_nm,reflectance\n390,0.1\n1010\n", "is no table of numbers"),
+        ("", "not a table of numbers with the columns wavelength_nm and reflectance|must cover"),
+        ("nm,r\n390,0.1\n1010,0.2\n", "not a table of numbers with the columns"),
+        ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "not a table of numbers"),
+        ("wavelength_nm,reflectance\n390,0.1\n1010\n", "not a table of numbers"),
         ("wavelength_nm,reflectance\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n400,0.1\n1010,0.2\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n1010,0.1\n390,0.2\n", "wavelengths must increase"),

@@ -17,51 +17,52 @@ from hsi_sc_nerf.simulate.light import SurfaceLight
 from hsi_sc_nerf.simulate.texture import over, smooth_noise, smoothstep
 
 DIRECTIONS = 96
+"""Default number of directions in which the surroundings of a point are sampled."""
 BLOTCH_SCALES = (0.20, 0.08, 0.03)
-"""Widths of the pattern's blotches, fractions of the image's side."""
+"""Width of the blotches of paint as a fraction of the image side."""
 EDGE_STEEPNESS = 8.0
-"""How sharp the edges of a blotch are: its fraction rises from 0 to 1 over 1 / this of the noise's range."""
+"""Slope of a blotch's fraction over the noise value at its edge."""
 BOARDS, JOINT_WIDTH = 5, 0.008
-"""Upright boards across the image, and the width of the black joints between them, fraction of the image's side."""
+"""Number of boards across the image; width of the black joints as a fraction of the image side."""
 
 
 @dataclass(frozen=True)
 class ChamberShading(SurfaceLightEffect):
-    """Where neighbours hide part of the chamber it is darker: at the foot of the object, between kernels.
+    """Points from which part of the chamber is occluded receive less light (ambient occlusion).
 
-    Irradiance is the fraction of directions, weighted by their cosine to the normal, in which the chamber is seen.
-    What is seen instead is black, but for `InterReflection`.
+    Irradiance is the cosine-weighted fraction of directions in which the chamber is visible. Occluders are black
+    unless `InterReflection` is on.
     """
 
     name: ClassVar[str] = "chamber_shading"
     directions: int = between(8, 4096, default=DIRECTIONS)
-    """Directions in which each point of the surface looks; errors fall as fast as this grows, time grows with it."""
+    """Directions sampled at each point; the error is inversely proportional to it, the time proportional."""
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
-        """Dim the chamber's light."""
-        free = light.surface.surroundings(self.directions).free.astype(np.float32)
-        return replace(light, chamber_lit=light.chamber_lit * free[:, None])
+        """Multiply the chamber's light by its visibility."""
+        visibility = light.surface.surroundings(self.directions).chamber_visibility.astype(np.float32)
+        return replace(light, chamber_lit=light.chamber_lit * visibility[:, None])
 
 
 @dataclass(frozen=True)
 class InterReflection(SurfaceLightEffect):
-    """Object, container and disc light each other, by one reflection, in their colours.
+    """Object, container and disc illuminate each other by one diffuse reflection.
 
-    Irradiance is what the chamber gives, as in `ChamberShading`, and what neighbours send that hide it. They
-    themselves are lit as they are without this effect: evenly, or as `ChamberShading` says where that is named.
-    Surfaces that are seen from behind send nothing.
+    Irradiance is that of the visible chamber, as in `ChamberShading`, plus the light of the occluders. The occluders
+    are lit as without this effect: evenly, or as `ChamberShading` determines if it is on. The back of a surface sends
+    no light.
     """
 
     name: ClassVar[str] = "inter_reflection"
     directions: int = between(8, 4096, default=DIRECTIONS)
-    """Directions in which each point of the surface looks; errors fall as fast as this grows, time grows with it."""
+    """Directions sampled at each point; the error is inversely proportional to it, the time proportional."""
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
-        """Add a colour for each pair of materials of which one lights the other."""
+        """Add one colour for each pair of materials of which one illuminates the other."""
         around = light.surface.surroundings(self.directions)
         materials = light.materials
-        from_neighbours = (around.seen @ light.chamber_lit).astype(np.float32)
-        plain = materials * around.free.astype(np.float32)[:, None]
+        from_neighbours = (around.form_factors @ light.chamber_lit).astype(np.float32)
+        plain = materials * around.chamber_visibility.astype(np.float32)[:, None]
         bounced: dict = {}
         for i, material in enumerate(materials.T):
             at = np.flatnonzero(material)
@@ -80,21 +81,20 @@ class InterReflection(SurfaceLightEffect):
 
 @dataclass(frozen=True)
 class TexturedBackground(ChamberEffect):
-    """The chamber's wall is no even white: boards with splashes of paint that stand still in the image.
+    """The wall of the chamber is made of boards with blotches of paint, which are stationary in the image.
 
-    Structure from motion finds more features on it than on the object, and takes the camera for one that does not
-    move.
+    Structure from motion finds more features on the wall than on the object and estimates a stationary camera.
     """
 
     name: ClassVar[str] = "textured_background"
     materials: ClassVar[tuple[str, ...]] = ("plywood", "blue_paint", "black_paint")
     contrast: float = between(0.0, 1.0, default=1.0)
-    """Fraction of the pattern in what the wall shows; the rest is the even chamber."""
+    """Fraction of the pattern in the wall; the rest is the white chamber."""
 
     def cover(
         self, size_px: int, materials: tuple[str, ...], rng: np.random.Generator
     ) -> Float[np.ndarray, "lines samples materials"]:
-        """Boards of wood with black joints, under blotches of paint of three sizes."""
+        """Wooden boards with black joints, covered by blotches of paint of three sizes."""
         wood, blue, black = np.eye(3)
         place = (np.arange(size_px) + 0.5) / size_px
         y, x = (axis.ravel() for axis in np.meshgrid(place, place, indexing="ij"))

@@ -1,8 +1,8 @@
-"""Effects of the detector: spectral smile, exposure, noise, fixed patterns and bad pixels.
+"""Effects of the detector: spectral smile, exposure, fixed patterns, bad pixels and noise.
 
-With `photon_noise` and `read_noise` the variance of a pixel's counts is a line over its mean, the photon transfer curve (Janesick,
-"Photon Transfer", SPIE 2007): ``variance = (mean - dark) / g + (electrons / g)^2``, g the electrons per count. The
-digitiser adds 1/12.
+With `PhotonNoise` and `ReadNoise` the variance of a pixel's counts is linear in its mean, the photon transfer curve
+(Janesick, "Photon Transfer", SPIE 2007): ``variance = (mean - dark) / g + (electrons / g)^2``, where g is the number
+of electrons per count. The digitiser adds 1/12.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effects.stages import DetectorEffect, ExposureEffect, ReadoutContext, ReadoutEffect
 
 FEW_ELECTRONS = 50.0
-"""Below this mean, Poisson numbers are drawn exactly; above, by `many_electrons` in half the time."""
+"""Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
 
 
 @dataclass(frozen=True)
 class SpectralSmile(DetectorEffect):
-    """Lines of one wavelength are curved on the detector: its pixels see other wavelengths than the header states.
+    """The wavelength of a band varies along the detector's line (spectral smile).
 
-    The shift is a parabola along the detector's line: nothing in the middle, ``shift_nm`` at both ends. It is in all
-    captures, and calibration with the tarp's mean spectrum leaves it in.
+    The shift is a parabola: 0 in the middle of the line, ``shift_nm`` at both ends. It affects all captures, and
+    calibration with the mean spectrum of the tarp does not remove it.
     """
 
     name: ClassVar[str] = "spectral_smile"
     shift_nm: float = between(-20.0, 20.0, default=1.5)
-    """Wavelength at the ends of the line less that in its middle, nm."""
+    """Wavelength at the ends of the line minus that in its middle, nm."""
 
     def wavelengths_nm(
         self, centres_nm: Float[np.ndarray, "bands"], samples: int
@@ -42,42 +42,42 @@ class SpectralSmile(DetectorEffect):
 
 @dataclass(frozen=True)
 class Saturation(ExposureEffect):
-    """The integration time is too long: what is too bright stops at the largest count.
+    """The integration time is too long, and bright pixels saturate.
 
-    It lengthens the integration time of the whole session, white tarp included, because the paper's session has one
-    (10 ms), here set for a dark object. So calibration stays right wherever neither the object nor the tarp stops; a
-    tarp at 0.82 of the largest count stops, in its brightest bands, from a factor of about 1.2 on. `tarp_exposure`
-    gives the tarp a time of its own.
+    The effect changes the integration time of the whole session, white tarp included, as the paper's session has one
+    integration time. Calibration stays correct where neither object nor tarp saturates. With the default
+    ``white_level`` the tarp saturates in its brightest bands above a factor of 1.2; `TarpExposure` gives the tarp an
+    integration time of its own.
     """
 
     name: ClassVar[str] = "saturation"
     exposure_factor: float = between(1.0, 100.0, default=1.5)
-    """Integration time over the one at which the tarp counts the sensor's ``white_level``."""
+    """Ratio of the integration time to the one at which the tarp counts the sensor's ``white_level``."""
 
     def factor(self, of_white: bool) -> float:
-        """`exposure_factor`, in all captures."""
+        """`exposure_factor` in all captures."""
         return self.exposure_factor
 
 
 @dataclass(frozen=True)
 class TarpExposure(ExposureEffect):
-    """The white tarp is taken with another integration time than the frames, as one sets it by hand for each.
+    """White tarp and frames are captured with different integration times.
 
-    The metadata of each capture states its own; reflectance is off by the factor for who does not read them.
+    The metadata of each capture state its integration time.
     """
 
     name: ClassVar[str] = "tarp_exposure"
     exposure_factor: float = between(0.01, 100.0, default=0.5)
-    """Integration time of the white tarp over that of the frames."""
+    """Ratio of the white tarp's integration time to that of the frames."""
 
     def factor(self, of_white: bool) -> float:
-        """`exposure_factor` for the tarp; the frames keep theirs."""
+        """`exposure_factor` for the tarp, 1 for the frames."""
         return self.exposure_factor if of_white else 1.0
 
 
 @dataclass(frozen=True)
 class DarkPattern(ReadoutEffect):
-    """The dark level is another one in each detector pixel; a dark cube takes it off."""
+    """Each detector pixel has its own dark level (fixed pattern), which a dark cube records."""
 
     name: ClassVar[str] = "dark_pattern"
     spread: float = between(0.0, 1000.0, default=6.0)
@@ -90,17 +90,17 @@ class DarkPattern(ReadoutEffect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Add the pattern."""
+        """Add the fixed pattern."""
         counts += context.maps["dark_offset"]
         return counts
 
 
 @dataclass(frozen=True)
 class BadPixels(ReadoutEffect):
-    """Some detector pixels do not follow the light: dead ones stay at the dark level, hot ones at the largest count.
+    """Some detector pixels are dead (constant dark level) or hot (constant largest count).
 
-    A detector pixel is one sample in one band, so each is a line across the image of its band. Whole bands can be
-    dead, too.
+    A detector pixel is one sample in one band, so each bad pixel is a line in the image of its band. Whole bands can
+    be dead as well.
     """
 
     name: ClassVar[str] = "bad_pixels"
@@ -112,10 +112,7 @@ class BadPixels(ReadoutEffect):
     """Number of bands that are dead in all samples."""
 
     def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """``dead`` and ``hot``: which pixels are, never both.
-
-        Their numbers are the fractions, rounded; the pixels of dead bands come on top and are dead, not hot.
-        """
+        """Boolean maps ``dead`` and ``hot``, which are disjoint; pixels of dead bands are dead in addition."""
         pixels = samples * bands
         dead, hot = round(self.dead_fraction * pixels), round(self.hot_fraction * pixels)
         chosen = rng.permutation(pixels)
@@ -123,7 +120,7 @@ class BadPixels(ReadoutEffect):
         maps[0, chosen[:dead]] = True
         maps[1, chosen[dead : dead + hot]] = True
         of_dead, of_hot = maps.reshape(2, samples, bands)
-        # Drawn last, so that the other pixels are the same with and without dead bands.
+        # Drawn last: the other bad pixels do not depend on the number of dead bands.
         dead_bands = rng.permutation(bands)[: self.dead_bands]
         of_dead[:, dead_bands] = True
         of_hot[:, dead_bands] = False
@@ -132,7 +129,7 @@ class BadPixels(ReadoutEffect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Overwrite what the bad pixels read."""
+        """Overwrite the counts of bad pixels."""
         counts[:, context.maps["dead"]] = context.dark_level
         counts[:, context.maps["hot"]] = context.largest_count
         return counts
@@ -140,17 +137,17 @@ class BadPixels(ReadoutEffect):
 
 @dataclass(frozen=True)
 class PhotonNoise(ReadoutEffect):
-    """Electrons arrive by chance: the variance of a signal is the signal itself, in electrons (Poisson)."""
+    """Shot noise: the number of electrons is Poisson distributed, so its variance equals its mean."""
 
     name: ClassVar[str] = "photon_noise"
 
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Draw the electrons of the light and give them back as counts; the dark level is no light."""
+        """Draw the electrons of the signal above the dark level and convert them back to counts."""
         electrons = np.maximum(counts - np.float32(context.dark_level), 0.0, dtype=np.float32)
         electrons *= np.float32(context.electrons_per_count)
-        # Line by line, which stays within the processor's cache.
+        # One line at a time fits in the processor's cache.
         for line in electrons:
             line[...] = poisson(line, context.rng)
         electrons /= np.float32(context.electrons_per_count)
@@ -160,7 +157,7 @@ class PhotonNoise(ReadoutEffect):
 
 @dataclass(frozen=True)
 class ReadNoise(ReadoutEffect):
-    """The amplifier adds the same noise to every reading, however much light there was."""
+    """The amplifier adds normally distributed noise that does not depend on the signal."""
 
     name: ClassVar[str] = "read_noise"
     electrons: float = between(0.0, 1e5, default=40.0)
@@ -169,7 +166,7 @@ class ReadNoise(ReadoutEffect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Add normal noise."""
+        """Add the noise."""
         spread = np.float32(self.electrons / context.electrons_per_count)
         for line in counts:
             line += spread * context.rng.standard_normal(line.shape, dtype=np.float32)
@@ -185,11 +182,11 @@ def poisson(mean: Float[np.ndarray, "*n"], rng: np.random.Generator) -> Float[np
 
 
 def many_electrons(mean: Float[np.ndarray, "*n"], normal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Whole numbers from standard normal ones that are distributed like Poisson numbers of a large mean.
+    """Approximate Poisson numbers of a large mean from standard normal numbers z.
 
-    A Cornish-Fisher expansion with the Poisson distribution's skewness, ``mean + s z + (z^2 - 1) / 6``, rounded.
-    Mean and variance are exact with ``s^2 = mean - 1/18 - 1/12`` (the last two are of the square and of the
-    rounding). From `FEW_ELECTRONS` on the cumulative distribution is nowhere off by more than 2e-4.
+    Rounded Cornish-Fisher expansion ``mean + s z + (z^2 - 1) / 6``. Mean and variance are exact with
+    ``s^2 = mean - 1/18 - 1/12``, where 1/18 is the variance of the square and 1/12 that of the rounding. For means of
+    at least `FEW_ELECTRONS` the error of the cumulative distribution is at most 2e-4.
     """
     number = np.sqrt(np.maximum(mean - np.float32(5.0 / 36.0), 0.0, dtype=np.float32))
     # s z + (z^2 - 1) / 6 = (s + z / 6) z - 1 / 6, in place.

@@ -1,4 +1,4 @@
-"""Effects of the object: it dries, shrinks, reflects like a mirror, and scatters light below its surface."""
+"""Effects of the object: drying, shrinkage, gloss and subsurface scattering."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from hsi_sc_nerf.simulate.render import Hits
 
 SHARP_NM, WIDTH_NM = 400.0, 1000.0
 LEVELS = 2
-"""Widths at which softened light is computed; in between it runs straight from one to the next."""
+"""Number of widths at which diffused light is computed; between them it is interpolated linearly."""
 
 
 @dataclass(frozen=True)
 class Drying(MaterialEffect):
-    """Plant tissue loses water at a steady rate, and its water bands (970 nm and neighbours) fade.
+    """Plant tissue loses water at a constant rate, and its water absorption bands (970 nm and others) fade.
 
-    A material that a scene gives as a measured spectrum has no known water and keeps its colour.
+    Materials with a measured spectrum do not change, because their water content is not known.
     """
 
     name: ClassVar[str] = "drying"
     water_loss: float = between(0.0, 1.0, default=0.3)
-    """Fraction of the water that is gone at the end of the session."""
+    """Fraction of the water that is lost at the end of the session."""
 
     def spectra(
         self,
@@ -38,60 +38,60 @@ class Drying(MaterialEffect):
         wavelengths_nm: Float[np.ndarray, "*samples bands"],
         elapsed: float,
     ) -> Float[np.ndarray, "*samples materials bands"]:
-        """Take the lost water's absorbance away; reflectance stays below the tissue's plateau."""
+        """Remove the absorbance of the lost water; reflectance stays below the plateau of the tissue."""
         water = np.array([m.water if isinstance(m, PlantTissue) else 0.0 for m in materials])
         lost = self.water_loss * elapsed * water[:, None] * water_absorbance(wavelengths_nm)[..., None, :]
-        return endmembers * 10.0**lost
+        # Rounding must not lift a reflectance above 1.
+        return np.minimum(endmembers * 10.0**lost, 1.0)
 
 
 @dataclass(frozen=True)
 class Deformation(DeformationEffect):
-    """The object shrinks at a steady rate towards the point that it stands on: it is no rigid body."""
+    """The object shrinks at a constant rate towards the point on which it stands."""
 
     name: ClassVar[str] = "deformation"
     shrink_percent: float = between(0.0, 50.0, default=2.0)
-    """Loss of height and width from the session's start to its end, percent."""
+    """Loss of height and width over the session, percent."""
 
     def deform(
         self, vertices: Float[np.ndarray, "v 3"], foot_m: Float[np.ndarray, "3"], elapsed: float
     ) -> Float[np.ndarray, "v 3"]:
-        """Scale about the foot."""
+        """Scale the vertices about the foot."""
         return foot_m + (1.0 - self.shrink_percent / 100.0 * elapsed) * (vertices - foot_m)
 
 
 @dataclass(frozen=True)
 class Gloss(ViewLightEffect):
-    """The object (not its support) has a smooth clear skin over its matte body.
+    """The object (not its support) has a smooth transparent coat over its matte body.
 
-    The skin mirrors F of the light and lets 1 - F through, to the body and back (F: `fresnel`). In the mirror the
-    chamber is seen where nothing else stands there, else nothing. With a `Lamp` there is its highlight as well, from
-    a skin of fine facets, and its light reaches the body through the skin: the matte body under a skin of Kelemen and
-    Szirmay-Kalos (2001), which is reciprocal, keeps all light of a white body, and for the chamber's even light is
-    just 1 - F. A highlight may be brighter than the white tarp; all that a point sends is never more than it gets.
+    The coat reflects the fraction F (`fresnel`) of the light and transmits 1 - F to the body and back. It mirrors the
+    chamber where the mirror direction is unoccluded, and nothing elsewhere. A `Lamp` adds a highlight of GGX facets;
+    its light reaches the body through the coat as in Kelemen and Szirmay-Kalos (2001), which is reciprocal and
+    conserves energy. A highlight can be brighter than the white tarp.
     """
 
     name: ClassVar[str] = "gloss"
     refractive_index: float = between(1.0, 3.0, default=1.45)
-    """Of the skin; 1.45 is a plant's cuticle."""
+    """Refractive index of the coat; 1.45 is that of a plant cuticle."""
     roughness: float = between(0.03, 1.0, default=0.25)
-    """Width of the lamp's highlight: 0.03 almost a mirror, 1 almost matte (GGX's alpha)."""
+    """GGX roughness alpha of the lamp's highlight: 0.03 is nearly a mirror, 1 nearly matte."""
 
     def at_hits(self, hits: Hits, light: HitLight, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
-        """Dim the body's light and add what the skin mirrors."""
+        """Attenuate the light of the body and add the mirrored light."""
         glossy = np.flatnonzero(hits.is_object)
         normals = hits.facing_normals[glossy]
         to_camera = -hits.directions[hits.ray[glossy]]
         cosine = np.einsum("nk,nk->n", normals, to_camera)
-        mirrored_fraction = fresnel(cosine, self.refractive_index)
+        reflectance = fresnel(cosine, self.refractive_index)
         mirror = 2.0 * cosine[:, None] * normals - to_camera
 
         chamber, lamp, of_chamber = light.chamber.copy(), light.lamp.copy(), np.zeros_like(light.chamber)
-        chamber[glossy] *= 1.0 - mirrored_fraction
-        of_chamber[glossy] = light.chamber[glossy] * mirrored_fraction * hits.is_free(mirror, glossy)
+        chamber[glossy] *= 1.0 - reflectance
+        of_chamber[glossy] = light.chamber[glossy] * reflectance * hits.is_unoccluded(mirror, glossy)
         mirrored = [(light.chamber_colour, of_chamber)]
         if light.to_lamp is not None:
             cosine_to_lamp = np.maximum(normals @ light.to_lamp, 0.0)
-            through = (1.0 - fresnel(cosine_to_lamp, self.refractive_index)) * (1.0 - mirrored_fraction)
+            through = (1.0 - fresnel(cosine_to_lamp, self.refractive_index)) * (1.0 - reflectance)
             lamp[glossy] *= through / (1.0 - mean_fresnel(self.refractive_index))
             highlight = np.zeros_like(light.lamp)
             highlight[glossy] = light.lamp[glossy] * np.pi * self.highlight(normals, to_camera, light.to_lamp)
@@ -104,9 +104,9 @@ class Gloss(ViewLightEffect):
         to_camera: Float[np.ndarray, "n 3"],
         to_lamp: Float[np.ndarray, "*n 3"],
     ) -> Float[np.ndarray, "n"]:
-        """The skin's reflection from the lamp to the camera (BRDF, 1/sr), both above it: Walter et al. (2007).
+        """BRDF (1/sr) of the coat for unit directions to lamp and camera: GGX facets, Walter et al. (2007).
 
-        GGX facets with Smith's shadowing, with Schlick's Fresnel of each facet.
+        Shadowing is Smith's, the reflectance of each facet Schlick's.
         """
         half = to_camera + to_lamp
         half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
@@ -123,13 +123,13 @@ class Gloss(ViewLightEffect):
 
 
 def fresnel(cosine: Float[np.ndarray, "*n"], refractive_index: float) -> Float[np.ndarray, "*n"]:
-    """Fraction of unpolarised light that a smooth surface mirrors, in [0, 1], by Schlick (1994)."""
+    """Fraction of unpolarised light that a smooth surface reflects, in [0, 1], after Schlick (1994)."""
     at_normal = _at_normal(refractive_index)
     return at_normal + (1.0 - at_normal) * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5
 
 
 def mean_fresnel(refractive_index: float) -> float:
-    """Fraction that it mirrors of light that comes evenly from everywhere: the cosine-weighted mean of `fresnel`."""
+    """Cosine-weighted mean of `fresnel` over the half space, in [0, 1]."""
     at_normal = _at_normal(refractive_index)
     return at_normal + (1.0 - at_normal) / 21.0
 
@@ -140,27 +140,26 @@ def _at_normal(refractive_index: float) -> float:
 
 @dataclass(frozen=True)
 class Translucency(SurfaceLightEffect):
-    """The object's patterns and its shading by the chamber are softer, the longer the wavelength.
+    """Light scatters below the surface of the object, which blurs patterns and shading at long wavelengths.
 
-    Light wanders under the skin, and further where less is absorbed. What a matte surface would send is spread over
-    the object's surface with a standard deviation that grows evenly from 0 at 400 nm to ``width_mm`` at 1000 nm; its
-    total over the surface is kept. Nothing passes from the object to its support, and the edges of shadows that the
-    lamp casts stay sharp.
+    The light of a matte surface diffuses over the surface of the object. The standard deviation grows linearly from 0
+    at 400 nm to ``width_mm`` at 1000 nm, and the total over the surface stays the same. No light passes to the
+    support, and cast shadows of the lamp stay sharp.
     """
 
     name: ClassVar[str] = "translucency"
     width_mm: float = between(0.1, 20.0, default=2.0)
-    """How far light at 1000 nm spreads (standard deviation along the surface), millimetres."""
+    """Standard deviation along the surface at 1000 nm, millimetres."""
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
-        """Give each colour of the object a copy for each width, which counts in its fraction of the bands."""
+        """Add, for each colour of the object, one diffused copy for each width and its weight in each band."""
         surface = light.surface
         on_object = surface.is_object[:, None]
         of_object = [i for i, lit in enumerate(light.chamber_lit.T) if lit[surface.is_object].any()]
         sharp = [lit[:, of_object] * on_object for lit in (light.chamber_lit, light.lamp_lit)]
         plain = [lit * ~on_object for lit in (light.chamber_lit, light.lamp_lit)]
         colours, columns = list(light.colours), [[lit] for lit in plain]
-        for level, bands in enumerate(_fractions_of_bands()):
+        for level, bands in enumerate(_band_weights()):
             colours += [replace(light.colours[i], bands=bands) for i in of_object]
             both = np.concatenate(sharp, axis=1)
             if level > 0:
@@ -171,7 +170,7 @@ class Translucency(SurfaceLightEffect):
         return replace(light, colours=tuple(colours), chamber_lit=chamber_lit, lamp_lit=lamp_lit)
 
 
-def _fractions_of_bands() -> list[tuple[tuple[float, float], ...]]:
-    """Fraction of each width in each band, as points (nm, fraction) of a line; they sum to 1 in every band."""
+def _band_weights() -> list[tuple[tuple[float, float], ...]]:
+    """Weight of each width over wavelength, as (nm, weight) nodes of a polyline; weights sum to 1 everywhere."""
     nodes_nm = [SHARP_NM + (WIDTH_NM - SHARP_NM) * i / LEVELS for i in range(LEVELS + 1)]
     return [tuple((nm, float(i == j)) for j, nm in enumerate(nodes_nm)) for i in range(LEVELS + 1)]

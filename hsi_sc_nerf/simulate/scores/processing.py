@@ -21,9 +21,9 @@ from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 COVERED = 0.5
-"""A pixel belongs to the object where the object covers more than this fraction of it."""
+"""Fraction of a pixel that the object must exceed for the pixel to belong to it."""
 MIDDLE_REFLECTANCE = (0.1, 0.9)
-"""Errors are compared with the uncertainty where nothing is clipped."""
+"""Range of reflectance, free of clipping, in which errors are compared with the uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,9 @@ class ProcessingScore:
         rotation_deg: largest angle between an estimated and a true camera orientation.
         position_m: largest distance between an estimated and a true camera position.
         focal_length_percent: error of the focal length.
-        reflectance_rmse: root mean squared error over all values that are measurements; noise counts. NaN where
-            nothing is.
-        flagged_fraction: fraction of the values that are no measurements, in [0, 1].
-        mask_iou: smallest intersection over union of a mask with the pixels that the object really covers.
+        reflectance_rmse: root mean squared error over all valid values, noise included; NaN without valid values.
+        flagged_fraction: fraction of invalid values, in [0, 1].
+        mask_iou: smallest intersection over union of a mask with the true object pixels.
     """
 
     rotation_deg: float
@@ -51,12 +50,17 @@ class ProcessingScore:
 def score_processing(
     dataset: PackedDataset, truth: Truth, bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
 ) -> ProcessingScore:
-    """Compare a packed dataset with the truth of its session, frame by frame, without any alignment.
+    """Compare a packed dataset with the truth of its session, frame by frame and without alignment.
 
     Args:
-        dataset: the processed session.
-        truth: what it was simulated from, in the dataset's bands at least.
-        bounds: what the calibration clipped reflectance to; the truth is clipped likewise.
+        dataset: processed session.
+        truth: truth of the session, in all bands of the dataset.
+        bounds: range to which the calibration clipped reflectance; the truth is clipped to it as well.
+
+    Example:
+        >>> score = score_processing(open_packed("data"), load_truth("pear-session"))
+        >>> score.rotation_deg < 0.5
+        True
     """
     poses = dict(zip(truth.captures, truth.camera_to_world, strict=True))
     bands = nearest_bands(truth.wavelengths_nm, dataset.wavelengths_nm)
@@ -88,11 +92,11 @@ class CalibrationScore:
     """Errors over all frames and kept bands.
 
     Attributes:
-        reflectance_rms: of the values that are measurements; noise counts.
-        noise_rms: what the calibration itself says of these errors.
-        error_over_uncertainty: root mean square of the errors in units of their stated standard deviations.
-        drift_rms: relative, of the lamps' drift; nan where it was not measured.
-        flagged_fraction: of the values.
+        reflectance_rms: root mean squared error of valid values, noise included.
+        noise_rms: root mean square of the uncertainty that the calibration states for them.
+        error_over_uncertainty: root mean square of the ratio of error and uncertainty.
+        drift_rms: relative root mean squared error of the lamp drift; NaN if the drift was not measured.
+        flagged_fraction: fraction of invalid values, in [0, 1].
     """
 
     reflectance_rms: float
@@ -105,10 +109,10 @@ class CalibrationScore:
 def score_calibration(
     session: Session, calibration: SessionCalibration, packed_dir: Path, truth: Truth
 ) -> CalibrationScore:
-    """Compare packed frames with the reflectance that even, steady light would have shown.
+    """Compare packed frames with the true reflectance under even and constant light.
 
     Raises:
-        ValueError: a calibration without an uncertainty (finished reflectance).
+        ValueError: the calibration has no uncertainty (the session holds reflectance).
     """
     if calibration.uncertainty is None:
         raise ValueError("score_calibration: finished reflectance has no uncertainty to compare errors with")
@@ -140,7 +144,7 @@ def score_calibration(
 
 
 def lamp_output(truth: Truth, capture: str) -> Float[np.ndarray, "bands"]:
-    """True illumination in the image's middle, which differs between frames by the lamps' drift alone."""
+    """True illumination in the image centre, which differs between frames by the lamp drift only."""
     product = np.ones(len(truth.wavelengths_nm))
     for factor in truth.light(capture).illumination:
         product = product * factor[factor.shape[0] // 2, factor.shape[1] // 2]
