@@ -1,8 +1,8 @@
-"""How right calibrated reflectance is, on simulated sessions of which everything is known, as a table.
+"""Accuracy of calibrated reflectance on simulated sessions, as a table.
 
     uv run python benchmarks/calibration_accuracy.py --page docs/calibration.md --pictures docs/images
 
-Each row is a pear with some effects of light and sensor, calibrated with and without what is meant against them.
+Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ COLUMNS = [
 
 @dataclass(frozen=True)
 class CalibrationAccuracy:
-    """Measure how right calibrated reflectance is on simulated sessions."""
+    """Measure the accuracy of calibrated reflectance on simulated sessions."""
 
     page: Path | None = None
     """Markdown page whose table is replaced."""

@@ -1,9 +1,9 @@
-"""Our renderer against Mitsuba 3: one frame of a scene, rendered by both under each transport of light.
+"""Comparison of the simulator's renderer with Mitsuba 3 on one frame, under each light transport.
 
     uv run --extra mitsuba python benchmarks/mitsuba_agreement.py --output-dir /tmp/agreement --scene pear
 
-Mitsuba renders each picture several times with other random numbers; their scatter is the Monte-Carlo error that the
-difference has to be judged by.
+Mitsuba renders each image several times with different seeds. The scatter gives the Monte-Carlo error of the
+difference.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ COMPARISONS: dict[mitsuba_render.Transport, tuple[str, ...]] = {
     "one_bounce": BOTH,
     "many_bounces": BOTH,
 }
-"""Our effects beside each transport of Mitsuba's. Ours has one bounce at most, so that the last one must differ."""
+"""Effects for each transport of Mitsuba; the simulator has at most one bounce, so the last one differs."""
 LARGEST_DIFFERENCE = 0.05
 """End of the colour scale of the picture's differences."""
 

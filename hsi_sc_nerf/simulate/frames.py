@@ -102,10 +102,10 @@ class Simulation:
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
         self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
-        self._seen_nm = self.wavelengths_nm
+        self._detector_nm = self.wavelengths_nm
         for detector in of_stage(effects, stages.DetectorEffect):
-            self._seen_nm = detector.wavelengths_nm(self._seen_nm, scene.camera.size_px)
-        self._signal_of_white = sensor.white_signal(scene.sensor, self._seen_nm)
+            self._detector_nm = detector.wavelengths_nm(self._detector_nm, scene.camera.size_px)
+        self._signal_of_white = sensor.white_signal(scene.sensor, self._detector_nm)
         self._exposures = of_stage(effects, stages.ExposureEffect)
         self.detector_maps = {
             effect.name: effect.detector_maps(
@@ -114,7 +114,7 @@ class Simulation:
             for effect in self._readout
         }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
-        self._seen_endmembers = self._seen_spectra(self.materials)
+        self._detector_endmembers = self._detector_reflectance(self.materials)
 
     @property
     def integration_time_ms(self) -> float:
@@ -143,18 +143,18 @@ class Simulation:
             if lighting is not None:
                 wall = light_weights[..., len(self.materials) - 1, None]
                 light_weights[..., : len(self.materials)] += wall * (cover - np.eye(len(self.materials))[-1])
-        spectra = self._seen_endmembers
+        spectra = self._detector_endmembers
         if self._material:
             of_object = [self.materials.index(name) for name in self.object_part.materials]
             spectra = spectra.copy()
             for effect in self._material:
                 spectra[..., of_object, :] = effect.spectra(
-                    spectra[..., of_object, :], self._object_materials, self._seen_nm, elapsed
+                    spectra[..., of_object, :], self._object_materials, self._detector_nm, elapsed
                 )
         if lighting is None:
             light = Light(weights, spectra)
         else:
-            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._seen_nm))
+            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._detector_nm))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
         return SimulatedFrame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
@@ -162,15 +162,15 @@ class Simulation:
     def white(self) -> SimulatedCapture:
         """Simulate the capture of the white tarp before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
-        light = self._on_sensor(Light(weights, self._seen_spectra(WHITE_MATERIALS)), elapsed=0.0)
+        light = self._on_sensor(Light(weights, self._detector_reflectance(WHITE_MATERIALS)), elapsed=0.0)
         return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
 
     def _exposure_factor(self, of_white: bool) -> float:
         return math.prod(exposure.factor(of_white) for exposure in self._exposures)
 
-    def _seen_spectra(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
+    def _detector_reflectance(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
         """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""
-        return np.moveaxis(endmembers(names, self._seen_nm, self.scene.materials), 0, -2)
+        return np.moveaxis(endmembers(names, self._detector_nm, self.scene.materials), 0, -2)
 
     def _renderer_of(self, thing: Part) -> Renderer:
         """The renderer of the object, which may be deformed, on its support."""

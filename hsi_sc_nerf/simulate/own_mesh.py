@@ -73,8 +73,8 @@ def load(settings: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
     else:
         raise InputError(
             f"{settings.mesh_file}: does not locate its materials {', '.join(settings.materials)}; give it vertex "
-            f"properties weight_{settings.materials[0]} and so on (PLY) or vertex colours, or add a weight_texture to "
-            "the scene."
+            f"properties weight_{settings.materials[0]} and so on (PLY) or vertex colours, or add a weight_texture "
+            "to the scene."
         )
     mesh, weights = welded(vertices, triangles, weights)
     return _facing_outwards(mesh, settings.mesh_file), weights

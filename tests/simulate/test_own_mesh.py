@@ -254,7 +254,7 @@ def test_bad_meshes_get_one_sentence(tmp_path):
 def test_bad_weights_get_one_sentence(tmp_path):
     vertices, triangles, uv = uv_sphere()
     save_ply(tmp_path / "ball.ply", vertices, triangles, {})
-    refused(tmp_path, "does not say where a, b lie")
+    refused(tmp_path, "does not locate its materials a, b")
     save_ply(tmp_path / "ball.ply", vertices, triangles, {"weight_a": uv[:, 0]})
     refused(tmp_path, "have no property weight_b")
     save_ply(tmp_path / "ball.ply", vertices, triangles, {"weight_a": uv[:, 0], "weight_b": 0 * uv[:, 0]})
