@@ -1,17 +1,17 @@
-"""Regions of an image: morphology and connected components on boolean masks."""
+"""Regions of an image: morphology, connected components and outlines of boolean masks."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from scipy import ndimage
 
 
 def ellipse_close_open(
     mask: Bool[np.ndarray, "lines samples"], *, close_px: int, open_px: int
 ) -> Bool[np.ndarray, "lines samples"]:
-    """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is left out)."""
+    """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is skipped)."""
     for operation, size in ((cv2.MORPH_CLOSE, close_px), (cv2.MORPH_OPEN, open_px)):
         if size >= 2:
             ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -42,5 +42,15 @@ def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarra
 
 
 def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
-    """The mask with everything that it encloses."""
+    """The mask with its holes filled."""
     return ndimage.binary_fill_holes(mask)
+
+
+def draw_outline(
+    image: UInt8[np.ndarray, "lines samples 3"],
+    mask: Bool[np.ndarray, "lines samples"],
+    colour: tuple[int, int, int] = (255, 0, 200),
+) -> UInt8[np.ndarray, "lines samples 3"]:
+    """A copy of the image with the mask's outline drawn over it."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.ascontiguousarray(image).copy(), contours, -1, colour, 1)

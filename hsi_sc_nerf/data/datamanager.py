@@ -47,16 +47,16 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     """Random pixels of the cubes on disk; nothing is cached but the masks.
 
     Attributes:
-        foreground_share: share of the training rays that hit the foreground; ``None`` for whole frames. The
+        foreground_ray_fraction: fraction of the training rays that hit the foreground; None for whole frames. The
             trainer sets it by stage.
-        rim_share: share of the others that pass just beside it; likewise.
+        boundary_ray_fraction: fraction of the others that pass just beside the foreground; likewise.
     """
 
     config: SpectralDataManagerConfig
     train_pixel_sampler: PixelSampler  # type: ignore[assignment]
     eval_pixel_sampler: PixelSampler  # type: ignore[assignment]
-    foreground_share: float | None = None
-    rim_share: float = 0.0
+    foreground_ray_fraction: float | None = None
+    boundary_ray_fraction: float = 0.0
 
     def _pixels(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         return PixelSampler(
@@ -91,7 +91,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """The training batch of ``step``: always the same for the same step, stage and seed."""
         self.train_count += 1
-        batch = self.train_pixel_sampler.sample(step, self.foreground_share, self.rim_share)
+        batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
         return self._with_rays(batch, self.train_ray_generator)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:

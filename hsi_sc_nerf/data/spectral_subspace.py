@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
-from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE, ReflectanceUncertainty
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 FEWEST_SPECTRA = 64
 """Below this, neither noise nor rank can be told."""
@@ -32,39 +31,22 @@ ROUNDING_NOISE = 1.0 / (REFLECTANCE_SCALE * np.sqrt(12.0))
 
 @dataclass(frozen=True, eq=False)
 class SpectralSubspace:
-    """An orthonormal basis of a session's spectra, and what is lost outside it.
+    """An orthonormal basis of a session's spectra.
 
     Attributes:
-        basis: orthonormal columns, by falling share of the spectra.
-        coefficient_rms: root mean square of the spectra's coefficients in ``scaled_basis``.
-        mean_spectrum: of the spectra, projected.
-        rank_above_noise: how many directions stand out of the noise; ``basis`` has no more columns than was allowed.
-        noise_rmse: root mean square of the noise over spectra and bands.
-        noise_estimated: whether the noise was told from the spectra themselves.
-        projection_rmse: root mean square of what the projection takes off spectra, noise included.
-        projection_sam_rad: mean spectral angle between spectra and their projections, noise included.
-        excess_rmse: the part of ``projection_rmse`` that noise does not explain: what the rank costs.
-        excess_sam_rad: the same of the root mean square angle.
+        basis: orthonormal columns, in the order of the spectra's energy along them.
+        mean_spectrum: mean of the spectra, projected.
     """
 
     basis: Float[np.ndarray, "bands rank"]
-    coefficient_rms: Float[np.ndarray, "rank"]
     mean_spectrum: Float[np.ndarray, "bands"]
-    rank_above_noise: int
-    noise_rmse: float
-    noise_estimated: bool
-    projection_rmse: float
-    projection_sam_rad: float
-    excess_rmse: float
-    excess_sam_rad: float
 
     @property
     def scaled_basis(self) -> Float[np.ndarray, "bands rank"]:
-        """The basis with columns of root mean square 1, for a network to emit the coefficients.
+        """The basis with columns of root mean square 1, whose coefficients the field emits.
 
-        The first coefficient is of the order of a reflectance, and the squared error's mean over the bands is the sum
-        of the coefficients' squared errors: none is learned at another's cost. (Coefficients that are all of order 1
-        leave the shape of a spectrum to gradients that drown in those of its brightness.)
+        The mean squared error over the bands is then the sum of the coefficients' squared errors. Coefficients that
+        are all scaled to 1 would give the shape of a spectrum far smaller gradients than its brightness.
         """
         return self.basis * np.sqrt(len(self.basis))
 
@@ -72,6 +54,24 @@ class SpectralSubspace:
     def mean_coefficients(self) -> Float[np.ndarray, "rank"]:
         """Coefficients of the mean spectrum in ``scaled_basis``."""
         return self.mean_spectrum @ self.basis / np.sqrt(len(self.basis))
+
+
+def training_subspace(
+    dataset: PackedDataset, frames: Sequence[PackedFrame], rank: int | None = None
+) -> SpectralSubspace:
+    """The subspace of training pixels, half of which lie on the object.
+
+    Args:
+        dataset: its uncertainty is the noise; where it has none, the noise is estimated from the spectra.
+        frames: training frames.
+        rank: number of directions; None for those above the noise.
+
+    Raises:
+        InputError: too few pixels are free of flagged values.
+    """
+    spectra, valid = sample_training_spectra(frames)
+    noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
+    return find_subspace(spectra, noise, valid, rank=rank)
 
 
 def find_subspace(
@@ -119,22 +119,14 @@ def find_subspace(
     even = of_band * np.sqrt(np.mean((deviation / of_band) ** 2, axis=1, keepdims=True))
     # The triangle of a QR decomposition has the singular values and directions of the whole.
     _, singular, directions = np.linalg.svd(np.linalg.qr(sample / even, mode="r"))
-    above = int((singular > _largest_of_noise(deviation / even)).sum())
-    chosen = rank or max(1, min(above, max_rank))
+    above_noise = int((singular > _largest_of_noise(deviation / even)).sum())
+    chosen = rank or max(1, min(above_noise, max_rank))
 
     span, _ = np.linalg.qr((directions[:chosen] * of_band).T)
-    _, energy, turn = np.linalg.svd(sample @ span, full_matrices=False)
+    _, _, turn = np.linalg.svd(sample @ span, full_matrices=False)
     basis = span @ turn.T
     basis *= np.where((sample @ basis).sum(axis=0) < 0.0, -1.0, 1.0)
-    return SpectralSubspace(
-        basis=basis,
-        coefficient_rms=energy / np.sqrt(sample.size),
-        mean_spectrum=basis @ (basis.T @ sample.mean(axis=0)),
-        rank_above_noise=above,
-        noise_rmse=float(np.sqrt(np.mean(deviation**2))),
-        noise_estimated=noise is None,
-        **_projection_errors(sample, deviation, basis),
-    )
+    return SpectralSubspace(basis, mean_spectrum=basis @ (basis.T @ sample.mean(axis=0)))
 
 
 def _largest_of_noise(deviation: Float[np.ndarray, "n bands"]) -> float:
@@ -142,27 +134,6 @@ def _largest_of_noise(deviation: Float[np.ndarray, "n bands"]) -> float:
     rng = np.random.default_rng(0)
     draws = [deviation * rng.standard_normal(deviation.shape) for _ in range(NOISE_DRAWS)]
     return float(max(np.sqrt(np.linalg.eigvalsh(draw.T @ draw)[-1]) for draw in draws))
-
-
-def _projection_errors(
-    sample: Float[np.ndarray, "n bands"], deviation: Float[np.ndarray, "n bands"], basis: Float[np.ndarray, "bands k"]
-) -> dict[str, float]:
-    """What the projection takes off, and how much of it is more than the noise that lies outside the subspace."""
-    coefficients = sample @ basis
-    squared = np.square(sample - coefficients @ basis.T).sum(axis=1)
-    length = np.square(coefficients).sum(axis=1)
-    outside = 1.0 - np.square(basis).sum(axis=1)
-    of_noise = deviation**2 @ outside
-    lit = length > 0.0
-    angle = np.arctan2(np.sqrt(squared), np.sqrt(length))
-    noise_angle = np.arctan2(np.sqrt(of_noise[lit]), np.sqrt(length[lit]))
-    bands = sample.shape[1]
-    return {
-        "projection_rmse": float(np.sqrt(squared.mean() / bands)),
-        "projection_sam_rad": float(angle.mean()),
-        "excess_rmse": float(np.sqrt(max(0.0, (squared - of_noise).mean() / bands))),
-        "excess_sam_rad": float(np.sqrt(max(0.0, np.mean(angle[lit] ** 2 - noise_angle**2)))),
-    }
 
 
 def estimate_noise(spectra: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "bands"]:

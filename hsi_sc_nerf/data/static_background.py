@@ -32,20 +32,10 @@ _SPREAD_OF_MAD = 1.4826
 _EVEN_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 
 
-@dataclass(frozen=True)
-class BackgroundImageConfig:
-    """How the chamber's picture is taken from the frames."""
-
-    most_frames: int = 12
-    """So many frames, evenly spread over the session, are looked at."""
-    most_cells: int = 128
-    """The picture has at most so many cells along its longer side; more show a patterned wall sharper."""
-    least_share: float = 0.2
-    """Places that fewer of these frames show free of object and turntable are filled in from their surroundings."""
-    margin_share: float = 0.01
-    """Object and turntable are widened by this share of the image's shorter side: their rims are blurred."""
-    smoothing_cells: int = 5
-    """Side of the window in which noise is averaged where the picture varies no more than it; 1 for none."""
+MARGIN_FRACTION = 0.01
+"""Object and turntable are dilated by this fraction of the image's shorter side, because their edges are blurred."""
+SMOOTHING_CELLS = 5
+"""Side of the Wiener filter's window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +54,12 @@ class StaticBackground:
 
 
 def estimate_static_background(
-    dataset: PackedDataset, frames: Sequence[PackedFrame], config: BackgroundImageConfig | None = None
+    dataset: PackedDataset,
+    frames: Sequence[PackedFrame],
+    *,
+    max_frames: int = 12,
+    max_cells: int = 128,
+    min_fraction: float = 0.2,
 ) -> StaticBackground:
     """The chamber behind the turntable, on a coarse grid over the camera's image.
 
@@ -77,13 +72,14 @@ def estimate_static_background(
     Args:
         dataset: camera, boxes and container.
         frames: the frames that may be looked at (training frames).
-        config: settings.
+        max_frames: number of frames that are read, evenly spread over the session.
+        max_cells: cells of the picture along its longer side.
+        min_fraction: fraction of the frames that have to show the chamber at a cell; other cells are filled in.
     """
-    config = config or BackgroundImageConfig()
-    chosen = [frames[i] for i in evenly_spread(len(frames), config.most_frames)]
+    chosen = [frames[i] for i in evenly_spread(len(frames), max_frames)]
     lens = dataset.intrinsics
-    cell_px = -(-max(lens.w, lens.h) // config.most_cells)
-    margin_px = 2 * max(1, round(config.margin_share * min(lens.w, lens.h))) + 1
+    cell_px = -(-max(lens.w, lens.h) // max_cells)
+    margin_px = 2 * max(1, round(MARGIN_FRACTION * min(lens.w, lens.h))) + 1
     places = [pixel_of_cells(lens.h, lens.w, cell_px, k) for k in range(len(chosen))]
     solids = turning_solids(dataset)
     free = np.empty((len(chosen), len(places[0][0]), len(places[0][1])), bool)
@@ -91,7 +87,7 @@ def estimate_static_background(
         turning = frame.mask() | turning_outline(solids, frame.camera_to_world, lens, dataset.distortion)
         free[k] = ~dilate(turning, margin_px)[np.ix_(y, x)]
 
-    least = max(1, int(np.ceil(config.least_share * len(chosen))))
+    least = max(1, int(np.ceil(min_fraction * len(chosen))))
     with closing(PixelReader(frame.cube() for frame in chosen)) as reader:
         image = np.empty((*free.shape[1:], reader.shape[2]), np.float32)
         variance = np.empty_like(image)
@@ -99,8 +95,7 @@ def estimate_static_background(
             indices = [np.stack(np.broadcast_arrays(k, y[line], x), axis=-1) for k, (y, x) in enumerate(places)]
             counts = reader.read(np.concatenate(indices)).reshape(len(chosen), len(image[0]), -1)
             image[line], variance[line] = median_over_frames(counts, free[:, line], least)
-    if config.smoothing_cells > 1:
-        image = quieten(image, variance, config.smoothing_cells)
+    image = quieten(image, variance, SMOOTHING_CELLS)
     coverage = free.mean(axis=0)
     return StaticBackground(
         image=fill_in(image, dataset.background_reflectance),

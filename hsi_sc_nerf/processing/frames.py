@@ -13,11 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8, UInt16
 
-from hsi_sc_nerf.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.calibration.pixel_counts import Tally
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration, pack_counts
-from hsi_sc_nerf.capture.cube_lines import CubeLines
-from hsi_sc_nerf.capture.envi import Cube, open_cube
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
+from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
@@ -63,14 +60,14 @@ class FrameNotes:
     gray: UInt8[np.ndarray, "lines samples"]
     score: Float[np.ndarray, "lines samples"]
     brightness: Float[np.ndarray, "lines samples"]
-    tally: Tally
+    tally: PixelCounts
 
 
 def finished_notes(paths: FramePaths, fingerprint: str) -> FrameNotes | None:
     """The notes of a frame that was finished from the same files with the same settings, or None."""
     try:
         with np.load(paths.notes) as stored:
-            tally = Tally(**{f.name: stored[f.name] for f in fields(Tally)})
+            tally = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
             notes = FrameNotes(
                 str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], tally
             )
@@ -121,10 +118,10 @@ def process_frame(
         upright(to_8_bit(frame.gray)),
         upright(foreground_score(frame.binned, masks.smoothing_px)),
         upright(brightness(frame.binned, masks.smoothing_px)),
-        frame.tally,
+        frame.pixel_counts,
     )
     with atomic_write(paths.notes) as (temporary,):
-        tally = {f.name: getattr(notes.tally, f.name) for f in fields(Tally)}
+        tally = {f.name: getattr(notes.tally, f.name) for f in fields(PixelCounts)}
         np.savez(
             temporary,
             fingerprint=notes.fingerprint,

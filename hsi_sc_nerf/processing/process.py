@@ -12,16 +12,15 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.pixel_counts import Tally
+from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
     describe_calibration,
-    describe_tally,
+    describe_pixel_counts,
     draw_calibration,
     write_calibration,
 )
-from hsi_sc_nerf.calibration.session_calibration import calibrate_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -36,7 +35,6 @@ from hsi_sc_nerf.packed.dataset import (
     transforms_path,
     write_transforms,
 )
-from hsi_sc_nerf.packed.uncertainty import typical_uncertainty
 from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import PoseWay, find_poses
@@ -136,10 +134,10 @@ def process_session(
         workers=config.workers,
         progress=progress,
     )
-    tally = Tally.total(note.tally for note in notes)
+    tally = PixelCounts.total(note.tally for note in notes)
     wavelengths_nm = session.wavelengths_nm[calibration.bands]
     values = sum(note.score.size for note in notes) * len(wavelengths_nm)
-    console.print(describe_tally(tally, values), highlight=False)
+    console.print(describe_pixel_counts(tally, values), highlight=False)
 
     images = [note.gray for note in notes]
     poses = pose_frames(
@@ -181,7 +179,7 @@ def process_session(
     console.print(f"Object: inside a box of {size_mm} mm.")
     typical = None
     if calibration.uncertainty is not None:
-        typical = typical_uncertainty(calibration.uncertainty, _mean_spectrum(frames, masks))
+        typical = calibration.uncertainty.standard_deviation(_mean_spectrum(frames, masks))
     write_calibration(output_dir / REPORT_NAME, session, calibration, tally, typical)
     widths_nm = session.frames[0].cube.fwhm_nm
     diameter_m = session.info.container_diameter_m if poses.metric else None

@@ -27,23 +27,17 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.dataset import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.plotting.false_colour import (
-    ANGLE_COLOURS,
-    ANGLE_DRAWN_RAD,
-    INDEX_COLOURS,
-    angle_to_measured,
-    coloured,
-)
+from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
-from hsi_sc_nerf.viewer.training_views import TrainingViews
+from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
-    from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+    from nerfstudio.pipelines.base_pipeline import Pipeline
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle
 
@@ -54,12 +48,12 @@ _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
 
 
-def attach_spectral_panel(pipeline: VanillaPipeline) -> SpectralPanel:
+def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
     """Add the spectral controls to a pipeline, and their images to what its model renders for a viewer.
 
     Args:
-        pipeline: pipeline whose model is a `SpectralModel`. It gets the attribute ``panel``, in which nerfstudio's
-            viewer finds the controls.
+        pipeline: pipeline whose model is a `SpectralModel`. It gets the attribute ``spectral_panel``, in
+            which nerfstudio's viewer finds the controls.
 
     Returns:
         The panel. It has no parameters and leaves checkpoints unchanged.
@@ -76,7 +70,7 @@ def attach_spectral_panel(pipeline: VanillaPipeline) -> SpectralPanel:
         return panel.render(camera, lambda camera: render(camera, obb_box=obb_box))
 
     model.get_outputs_for_camera = render_with_panel  # type: ignore[method-assign]
-    pipeline.panel = panel
+    pipeline.spectral_panel = panel
     return panel
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.data.static_background import (
-    BackgroundImageConfig,
     estimate_static_background,
     evenly_spread,
     fill_in,
@@ -101,10 +100,8 @@ def test_the_wall_is_found_and_its_hidden_part_filled_in(session):
 
 
 def test_what_few_frames_show_is_filled_in(session):
-    few = BackgroundImageConfig(least_share=0.6)
-    np.testing.assert_array_equal(
-        estimate_static_background(session, session.frames, few).coverage[4, [20, 24, 28, 40]], [0, 0, 0, 1]
-    )
+    found = estimate_static_background(session, session.frames, min_fraction=0.6)
+    np.testing.assert_array_equal(found.coverage[4, [20, 24, 28, 40]], [0, 0, 0, 1])
 
 
 def test_flagged_values_count_nowhere(session):
@@ -132,7 +129,7 @@ def test_cells_of_several_pixels(tmp_path, most_cells):
     """The median over frames of other pixels of the cell is the cell's middle on a ramp."""
     empty = np.zeros((LENS.h, LENS.w), bool)
     dataset = write_dataset(tmp_path, [pack(wall())] * 12, [empty] * 12)
-    found = estimate_static_background(dataset, dataset.frames, BackgroundImageConfig(most_cells=most_cells))
+    found = estimate_static_background(dataset, dataset.frames, max_cells=most_cells)
     size = found.cell_px
     assert size == -(-48 // most_cells)
     assert found.image.shape == (-(-LENS.h // size), -(-LENS.w // size), BANDS)
@@ -150,7 +147,7 @@ def test_reads_no_more_frames_than_told(session):
     for frame in session.frames[1::2]:
         frame.mask_path.unlink()
     chosen = [session.frames[i] for i in (1, 0, 3, 2, 5, 4, 7, 6)]
-    estimate_static_background(session, chosen, BackgroundImageConfig(most_frames=4))
+    estimate_static_background(session, chosen, max_frames=4)
 
 
 def test_evenly_spread():

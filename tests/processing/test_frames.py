@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.pixel_counts import Tally
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PixelCounts
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, pack, unpack, write_packed_cube
@@ -100,7 +99,7 @@ def test_notes_of_a_finished_frame_are_read_again(cube, tmp_path):
     assert again.fingerprint == "made"
     np.testing.assert_array_equal(again.gray, notes.gray)
     np.testing.assert_array_equal(again.score, notes.score)
-    for field in fields(Tally):
+    for field in fields(PixelCounts):
         np.testing.assert_array_equal(getattr(again.tally, field.name), getattr(notes.tally, field.name))
     assert finished_notes(paths, "other files") is None
 

@@ -15,11 +15,11 @@ from viser.transforms import SO3
 from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.plotting.false_colour import BLANK, angle_to_measured, coloured, frame_pixels
+from hsi_sc_nerf.plotting.false_colour import BLANK, coloured
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.panel import SpectralPanel, attach_spectral_panel, pick
-from hsi_sc_nerf.viewer.training_views import TrainingViews
+from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 LENS = PinholeIntrinsics(w=40, h=30, fl_x=50.0, fl_y=60.0, cx=19.0, cy=16.0)
@@ -173,7 +173,7 @@ def test_an_attached_panel_is_found_by_the_viewer_and_keeps_checkpoints(pipeline
     before = pipeline.state_dict().keys()
     panel = attach_spectral_panel(pipeline)
     found = [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements")]
-    assert "Custom Elements/panel/band" in found
+    assert "Custom Elements/spectral_panel/band" in found
     assert pipeline.state_dict().keys() == before
     # Without a viewer the model renders as before.
     frame = pipeline.datamanager.train_dataset.cameras[2:3]
