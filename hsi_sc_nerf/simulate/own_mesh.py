@@ -55,7 +55,7 @@ def load(settings: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
             that fits on the turntable; the materials' fractions, UVs or colours are missing or do not fit.
     """
     surface = _read_mesh_file(settings)
-    vertices = _upright_and_scaled(surface.vertices, thing)
+    vertices = _upright_and_scaled(surface.vertices, settings)
     triangles = surface.triangles
     if len(settings.materials) == 1:
         weights = np.ones((len(vertices), 1))
