@@ -81,8 +81,8 @@ class Simulation:
         self.offset_m = sum((e.offset_m() for e in of_stage(effects, stages.PlacementEffect)), np.zeros(3))
         self._light = of_stage(effects, stages.LightEffect)
         covers = of_stage(effects, stages.ChamberEffect)
-        thing = assemble.object_part(scene)
-        self.object_part = replace(thing, mesh=thing.mesh.moved(self.offset_m))
+        scanned = assemble.object_part(scene)
+        self.object_part = replace(scanned, mesh=scanned.mesh.moved(self.offset_m))
         self._chamber_materials = [name for cover in covers for name in cover.materials]
         self.renderer = self._renderer_of(self.object_part)
         self._lighting = self._lit(self.renderer)
@@ -94,7 +94,7 @@ class Simulation:
         self.lens = lenses[0] if lenses else None
         self._optics = of_stage(effects, stages.OpticsEffect)
         self._material = of_stage(effects, stages.MaterialEffect)
-        self._object_materials = [known_materials(scene.materials)[name] for name in thing.materials]
+        self._object_materials = [known_materials(scene.materials)[name] for name in scanned.materials]
         self._illumination = of_stage(effects, stages.IlluminationEffect)
         self._readout = of_stage(effects, stages.ReadoutEffect)
         self._orientation = of_stage(effects, stages.OrientationEffect)
@@ -172,10 +172,10 @@ class Simulation:
         """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""
         return np.moveaxis(endmembers(names, self._detector_nm, self.scene.materials), 0, -2)
 
-    def _renderer_of(self, thing: Part) -> Renderer:
+    def _renderer_of(self, scanned: Part) -> Renderer:
         """The renderer of the object, which may be deformed, on its support."""
         spacing_m = LIGHT_SPACING_M if of_stage(self._light, stages.SurfaceLightEffect) else None
-        return assemble.build_renderer(self.scene, thing, self.offset_m, self._chamber_materials, spacing_m)
+        return assemble.build_renderer(self.scene, scanned, self.offset_m, self._chamber_materials, spacing_m)
 
     def _lit(self, renderer: Renderer) -> Lighting | None:
         """The light on the parts of a renderer; None if it is even."""

@@ -248,7 +248,7 @@ def test_bad_meshes_get_one_sentence(tmp_path):
     save_ply(tmp_path / "ball.ply", vertices * [1, 1, 0], triangles, {})
     refused(tmp_path, "is flat", materials=("a",))
     save_ply(tmp_path / "ball.ply", np.where(vertices > 3.0, np.nan, vertices), triangles, {})
-    refused(tmp_path, "not at finite places", materials=("a",))
+    refused(tmp_path, "not finite", materials=("a",))
 
 
 def test_bad_weights_get_one_sentence(tmp_path):
