@@ -1,8 +1,8 @@
-"""How right calibrated reflectance is, on simulated sessions of which everything is known, as a table.
+"""Accuracy of calibrated reflectance on simulated sessions, as a table.
 
     uv run python benchmarks/calibration_accuracy.py --page docs/calibration.md --pictures docs/images
 
-Each row is a pear with some effects of light and sensor, calibrated with and without what is meant against them.
+Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calib
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.scores.calibration import CalibrationScore, score_calibration
+from hsi_sc_nerf.simulate.scores.processing import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
 FALLOFF = "{illumination_falloff: {edge_loss: 0.2}}"
 DRIFT = "{lamp_drift: {percent: -6, temperature_change_k: -80}}"
 SENSOR = (
-    "{bad_pixels: {dead_share: 0.001, hot_share: 0.001, dead_bands: 2}}",
+    "{bad_pixels: {dead_fraction: 0.001, hot_fraction: 0.001, dead_bands: 2}}",
     "gloss",
     "{saturation: {exposure_factor: 1.6}}",
     "{tarp_exposure: {exposure_factor: 0.6}}",
@@ -62,7 +62,7 @@ COLUMNS = [
 
 @dataclass(frozen=True)
 class CalibrationAccuracy:
-    """Measure how right calibrated reflectance is on simulated sessions."""
+    """Measure the accuracy of calibrated reflectance on simulated sessions."""
 
     page: Path | None = None
     """Markdown page whose table is replaced."""
@@ -109,7 +109,7 @@ def _cells(score: CalibrationScore) -> list[str]:
         f"{score.noise_rms:.4f}",
         f"{score.error_over_uncertainty:.2f}",
         f"{100.0 * score.drift_rms:.3f}",
-        f"{100.0 * score.flagged_share:.2f}",
+        f"{100.0 * score.flagged_fraction:.2f}",
     ]
 
 

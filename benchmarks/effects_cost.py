@@ -1,10 +1,10 @@
-"""What each effect of the simulator costs, and the error that leaving it out would make, as a table.
+"""Cost of each effect of the simulator, and the error of neglecting it, as a table.
 
     uv run python benchmarks/effects_cost.py --page docs/effects.md
 
-Each effect is named alone, at its default strength, on each scene. Its cost is the time of preparing the scene and of
-making a frame, beside a frame without any effect in the same run; its error is the difference between the calibrated
-reflectances with and without it over the object's pixels: root mean square, and mean spectral angle.
+Each effect is simulated alone, with its default settings, on each scene. Its cost is the time to prepare the scene
+and to simulate a frame, beside a frame without effects in the same run. Its error is the difference of the calibrated
+reflectance with and without it over the object's pixels: root mean square and mean spectral angle.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rich.table import Table
 
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.effects import EFFECTS
-from hsi_sc_nerf.simulate.frames import Capture, Simulation
+from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 
 COLUMNS = [
@@ -41,10 +41,10 @@ COLUMNS = [
 
 @dataclass(frozen=True)
 class EffectsCost:
-    """Measure the cost and the worth of every effect."""
+    """Measure the cost and the error of every effect."""
 
     page: Path
-    """Markdown page whose table is replaced; the same figures go into a JSON file beside it."""
+    """Markdown page whose table is replaced; a JSON file beside it gets the same figures."""
     scenes: tuple[str, ...] = ("pear", "apple", "maize")
     """Scenes to measure on."""
     effects: tuple[str, ...] = tuple(EFFECTS)
@@ -59,7 +59,7 @@ class EffectsCost:
         rows = []
         for name in self.scenes:
             scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=())
-            _make(scene)  # the first run pays for what is loaded once
+            _make(scene)  # the first run includes imports and caches
             plain = _make(scene)
             for effect in track(self.effects, f"effects on {name}"):
                 made = _make(override(scene, effects=(effect,)))
@@ -90,7 +90,7 @@ def _make(scene: Scene) -> _Made:
     centre = scene.camera.size_px // 2
     middle = slice(centre - 4, centre + 4)
     signal = _above_dark(white)[middle, middle].mean(axis=(0, 1))
-    # A pixel without light has no reflectance to be wrong about.
+    # Detector pixels without light get reflectance 0.
     signal = np.where(signal > 0, signal, np.inf)
     return _Made(
         prepare_s=prepared - started,
@@ -100,7 +100,7 @@ def _make(scene: Scene) -> _Made:
     )
 
 
-def _above_dark(capture: Capture) -> Float[np.ndarray, "lines samples bands"]:
+def _above_dark(capture: SimulatedCapture) -> Float[np.ndarray, "lines samples bands"]:
     return capture.counts.astype(float) - capture.dark.mean(axis=0)
 
 

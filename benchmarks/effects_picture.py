@@ -1,4 +1,4 @@
-"""One frame of a scene without effects and with each of some: a contact sheet of pseudo-RGB.
+"""Contact sheet of pseudo-RGB images: one frame of a scene without effects and with each of several effects.
 
 uv run python benchmarks/effects_picture.py --output docs/images/effects.png
 """
@@ -35,7 +35,7 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class EffectsPicture:
-    """Draw what effects look like."""
+    """Draw one frame under each effect."""
 
     output: Path
     """PNG to write."""

@@ -1,9 +1,9 @@
-"""Our renderer against Mitsuba 3: one frame of a scene, rendered by both under each transport of light.
+"""Comparison of the simulator's renderer with Mitsuba 3 on one frame, under each light transport.
 
     uv run --extra mitsuba python benchmarks/mitsuba_agreement.py --output-dir /tmp/agreement --scene pear
 
-Mitsuba renders each picture several times with other random numbers; their scatter is the Monte-Carlo error that the
-difference has to be judged by.
+Mitsuba renders each image several times with different seeds. The scatter gives the Monte-Carlo error of the
+difference.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ COMPARISONS: dict[mitsuba_render.Transport, tuple[str, ...]] = {
     "one_bounce": BOTH,
     "many_bounces": BOTH,
 }
-"""Our effects beside each transport of Mitsuba's. Ours has one bounce at most, so that the last one must differ."""
+"""Effects for each transport of Mitsuba; the simulator has at most one bounce, so the last one differs."""
 LARGEST_DIFFERENCE = 0.05
 """End of the colour scale of the picture's differences."""
 
@@ -49,7 +49,7 @@ class Ours:
 
     Attributes:
         radiance: relative to the white tarp's, the chamber as bright as in Mitsuba.
-        weights: share of each material in each pixel; the last one is the chamber.
+        weights: fraction of each material in each pixel; the last one is the chamber.
         materials: their names.
         ray_grid: error of our evenly spaced rays (RMS), from two numbers of rays a pixel in even light.
         seconds: for light and frame together.
@@ -73,7 +73,7 @@ class Agreement:
         monte_carlo: the part of it that Mitsuba's random numbers explain.
         ray_grid: the part that our evenly spaced rays explain.
         bias: mean of Mitsuba minus ours, and its standard error.
-        bias_of_material: the same for each material, pixels weighted by its share.
+        bias_of_material: the same for each material, pixels weighted by its fraction.
         seconds: one rendering of ours, one of Mitsuba's.
     """
 

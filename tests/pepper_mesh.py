@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import revolve
-from hsi_sc_nerf.simulate.shapes import smoothstep
+from hsi_sc_nerf.simulate.plants import smoothstep
 from hsi_sc_nerf.simulate.texture import over, smooth_noise
 
 MATERIALS = ("pepper_red", "pepper_green", "pepper_stem")

@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf demo``: the whole job on a simulated capture, and how good the result is."""
+"""``hsi-sc-nerf demo``: the whole workflow on a simulated session, compared with its truth."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder
 
 MARK = ".hsi-sc-nerf-demo"
-"""A file of this name tells that a folder is a demo's, whose parts may be deleted."""
+"""File that marks the folder of a demo, whose contents may be replaced."""
 
-# Fewer rays a step than the method's default, for two cores, and schedules for a run of some hundred steps.
+# Fewer rays a step than the default, for two cores, and schedules for a run of some hundred steps.
 DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
     "pipeline.model.proposal-warmup": "200",
     "pipeline.model.proposal-weights-anneal-max-num-iters": "100",
-    # Pressing the surface together as hard as in a run of thousands of steps costs one of some hundred a decibel.
+    # The default weight is for thousands of steps; in some hundred steps it would cost about one decibel.
     "pipeline.model.distortion-loss-mult": "0.007",
     "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
@@ -32,19 +32,19 @@ DEMO_TRAINING = {
 
 @dataclass(frozen=True)
 class DemoCommand:
-    """Make a capture of a virtual fruit, reconstruct it, and compare the result with the known truth.
+    """Simulate a session of a fruit, reconstruct it, and compare the result with the truth.
 
     Takes two to five minutes on two cores.
     """
 
     output_dir: Path = Path("hsi-sc-nerf-demo")
-    """Folder for everything the demo makes; an earlier demo there is replaced."""
+    """Folder for all results; an earlier demo there is replaced."""
     scene: str = "pear"
-    """What stands on the turntable: pear, apple, maize, pepper, sphere, cylinder, or a scene file of your own."""
+    """pear, apple, maize, pepper, sphere, cylinder, or the path of a scene file."""
     iterations: int = 500
-    """Training steps, both stages together."""
+    """Training steps of both stages together."""
     points: int = 60_000
-    """Points of the cloud."""
+    """Number of points of the cloud."""
 
     def main(self) -> None:
         """Run the demo.
@@ -52,7 +52,7 @@ class DemoCommand:
         Raises:
             InputError: a step failed, or the folder cannot be used.
         """
-        # Open3D takes seconds to import; the other commands and --help do without it.
+        # Deferred because Open3D takes seconds to import.
         from hsi_sc_nerf.cli.demo_report import draw_pictures, score, score_dataset, show_table, write_summary
 
         console = Console()
@@ -60,10 +60,12 @@ class DemoCommand:
         logs = out / "logs"
         make_folder(out)
         if any(out.iterdir()) and not (out / MARK).is_file():
-            raise InputError(f"{out}: holds something else than a demo; choose another --output-dir.")
+            raise InputError(f"{out}: holds something other than a demo; choose another --output-dir.")
         make_folder(logs)
         with atomic_write(out / MARK) as (mark,):
-            mark.write_text("What lies here belongs to `hsi-sc-nerf demo`, which replaces it.\n", encoding="utf-8")
+            mark.write_text(
+                "This folder belongs to `hsi-sc-nerf demo`, which replaces its contents.\n", encoding="utf-8"
+            )
         session, data, runs = out / "session", out / "data", out / "runs"
         for earlier in (runs, out / "renders"):
             shutil.rmtree(earlier, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What the demo shows at its end: scores against the known truth, pictures, a table, a summary for machines."""
+"""Results of the demo: scores against the truth, images, tables and ``summary.json``."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")
 REFERENCE_POINTS = 100_000
 MARKED_POINTS = 4
 FRONT_LAYER_M = 0.005
-# The paper's hardest object, the apple: what the demo has to reach.
+# The paper's results of the apple, its hardest object, for comparison.
 PAPER_APPLE = {"sam": 0.0642, "rmse": 0.0438, "ssim": 0.742, "psnr": 24.49, "f_score": None}
 
 
 def score(out: Path) -> dict[str, float]:
-    """The held-out metrics of ``ns-eval`` and the F-score of the cloud against the true mesh, without alignment."""
+    """Held-out metrics of ``ns-eval``, and F-score of the cloud against the true mesh without alignment."""
     results = json.loads((out / "eval.json").read_text(encoding="utf-8"))["results"]
     metrics = {f"{key}{end}": results[f"{key}{end}"] for key in SPECTRAL_METRICS for end in ("", "_std")}
     mesh = load_truth(out / "session").mesh()
@@ -50,14 +50,14 @@ def score(out: Path) -> dict[str, float]:
 
 
 def score_dataset(out: Path) -> ProcessingScore:
-    """How well processing recovered poses, camera, reflectance and masks."""
+    """Errors of poses, camera, reflectance and masks."""
     return score_processing(open_packed(out / "data"), load_truth(out / "session"))
 
 
 def write_summary(
     out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
 ) -> None:
-    """``summary.json``: metrics, errors of the processing, steps, versions and machine."""
+    """Write ``summary.json``: metrics, errors of the processing, steps, version and machine."""
     write_json(
         out / "summary.json",
         {
@@ -75,40 +75,40 @@ def write_summary(
 def show_table(
     console: Console, out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
 ) -> None:
-    """Print what was reached and what it cost."""
+    """Print metrics, errors and costs."""
     quality = Table(title="Held-out views, masked to the object; cloud against the true mesh")
     for title in ("metric", "mean ± SD", "paper's apple"):
         quality.add_column(title)
     units = {"sam": "SAM, rad", "rmse": "RMSE", "ssim": "SSIM", "psnr": "PSNR, dB", "f_score": "F-score at 2 mm, %"}
     for key, title in units.items():
         digits = 1 if key in ("psnr", "f_score") else 4
-        printed = PAPER_APPLE[key]
-        reached = f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}"
-        quality.add_row(title, reached, "-" if printed is None else f"{printed:.{digits}f}")
-    steps_table = Table(title="Processing against the known truth")
-    for title in ("error", "reached", "target"):
-        steps_table.add_column(title)
-    for title, reached, target in (
+        published = PAPER_APPLE[key]
+        value = f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}"
+        quality.add_row(title, value, "-" if published is None else f"{published:.{digits}f}")
+    errors_table = Table(title="Processing against the truth")
+    for title in ("error", "value", "target"):
+        errors_table.add_column(title)
+    for title, value, target in (
         ("rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"),
         ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
         ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
         ("reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"),
-        ("values flagged, %", f"{100 * processing.flagged_share:.2f}", "-"),
+        ("values flagged, %", f"{100 * processing.flagged_fraction:.2f}", "-"),
         ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
     ):
-        steps_table.add_row(title, reached, target)
+        errors_table.add_row(title, value, target)
     cost_table = Table(title="Cost")
     for title in ("step", "seconds", "peak memory, MiB"):
         cost_table.add_column(title, justify="left" if title == "step" else "right")
     for cost in costs:
         cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
     cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")
-    console.print(quality, steps_table, cost_table)
+    console.print(quality, errors_table, cost_table)
     console.print(f"Pictures, cloud and summary.json are in {escape(str(out))}.")
 
 
 def draw_pictures(out: Path) -> None:
-    """Draw ``views.png``, ``spectra.png`` and ``cloud.png``, and put ``poses.png`` beside them."""
+    """Draw ``views.png``, ``spectra.png`` and ``cloud.png``, and copy ``poses.png``."""
     dataset = open_packed(out / "data")
     cloud = read_spectral_ply(out / "point_cloud.ply")
     renders = sorted((out / "renders").glob("*_img_*.png"))
@@ -121,7 +121,7 @@ def draw_pictures(out: Path) -> None:
 
 
 def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray, spectra: np.ndarray) -> None:
-    """Spectra of the cloud at a few places of the first frame, beside what that frame measured there."""
+    """Draw spectra of the cloud at some pixels of the first frame beside the measured ones."""
     frame = dataset.frames[0]
     pixels = _spread_pixels(frame.mask(), MARKED_POINTS)
     image_points, depth = project(points, frame.camera_to_world, dataset.intrinsics)
@@ -129,24 +129,24 @@ def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray,
     seen = []
     for pixel in pixels:
         behind = np.array(tree.query_ball_point(pixel, 0.5) or [tree.query(pixel)[1]])
-        # The pixel shows the layer of points that is nearest to the camera, not the object's far side.
+        # Only the layer of points nearest to the camera is visible in the pixel.
         front = behind[depth[behind] < depth[behind].min() + FRONT_LAYER_M]
         seen.append(spectra[front].mean(axis=0))
     columns, lines = np.floor(pixels).astype(int).T
     measured, valid = unpack(frame.cube()[lines, columns])
-    measured[~valid] = np.nan  # a gap in the curve
+    measured[~valid] = np.nan  # NaN leaves a gap in the curve
     labels = [chr(ord("A") + i) for i in range(len(pixels))]
     draw_spectra(path, dataset.wavelengths_nm, measured, np.array(seen), labels, frame.pseudo_rgb(), pixels)
 
 
 def _spread_pixels(mask: np.ndarray, count: int) -> np.ndarray:
-    """Centres (x, y) of ``count`` pixels well inside the mask, spread from its top to its bottom."""
+    """Centres (x, y) of ``count`` pixels inside the mask, spread from its top to its bottom."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     lines, columns = np.nonzero(inside if inside.any() else mask)
-    wanted = np.quantile(lines, (np.arange(count) + 0.5) / count).round().astype(int)
-    chosen = []
-    for i, line in enumerate(wanted):
+    heights = np.quantile(lines, (np.arange(count) + 0.5) / count).round().astype(int)
+    pixels = []
+    for i, line in enumerate(heights):
         row = np.sort(columns[lines == lines[np.abs(lines - line).argmin()]])
-        # Alternate between the sides of the object, where its spectra differ.
-        chosen.append((row[int((0.25 if i % 2 else 0.75) * (len(row) - 1))] + 0.5, line + 0.5))
-    return np.array(chosen)
+        # The pixels alternate between the sides of the object, whose spectra differ.
+        pixels.append((row[int((0.25 if i % 2 else 0.75) * (len(row) - 1))] + 0.5, line + 0.5))
+    return np.array(pixels)

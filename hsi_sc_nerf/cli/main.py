@@ -36,9 +36,9 @@ Commands = (
 
 
 def main() -> None:
-    """Run the command that the user asked for; bad input ends in one sentence and status 2."""
+    """Run the command of the command line; invalid input exits with one sentence and status 2."""
     try:
-        # Some options are refused while they are read.
+        # Reading the options can already raise InputError.
         command = tyro.cli(Commands, description=__doc__)  # type: ignore[var-annotated]
         command.main()
     except InputError as error:

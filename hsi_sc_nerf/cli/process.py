@@ -13,9 +13,9 @@ from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 @dataclass(frozen=True)
 class ProcessCommand:
-    """Calibrate the captures of a turntable session, find their poses and masks, and pack them for training.
+    """Calibrate the captures of a turntable session, estimate poses and masks, and pack the frames for training.
 
-    A run that stopped goes on where it was; the same session with the same settings is processed once.
+    An interrupted run continues where it stopped. Results of the same session and settings are reused.
     """
 
     session: tyro.conf.Positional[Path]

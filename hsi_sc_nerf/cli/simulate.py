@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf simulate``: a turntable capture of a virtual fruit, with its truth."""
+"""``hsi-sc-nerf simulate``: a simulated turntable session with its truth."""
 
 from __future__ import annotations
 
@@ -14,23 +14,22 @@ from hsi_sc_nerf.simulate.scene import load_scene, override
 
 @dataclass(frozen=True)
 class SimulateCommand:
-    """Make a turntable capture of a virtual fruit, as the camera would leave it on disk, with its truth beside it."""
+    """Simulate a turntable session in the camera's file layout, with its truth beside the captures."""
 
     scene: tyro.conf.Positional[str]
-    """pear, apple, maize, pepper, sphere, cylinder, or a scene file of your own (YAML; start from a copy of a shipped
-    one)."""
+    """pear, apple, maize, pepper, sphere, cylinder, or the path of a scene file (YAML)."""
     session: tyro.conf.Positional[Path]
-    """Folder to write; new, empty, or an earlier simulated session, which is replaced."""
+    """Folder to write: new, empty, or an earlier simulated session, which is replaced."""
     frames: int | None = None
-    """Images in one full turn, instead of the scene's."""
+    """Frames in one full turn; the scene's by default."""
     size: int | None = None
-    """Width and height of the images in pixels, instead of the scene's."""
+    """Width and height of the images in pixels; the scene's by default."""
     bands: int | None = None
-    """Number of spectral bands between 397 and 1003 nm, instead of the scene's."""
+    """Number of spectral bands between 397 and 1003 nm; the scene's by default."""
     seed: int | None = None
-    """Grows another fruit of the same kind, instead of the scene's."""
+    """Seed of all random numbers; another seed gives another fruit of the same kind."""
     effects: tuple[str, ...] | None = None
-    """Physical effects instead of the scene's: names, or with strengths '{read_noise: {electrons: 40}}'."""
+    """Effects in place of the scene's: names, or names with settings like '{read_noise: {electrons: 40}}'."""
 
     def main(self) -> None:
         """Run the command.
@@ -38,7 +37,7 @@ class SimulateCommand:
         Raises:
             InputError: the scene cannot be used or the session cannot be written.
         """
-        # Open3D takes seconds to import; the other commands and --help do without it.
+        # Deferred because Open3D takes seconds to import.
         from hsi_sc_nerf.simulate.session import simulate_session
         from hsi_sc_nerf.simulate.truth import load_truth
 

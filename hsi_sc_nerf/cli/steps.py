@@ -1,4 +1,4 @@
-"""Run a command as a step of its own, and tell what it cost."""
+"""Runs commands as steps in processes of their own, and measures their time and memory."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hsi_sc_nerf.errors import InputError
 
 @dataclass(frozen=True)
 class StepCost:
-    """What a step cost.
+    """Time and memory of a step.
 
     Attributes:
-        name: the step.
-        seconds: wall time, starting Python included.
-        peak_memory_mib: most memory that it held at once.
+        name: name of the step.
+        seconds: wall time, start of Python included.
+        peak_memory_mib: peak resident memory.
     """
 
     name: str
@@ -30,16 +30,21 @@ class StepCost:
 
 
 def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
-    """Run ``argv`` in a process of its own; its progress bars stay on the terminal, its report goes to ``log``.
+    """Run a command in a process of its own.
+
+    Args:
+        name: name of the step.
+        argv: command; its progress bars appear on the terminal.
+        log: file for its standard output.
 
     Raises:
-        InputError: the command failed; the sentence names its log.
+        InputError: the command failed; the message names its log.
     """
     started = time.perf_counter()
-    # Libraries' warnings about each other's versions would bury the progress bars.
+    # Warnings of libraries would hide the progress bars.
     environment = os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
-        # Without compiled modules each start of nerfstudio takes twice as long; keep them beside the log.
+        # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
     with log.open("wb") as output:
         process = subprocess.Popen(list(argv), stdout=output, env=environment)
@@ -52,21 +57,21 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise InputError(
-            f"the step '{name}' failed with status {process.returncode}; what it said is above and in {log}."
+            f"the step '{name}' failed with status {process.returncode}; its output is above and in {log}."
         )
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
 
 
 def own_cost(name: str, started: float) -> StepCost:
-    """Cost of a step that ran in this process since ``started`` (`time.perf_counter`)."""
+    """Cost of a step in this process since ``started`` (`time.perf_counter`)."""
     return StepCost(name, time.perf_counter() - started, peak_memory_mib())
 
 
 def nerfstudio_command(script: str) -> list[str]:
-    """How to start one of nerfstudio's commands (``train``, ``eval``, ``exporter``) with this Python."""
+    """Command that runs a script of nerfstudio (``train``, ``eval``, ``exporter``) with this Python."""
     return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()"]
 
 
 def own_command() -> list[str]:
-    """How to start `hsi-sc-nerf` with this Python."""
+    """Command that runs `hsi-sc-nerf` with this Python."""
     return [sys.executable, "-m", "hsi_sc_nerf.cli.main"]

@@ -1,1 +1,1 @@
-"""Turntable sessions with known truth, rendered from a scene file."""
+"""Simulator of turntable sessions with known truth."""

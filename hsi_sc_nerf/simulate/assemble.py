@@ -1,4 +1,4 @@
-"""From a scene's description to the things that are rendered: the object, its support, the camera."""
+"""From the description of a scene to what is rendered: the object, its support, and the camera of each frame."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate import own_mesh, shapes, target, texture
+from hsi_sc_nerf.simulate import own_mesh, plants, target
 from hsi_sc_nerf.simulate.effects import of_stage
 from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
-from hsi_sc_nerf.simulate.objects import Cylinder, MaizeEar, Object, OwnMesh, Sphere
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
-from hsi_sc_nerf.simulate.scene import Camera, Scene
+from hsi_sc_nerf.simulate.scene import CameraSettings, Cylinder, MaizeEar, Object, OwnMesh, Scene, Sphere
 
 
-def intrinsics(camera: Camera) -> PinholeIntrinsics:
-    """The pinhole camera of the scene: square image, principal point in its middle."""
+def intrinsics(camera: CameraSettings) -> PinholeIntrinsics:
+    """Pinhole intrinsics of the scene's camera: square image, principal point in its centre."""
     focal_px = camera.size_px / 2.0 / np.tan(np.deg2rad(camera.field_of_view_deg) / 2.0)
     centre = camera.size_px / 2.0
     return PinholeIntrinsics(camera.size_px, camera.size_px, focal_px, focal_px, centre, centre)
 
 
-def first_camera(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """Camera-to-world of the first frame: above the x axis, looking at the turntable's axis."""
+def first_camera(camera: CameraSettings) -> Float[np.ndarray, "4 4"]:
+    """CameraSettings-to-world of the first frame: above the x axis, looking at the turntable's axis."""
     elevation = np.deg2rad(camera.elevation_deg)
     aim = np.array([0.0, 0.0, camera.aim_height_m])
     return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
 
 
 def frame_plan(scene: Scene) -> FramePlan:
-    """Which frames are taken, at which angles, from where: an even turn, changed by the scene's effects."""
+    """The frames of the scene: even steps of the turntable, changed by the motion effects."""
     frames = scene.turntable.frames
     sign = 1.0 if scene.turntable.direction == "ccw" else -1.0
     plan = FramePlan(
@@ -49,7 +49,7 @@ def frame_plan(scene: Scene) -> FramePlan:
 
 
 def object_part(scene: Scene) -> Part:
-    """The object, standing on the container's lid.
+    """The object on the lid of the container.
 
     Raises:
         InputError: the object is a mesh whose files cannot be used.
@@ -58,31 +58,31 @@ def object_part(scene: Scene) -> Part:
     return replace(part, mesh=part.mesh.moved(np.array([0.0, 0.0, scene.container.height_m])), is_object=True)
 
 
-def _object_on_zero(thing: Object, rng: np.random.Generator) -> Part:
-    """The object, standing on z = 0."""
-    if isinstance(thing, Sphere):
-        return _plain(shapes.sphere(thing.height_m), thing.material)
-    if isinstance(thing, Cylinder):
-        return _plain(shapes.cylinder(thing.diameter_m, thing.height_m), thing.material)
-    if isinstance(thing, OwnMesh):
-        mesh, weights = own_mesh.load(thing)
-        return Part(mesh, thing.materials, weights)
-    if isinstance(thing, MaizeEar):
-        shape = shapes.maize(thing.height_m, rng)
-        return Part(shape.mesh, texture.MAIZE_MATERIALS, texture.maize_weights(shape, thing, rng))
-    shape = {"pear": shapes.pear, "apple": shapes.apple}[thing.shape](thing.height_m, rng)
-    return Part(shape.mesh, texture.FRUIT_MATERIALS[thing.shape], texture.fruit_weights(shape, thing, rng))
+def _object_on_zero(settings: Object, rng: np.random.Generator) -> Part:
+    """The object on z = 0."""
+    if isinstance(settings, Sphere):
+        return _plain(sphere(settings.height_m), settings.material)
+    if isinstance(settings, Cylinder):
+        return _plain(cylinder(settings.diameter_m, settings.height_m, SEGMENTS, VERTEX_SPACING_M), settings.material)
+    if isinstance(settings, OwnMesh):
+        mesh, weights = own_mesh.load(settings)
+        return Part(mesh, settings.materials, weights)
+    if isinstance(settings, MaizeEar):
+        shape = plants.maize(settings.height_m, rng)
+        return Part(shape.mesh, plants.MAIZE_MATERIALS, plants.maize_weights(shape, settings, rng))
+    shape = {"pear": plants.pear, "apple": plants.apple}[settings.shape](settings.height_m, rng)
+    return Part(shape.mesh, plants.FRUIT_MATERIALS[settings.shape], plants.fruit_weights(shape, settings, rng))
 
 
-def support_parts(scene: Scene, step_m: float | None = None) -> list[Part]:
-    """Disc, container, and the markers on both; ``step_m`` as in `build_renderer`.
+def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
+    """Disc and container with their markers; ``spacing_m`` as in `build_renderer`.
 
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
     parts = [
-        _plain(target.disc_mesh(scene.turntable, step_m), "disc"),
-        _plain(target.container_mesh(scene.container, step_m), "container_plastic"),
+        _plain(target.disc_mesh(scene.turntable, spacing_m), "disc"),
+        _plain(target.container_mesh(scene.container, spacing_m), "container_plastic"),
     ]
     on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
@@ -94,21 +94,25 @@ def support_parts(scene: Scene, step_m: float | None = None) -> list[Part]:
 
 def build_renderer(
     scene: Scene,
-    thing: Part,
+    scanned: Part,
     offset_m: Float[np.ndarray, "3"] | float = 0.0,
     extra_materials: Sequence[str] = (),
-    step_m: float | None = None,
+    spacing_m: float | None = None,
 ) -> Renderer:
-    """The renderer of the whole scene around its object (from `object_part`), its support shifted by ``offset_m``.
+    """The renderer of the whole scene.
 
-    ``extra_materials`` get columns of their own, for what is seen where rays miss everything. With ``step_m`` the
-    same surfaces have vertices at most about so far apart (metres), for light that is computed there.
+    Args:
+        scene: the scene.
+        scanned: its object, from `object_part`.
+        offset_m: shift of disc, container and markers, metres.
+        extra_materials: materials of patterns on the chamber, which get columns of their own.
+        spacing_m: approximate largest distance between vertices, metres, for light that is computed at vertices.
     """
-    support = support_parts(scene, step_m)
-    parts = [thing, *(replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support)]
-    if step_m is not None:
-        # The diagonal of a square of that side is left whole.
-        parts = [part.refined(1.5 * step_m) for part in parts]
+    support = support_parts(scene, spacing_m)
+    parts = [scanned, *(replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support)]
+    if spacing_m is not None:
+        # The factor keeps the diagonals of squares of that side.
+        parts = [part.refined(1.5 * spacing_m) for part in parts]
     return Renderer(parts, extra_materials=extra_materials)
 
 

@@ -1,4 +1,4 @@
-"""From a scene to the counts and the truth of each of its captures, one at a time and in any order."""
+"""From a scene to the counts and the truth of its captures, one at a time and in any order."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble, sensor
-from hsi_sc_nerf.simulate.colours import colour_spectra
 from hsi_sc_nerf.simulate.effects import of_stage, stages
 from hsi_sc_nerf.simulate.effects.stages import effect_rng
-from hsi_sc_nerf.simulate.light import Light
+from hsi_sc_nerf.simulate.light import Light, colour_spectra
 from hsi_sc_nerf.simulate.lighting import Lighting
 from hsi_sc_nerf.simulate.materials import endmembers, known_materials
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
@@ -22,26 +21,26 @@ from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_MATERIALS = ("white_tarp", "tarp_surround")
 TARP_MARGIN = 0.08
-"""Share of the image's side that the tarp leaves free along each edge."""
+"""Width of the margin around the tarp as a fraction of the image side."""
 PERFECT_DARK_LINES, DARK_LINES = 1, 64
-"""Lines of a dark cube: of a perfect sensor, whose lines are all the same, and of any other."""
+"""Lines of a dark cube: of a perfect sensor, whose lines are equal, and of a sensor with read-out effects."""
 WHITE_EXPOSURE = 0
-"""Number of the white tarp's exposure; the frames follow."""
-LIGHT_STEP_M = 0.0025
-"""Light that is computed at points of the surface runs straight between points that are no further apart."""
+"""Exposure number of the white tarp; the frames have the following numbers."""
+LIGHT_SPACING_M = 0.0025
+"""Largest distance of the surface points at which light is computed; it is interpolated between them."""
 LINES_AT_ONCE = 64
-"""Lines of an image that are exposed together, which keeps large frames within little memory."""
+"""Lines of an image that are exposed at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
-class Capture:
-    """One capture: what the instrument writes, and what it is made of.
+class SimulatedCapture:
+    """The cubes of one capture and the light that they record.
 
     Attributes:
-        counts: the cube.
-        dark: its dark cube.
-        light: the noise-free light on the sensor, as the counts lie in the file.
-        integration_time_ms: how long the sensor collected light.
+        counts: raw counts.
+        dark: counts of the dark cube.
+        light: noise-free light on the sensor, rotated as the counts are.
+        integration_time_ms: integration time.
     """
 
     counts: UInt16[np.ndarray, "lines samples bands"]
@@ -51,13 +50,13 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Frame(Capture):
-    """A capture of the object, and its truth, which is upright.
+class SimulatedFrame(SimulatedCapture):
+    """A capture of the object, and its truth as upright images.
 
     Attributes:
-        material_weights: share of each material in each pixel, summing to 1.
-        coverage: share of each pixel that the object covers.
-        endmembers: of those materials at the start of the session and the header's wavelengths.
+        material_weights: fraction of each material in each pixel, summing to 1.
+        coverage: fraction of each pixel that the object covers.
+        endmembers: reflectance of the materials at the start of the session at the header's wavelengths.
     """
 
     material_weights: Float[np.ndarray, "lines samples materials"]
@@ -66,7 +65,13 @@ class Frame(Capture):
 
 
 class Simulation:
-    """A scene made ready: what its captures share is computed once, here; `frame` and `white` change nothing."""
+    """A scene ready for its captures, which `frame` and `white` simulate in any order and from several threads.
+
+    Example:
+        >>> simulation = Simulation(load_scene("pear"))
+        >>> simulation.frame(0).counts.shape
+        (128, 128, 204)
+    """
 
     def __init__(self, scene: Scene) -> None:
         effects = scene.effects
@@ -76,8 +81,8 @@ class Simulation:
         self.offset_m = sum((e.offset_m() for e in of_stage(effects, stages.PlacementEffect)), np.zeros(3))
         self._light = of_stage(effects, stages.LightEffect)
         covers = of_stage(effects, stages.ChamberEffect)
-        thing = assemble.object_part(scene)
-        self.object_part = replace(thing, mesh=thing.mesh.moved(self.offset_m))
+        scanned = assemble.object_part(scene)
+        self.object_part = replace(scanned, mesh=scanned.mesh.moved(self.offset_m))
         self._chamber_materials = [name for cover in covers for name in cover.materials]
         self.renderer = self._renderer_of(self.object_part)
         self._lighting = self._lit(self.renderer)
@@ -89,7 +94,7 @@ class Simulation:
         self.lens = lenses[0] if lenses else None
         self._optics = of_stage(effects, stages.OpticsEffect)
         self._material = of_stage(effects, stages.MaterialEffect)
-        self._object_materials = [known_materials(scene.materials)[name] for name in thing.materials]
+        self._object_materials = [known_materials(scene.materials)[name] for name in scanned.materials]
         self._illumination = of_stage(effects, stages.IlluminationEffect)
         self._readout = of_stage(effects, stages.ReadoutEffect)
         self._orientation = of_stage(effects, stages.OrientationEffect)
@@ -97,10 +102,10 @@ class Simulation:
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
         self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
-        self._seen_nm = self.wavelengths_nm
+        self._detector_nm = self.wavelengths_nm
         for detector in of_stage(effects, stages.DetectorEffect):
-            self._seen_nm = detector.wavelengths_nm(self._seen_nm, scene.camera.size_px)
-        self._signal_of_white = sensor.white_signal(scene.sensor, self._seen_nm)
+            self._detector_nm = detector.wavelengths_nm(self._detector_nm, scene.camera.size_px)
+        self._signal_of_white = sensor.white_signal(scene.sensor, self._detector_nm)
         self._exposures = of_stage(effects, stages.ExposureEffect)
         self.detector_maps = {
             effect.name: effect.detector_maps(
@@ -109,7 +114,7 @@ class Simulation:
             for effect in self._readout
         }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
-        self._seen_endmembers = self._seen_spectra(self.materials)
+        self._detector_endmembers = self._detector_reflectance(self.materials)
 
     @property
     def integration_time_ms(self) -> float:
@@ -121,8 +126,8 @@ class Simulation:
         """Integration time of the white tarp's capture."""
         return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=True)
 
-    def frame(self, number: int) -> Frame:
-        """The capture of one frame of the plan."""
+    def frame(self, number: int) -> SimulatedFrame:
+        """Simulate one frame of the plan."""
         elapsed = float(self.plan.elapsed[number])
         view = (self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens)
         renderer, lighting = (self.renderer, self._lighting) if not self._deformation else self._deformed(elapsed)
@@ -132,52 +137,52 @@ class Simulation:
             rendering = lighting.render(*view)
             weights, coverage, light_weights = rendering.material_weights, rendering.coverage, rendering.light_weights
         for cover in self._chamber:
-            # The wall's share goes to what stands before it.
+            # The pattern replaces the fraction of the wall.
             covered = weights + weights[..., -1:] * (cover - np.eye(len(self.materials))[-1])
             weights = exact_weights(covered.reshape(-1, len(self.materials))).reshape(weights.shape)
             if lighting is not None:
                 wall = light_weights[..., len(self.materials) - 1, None]
                 light_weights[..., : len(self.materials)] += wall * (cover - np.eye(len(self.materials))[-1])
-        spectra = self._seen_endmembers
+        spectra = self._detector_endmembers
         if self._material:
             of_object = [self.materials.index(name) for name in self.object_part.materials]
             spectra = spectra.copy()
             for effect in self._material:
                 spectra[..., of_object, :] = effect.spectra(
-                    spectra[..., of_object, :], self._object_materials, self._seen_nm, elapsed
+                    spectra[..., of_object, :], self._object_materials, self._detector_nm, elapsed
                 )
         if lighting is None:
             light = Light(weights, spectra)
         else:
-            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._seen_nm))
+            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._detector_nm))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
-        return Frame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
+        return SimulatedFrame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
 
-    def white(self) -> Capture:
-        """The capture of the white tarp, before the first frame."""
+    def white(self) -> SimulatedCapture:
+        """Simulate the capture of the white tarp before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
-        light = self._on_sensor(Light(weights, self._seen_spectra(WHITE_MATERIALS)), elapsed=0.0)
-        return Capture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
+        light = self._on_sensor(Light(weights, self._detector_reflectance(WHITE_MATERIALS)), elapsed=0.0)
+        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
 
     def _exposure_factor(self, of_white: bool) -> float:
         return math.prod(exposure.factor(of_white) for exposure in self._exposures)
 
-    def _seen_spectra(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
-        """Spectra as the detector sees them: a table, or one a sample where its wavelengths differ."""
-        return np.moveaxis(endmembers(names, self._seen_nm, self.scene.materials), 0, -2)
+    def _detector_reflectance(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
+        """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""
+        return np.moveaxis(endmembers(names, self._detector_nm, self.scene.materials), 0, -2)
 
-    def _renderer_of(self, thing: Part) -> Renderer:
-        """The renderer of the object, perhaps deformed, on its support."""
-        step_m = LIGHT_STEP_M if of_stage(self._light, stages.SurfaceLightEffect) else None
-        return assemble.build_renderer(self.scene, thing, self.offset_m, self._chamber_materials, step_m)
+    def _renderer_of(self, scanned: Part) -> Renderer:
+        """The renderer of the object, which may be deformed, on its support."""
+        spacing_m = LIGHT_SPACING_M if of_stage(self._light, stages.SurfaceLightEffect) else None
+        return assemble.build_renderer(self.scene, scanned, self.offset_m, self._chamber_materials, spacing_m)
 
     def _lit(self, renderer: Renderer) -> Lighting | None:
-        """The light on the parts of a renderer, or None where it is even."""
+        """The light on the parts of a renderer; None if it is even."""
         return Lighting(renderer, self._light) if self._light else None
 
     def _deformed(self, elapsed: float) -> tuple[Renderer, Lighting | None]:
-        """The renderer at a time of the session, and the light on it."""
+        """The renderer of the deformed object at time ``elapsed``, and its light."""
         vertices = self.object_part.mesh.vertices
         foot_m = self.offset_m + np.array([0.0, 0.0, self.scene.container.height_m])
         for effect in self._deformation:
@@ -187,7 +192,7 @@ class Simulation:
         return renderer, self._lit(renderer)
 
     def _on_sensor(self, light: Light, elapsed: float) -> Light:
-        """The light after the lens and under the lamps of its time, as it lies in the file."""
+        """The light after optics and illumination at time ``elapsed``, rotated as in the file."""
         weights = light.weights
         for effect in self._optics:
             weights = effect.image(weights)
@@ -201,7 +206,7 @@ class Simulation:
     def _expose(
         self, light: Light, exposure: int
     ) -> tuple[UInt16[np.ndarray, "lines samples bands"], UInt16[np.ndarray, "dark_lines samples bands"]]:
-        """Counts of an image, and of the shutter."""
+        """Counts of an image and of its dark cube."""
         lines, samples = light.weights.shape[:2]
         bands = len(self.wavelengths_nm)
         signal_of_white = self._signal_of_white * self._exposure_factor(of_white=exposure == WHITE_EXPOSURE)
@@ -218,7 +223,7 @@ class Simulation:
     def _digitise(
         self, signal: Float[np.ndarray, "lines samples bands"], random: list[np.random.Generator]
     ) -> UInt16[np.ndarray, "lines samples bands"]:
-        """Counts of a signal (counts above dark), which is overwritten."""
+        """Digitised counts of a signal in counts above dark, which is overwritten."""
         counts = signal
         counts += self.scene.sensor.dark_level
         largest = sensor.largest_count(self.scene.sensor)
@@ -235,7 +240,7 @@ class Simulation:
 
 
 def white_capture_weights(size_px: int) -> Float[np.ndarray, "lines samples 2"]:
-    """Shares of tarp and of its dark surround: the tarp fills most of the image."""
+    """Fractions of the tarp, which fills most of the image, and of its dark surroundings."""
     edge = max(1, round(TARP_MARGIN * size_px))
     tarp = np.zeros((size_px, size_px), np.float32)
     tarp[edge:-edge, edge:-edge] = 1.0

@@ -1,15 +1,13 @@
-"""Light that is not even: from the effects of the stage `light` to the light that each pixel gets.
+"""Uneven light: from the light effects of a scene to the light of each pixel.
 
-Without these effects each point gets the irradiance 1, that of the white tarp, and so has its reflectance as its
-radiance. With them the light of a pixel is the mean over its rays of
+Without light effects every point has the irradiance 1, that of the white tarp, so its radiance is its reflectance.
+With them the light of a pixel is the mean over its rays of
 
     chamber * chamber_lit + lamp * lamp_lit + mirrored
 
-where ``chamber_lit`` and ``lamp_lit``, as weights of colours, belong to the surface (`SurfaceLight`), and the factors
-``chamber`` and ``lamp`` and what is mirrored depend on where camera and lamp stand (`HitLight`).
-
-They act in this order: shading by the chamber, inter-reflection of what is so lit, translucency of what a matte
-surface would then send; the lamp takes its share from the chamber; gloss lies over it all.
+where ``chamber_lit`` and ``lamp_lit`` belong to the surface (`SurfaceLight`), and the factors ``chamber`` and
+``lamp`` and the mirrored light depend on the view (`HitLight`). Effects act in this order: shading by the chamber,
+inter-reflection, translucency, lamp, gloss.
 """
 
 from __future__ import annotations
@@ -21,62 +19,21 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.colours import Colour
-from hsi_sc_nerf.simulate.effects.stages import LensEffect, LightEffect, SurfaceLightEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.render import Hits, Renderer
+from hsi_sc_nerf.simulate.effects.stages import LightEffect, SurfaceLightEffect, ViewLightEffect
+from hsi_sc_nerf.simulate.light import Colour, HitLight, even_light
+from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceLight:
-    """Radiance of each point of a surface, the same in all directions.
-
-    Attributes:
-        surface: the points.
-        colours: names the columns; the first are the renderer's materials, in their order.
-        chamber_lit: under a chamber of radiance 1.
-        lamp_lit: under a lamp that gives each point the irradiance 1.
-    """
-
-    surface: Surface
-    colours: tuple[Colour, ...]
-    chamber_lit: Float[np.ndarray, "p colours"]
-    lamp_lit: Float[np.ndarray, "p colours"]
-
-    @property
-    def materials(self) -> Float[np.ndarray, "p materials"]:
-        """Share of each material at each point."""
-        return self.surface.renderer.weights[self.surface.vertex]
-
-
-@dataclass(frozen=True, eq=False)
-class HitLight:
-    """What becomes of a surface's light on its way to one camera, where its rays hit.
-
-    Attributes:
-        chamber: factor on the light that the chamber gives.
-        lamp: factor on the light that the lamp gives, its irradiance with it.
-        to_lamp: unit direction to the lamp, if there is one.
-        chamber_colour: of the chamber.
-        mirrored: further light at each hit, by its colour.
-    """
-
-    chamber: Float[np.ndarray, "hits"]
-    lamp: Float[np.ndarray, "hits"]
-    to_lamp: Float[np.ndarray, "3"] | None
-    chamber_colour: Colour
-    mirrored: tuple[tuple[Colour, Float[np.ndarray, "hits"]], ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a camera sees.
+    """An image under uneven light.
 
     Attributes:
-        material_weights: share of each material in each pixel, summing to exactly 1.
-        coverage: share of each pixel that the object covers.
-        light_weights: how much light of each colour each pixel gets.
-        colours: of the light, the plain materials first.
+        material_weights: fraction of each material in each pixel, summing to exactly 1.
+        coverage: fraction of each pixel that the object covers.
+        light_weights: amount of each colour in the light of each pixel.
+        colours: colours of the light; those of single materials come first.
     """
 
     material_weights: Float[np.ndarray, "h w materials"]
@@ -86,7 +43,7 @@ class Rendering:
 
 
 class Lighting:
-    """The light on one set of parts under some effects: what is the same from everywhere is computed here, once."""
+    """The light on the parts of a renderer under some effects; view-independent light is computed once, here."""
 
     def __init__(self, renderer: Renderer, effects: Sequence[LightEffect]) -> None:
         on_surface = [effect for effect in effects if isinstance(effect, SurfaceLightEffect)]
@@ -101,9 +58,9 @@ class Lighting:
         intrinsics: PinholeIntrinsics,
         camera_to_world: Float[np.ndarray, "4 4"],
         supersampling: int,
-        lens: LensEffect | None = None,
+        lens: Lens | None = None,
     ) -> Rendering:
-        """What a camera sees; as `Renderer.render`, and the light with it."""
+        """An image and its light; arguments as in `Renderer.render`."""
         size, materials = (intrinsics.h, intrinsics.w), len(self._renderer.materials)
         weights = np.empty((*size, materials), np.float32)
         coverage = np.empty(size, np.float32)
@@ -118,7 +75,7 @@ class Lighting:
     def light(
         self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, "pixels colours"], tuple[Colour, ...]]:
-        """The light that each pixel gets, as weights of colours, and these."""
+        """The light of each pixel as weights of colours, and the colours."""
         surface, count = self._light.surface, len(hits.ray)
         chamber = len(self._renderer.materials) - 1
         at_hits = HitLight(np.ones(count, np.float32), np.zeros(count, np.float32), None, Colour((chamber,)))
@@ -133,10 +90,3 @@ class Lighting:
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
         return light, colours
-
-
-def even_light(surface: Surface) -> SurfaceLight:
-    """Irradiance 1 everywhere."""
-    materials = surface.renderer.weights[surface.vertex]
-    colours = tuple(Colour((i,)) for i in range(len(surface.renderer.materials)))
-    return SurfaceLight(surface, colours, materials, materials)

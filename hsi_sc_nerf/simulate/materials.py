@@ -1,6 +1,6 @@
-"""Reflectance spectra of the materials, 397-1003 nm, built from the absorption features that shape real ones.
+"""Reflectance spectra of the materials from 397 to 1003 nm, and reading materials of a scene file.
 
-A plant surface is a flat scatterer dimmed by absorbers: reflectance = plateau * 10 ** -(absorbance of the
+A plant surface is a spectrally flat scatterer with absorbers: reflectance = plateau * 10 ** -(absorbance of the
 pigments + water). Band positions after Merzlyak et al. (2003), "Reflectance spectral features and
 non-destructive estimation of chlorophyll, carotenoid and anthocyanin content in apple fruit", and the 970 nm
 overtone of water after Peñuelas et al. (1993).
@@ -8,14 +8,18 @@ overtone of water after Peñuelas et al. (1993).
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.simulate.reading import between
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 
 Spectrum = Float[np.ndarray, "bands"]
 
@@ -30,25 +34,25 @@ class PlantTissue:
     carotenoid: float = between(0.0, 5.0, default=0.0)
     anthocyanin: float = between(0.0, 5.0, default=0.0)
     brown: float = between(0.0, 5.0, default=0.0)
-    """Oxidised phenols: absorbance at 400 nm of an exponential tail towards the red."""
+    """Oxidised phenols: absorbance at 400 nm, decreasing exponentially towards the red."""
     water: float = between(0.0, 5.0, default=0.0)
 
 
 @dataclass(frozen=True)
 class Plain:
-    """A non-plant material: nearly flat, with a gentle rise from blue to near-infrared."""
+    """A non-plant material with a nearly flat spectrum."""
 
     level: float = between(0.0, 1.0)
     """Reflectance at 700 nm."""
     slope_per_um: float = between(-3.0, 3.0, default=0.0)
     """Relative change of reflectance over 1000 nm."""
     blue_loss: float = between(0.0, 1.0, default=0.0)
-    """Share lost at 400 nm (binders and whiteners absorb there), gone by 450 nm."""
+    """Relative loss at 400 nm due to binders and whiteners; it vanishes by 450 nm."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A measured spectrum, straight between its points."""
+    """A measured spectrum with linear interpolation."""
 
     wavelengths_nm: tuple[float, ...]
     """Increasing."""
@@ -57,7 +61,6 @@ class Measured:
 
 
 Material: TypeAlias = PlantTissue | Plain | Measured
-
 MATERIALS: dict[str, Material] = {
     "pear_skin": PlantTissue(0.66, chlorophyll=0.62, carotenoid=0.62, brown=0.10, water=0.075),
     "pear_blush": PlantTissue(0.64, chlorophyll=0.30, carotenoid=0.52, anthocyanin=0.55, brown=0.12, water=0.075),
@@ -77,24 +80,28 @@ MATERIALS: dict[str, Material] = {
     "disc": Plain(0.78, slope_per_um=0.03, blue_loss=0.10),
     # Sintered PTFE: 0.95-0.97, nearly flat.
     "chamber": Plain(0.96, slope_per_um=0.01),
-    # What a chamber's wall can be made of instead.
+    # Materials of a textured chamber wall.
     "plywood": PlantTissue(0.66, carotenoid=0.18, brown=0.55, water=0.02),
     "blue_paint": Measured(
         (380.0, 420.0, 460.0, 500.0, 540.0, 580.0, 640.0, 700.0, 740.0, 800.0, 1010.0),
         (0.14, 0.30, 0.46, 0.38, 0.20, 0.09, 0.07, 0.12, 0.30, 0.42, 0.45),
     ),
     "black_paint": Plain(0.06, slope_per_um=0.05),
-    # Calibration is relative to the tarp, so an ideal tarp makes calibrated reflectance the true one.
+    # Calibration is relative to the tarp; an ideal tarp makes calibrated reflectance equal to the true one.
     "white_tarp": Plain(1.0),
     "tarp_surround": Plain(0.12, slope_per_um=0.05),
-    # Exactly flat, for proofs: what is white absorbs nothing, what is grey half.
+    # Exactly flat spectra for tests.
     "matte_white": Plain(1.0),
     "matte_grey": Plain(0.5),
 }
 
 
+KINDS = {"plant": PlantTissue, "plain": Plain}
+COLUMNS = ("wavelength_nm", "reflectance")
+
+
 def known_materials(own: Mapping[str, Material]) -> dict[str, Material]:
-    """All materials by name; a scene's ``own`` come before built-in ones of the same name."""
+    """All materials by name; ``own`` materials replace built-in ones of the same name."""
     return {**MATERIALS, **own}
 
 
@@ -103,7 +110,7 @@ def endmembers(
 ) -> Float[np.ndarray, "materials bands"]:
     """Reflectance of the named materials at the given wavelengths, each in [0, 1].
 
-    ``own`` are the scene's own materials; they come before built-in ones of the same name.
+    ``own`` materials of the scene replace built-in ones of the same name.
 
     Raises:
         KeyError: a name is neither in ``own`` nor in `MATERIALS`.
@@ -155,3 +162,62 @@ def water_absorbance(wavelengths_nm: Float[np.ndarray, "*shape"]) -> Float[np.nd
     750-840 nm."""
     w = wavelengths_nm
     return _peak(w, 970.0, 24.0) + 0.30 * _peak(w, 1010.0, 40.0) + 0.06 * _peak(w, 835.0, 18.0)
+
+
+def read_materials(values: Any, source: str, folder: Path) -> dict[str, Material]:
+    """Materials of a scene file's ``materials`` mapping, by name.
+
+    Each is ``plant: {plateau: ...}`` (fields of `PlantTissue`), ``plain: {level: ...}`` (fields of `Plain`), or
+    ``csv: FILE`` with a path relative to ``folder``.
+
+    Raises:
+        InputError: not such a mapping; an unknown, missing, mistyped or out-of-range value; see `read_spectrum`.
+    """
+    if not isinstance(values, dict):
+        raise InputError(f"{source}: materials must hold `name: definition` lines, not {values!r}.")
+    return {str(name): _read_material(value, source, f"materials.{name}", folder) for name, value in values.items()}
+
+
+def _read_material(value: Any, source: str, where: str, folder: Path) -> Material:
+    if not isinstance(value, dict) or len(value) != 1 or not {*value} <= {*KINDS, "csv"}:
+        raise InputError(
+            f"{source}: {where} is {value!r}, but must be one of `plant: {{plateau: ...}}`, `plain: {{level: ...}}` "
+            "and `csv: FILE`."
+        )
+    ((kind, content),) = value.items()
+    if kind == "csv":
+        if not isinstance(content, str):
+            raise InputError(f"{source}: {where}.csv is {content!r}, but must be the path of a CSV file.")
+        return read_spectrum(folder / content)
+    material = read_dataclass(KINDS[kind], content, source, f"{where}.{kind}.")
+    check_ranges(material, source, f"{where}.{kind}.")
+    return material
+
+
+def read_spectrum(path: Path) -> Measured:
+    """A measured reflectance spectrum: a CSV file with the columns wavelength_nm and reflectance.
+
+    Raises:
+        InputError: the file is missing or lacks a column; a value is not a number; wavelengths do not increase or do
+            not cover `paper.WAVELENGTH_RANGE_NM`; a reflectance is outside [0, 1].
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+        wavelengths_nm, reflectance = (np.array([float(row[column]) for row in rows]) for column in COLUMNS)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give the path of a spectrum's CSV file."
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: is not a table of numbers with the columns {' and '.join(COLUMNS)}; save it like that."
+        ) from error
+    low_nm, high_nm = paper.WAVELENGTH_RANGE_NM
+    if len(rows) == 0 or not wavelengths_nm.min() <= low_nm < high_nm <= wavelengths_nm.max():
+        raise InputError(f"{path}: must cover {low_nm:g} to {high_nm:g} nm; extend the spectrum at its ends.")
+    if not (np.diff(wavelengths_nm) > 0.0).all():
+        raise InputError(f"{path}: wavelengths must increase from line to line; sort the lines and keep each once.")
+    if not ((reflectance >= 0.0) & (reflectance <= 1.0)).all():
+        raise InputError(f"{path}: reflectances must lie between 0 and 1; divide by 100 if they are percentages.")
+    return Measured(tuple(wavelengths_nm.tolist()), tuple(reflectance.tolist()))

@@ -1,8 +1,8 @@
-"""The same scene rendered with Mitsuba 3, to check our own renderer against one that others wrote.
+"""Rendering of a scene with Mitsuba 3, as an independent check of the simulator's own renderer.
 
-Needs the optional extra ``hsi-sc-nerf[mitsuba]``. Geometry, poses and the materials' shares are the simulator's own;
-visibility, the paths of the light and the spectral film are Mitsuba's. Lights that Mitsuba makes of plain numbers
-have the spectrum of daylight, which ends at 830 nm there: every spectrum here is a table of its own.
+Needs the optional extra ``hsi-sc-nerf[mitsuba]``. Geometry, poses and material fractions are the simulator's own;
+visibility, light transport and the spectral film are Mitsuba's. All spectra are explicit tables, because lights that
+Mitsuba makes of plain numbers have the spectrum of daylight, which ends at 830 nm.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ except ImportError as error:
     raise InputError("Mitsuba is not installed; install it with: pip install 'hsi-sc-nerf[mitsuba]'.") from error
 
 mi.set_variant("scalar_spectral")
-# It warns of the slowness of integrators in Python, which small pictures can bear.
+# Mitsuba warns that integrators in Python are slow; for small images they are fast enough.
 mi.set_log_level(mi.LogLevel.Error)
 
 Transport = Literal["even", "chamber", "one_bounce", "many_bounces"]
-"""How light comes to what is seen: evenly to every point; from the chamber, where nothing hides it; by way of one
-other surface as well; by way of any number of them."""
+"""Light transport: even light; direct light of the chamber with occlusion; one diffuse bounce in addition; any number
+of bounces."""
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 COVERED_EFFECTS = ("chamber_shading", "inter_reflection")
-"""Effects that a transport stands for. Motion is in the poses; no other effect is rendered."""
+"""Effects that a transport represents. Motion effects are part of the poses; other effects cannot be rendered."""
 MAX_DEPTH: dict[Transport, int] = {"chamber": 2, "one_bounce": 3, "many_bounces": -1}
-"""Longest path from the chamber to the camera, in straight pieces; -1 for any."""
+"""Largest number of segments of a path from the chamber to the camera; -1 for any."""
 OPENGL_TO_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""Mitsuba's camera has x to the left and looks along +z."""
+"""The x axis of Mitsuba's camera points left, and the camera looks along +z."""
 SEAM_NM = 0.02
-"""Neighbouring bands fade into each other over so much on either side of their common edge."""
+"""Half width of the transition between neighbouring bands."""
 
 
 class SeenReflectance(mi.SamplingIntegrator):
-    """Even light: every surface sends its reflectance to the camera, whatever hides it from the chamber."""
+    """Even light: the radiance of every surface is its reflectance, without occlusion."""
 
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: bool = True
     ) -> tuple[Any, bool, list[float]]:
-        """Reflectance of what the ray hits, or the radiance of the chamber."""
+        """Reflectance at the hit of the ray, or radiance of the chamber."""
         hit = scene.ray_intersect(ray)
         if hit.is_valid():
             return hit.bsdf(ray).eval_diffuse_reflectance(hit), True, []
@@ -62,11 +62,16 @@ mi.register_integrator("seen_reflectance", SeenReflectance)
 def render(
     scene: Scene, frame: int, transport: Transport, *, rays_per_pixel: int, seed: int = 0
 ) -> Float[np.ndarray, "lines samples bands"]:
-    """Noise-free radiance of one frame, relative to the white tarp's, but for Mitsuba's Monte-Carlo error.
+    """Radiance of one frame relative to the white tarp's, with Mitsuba's Monte-Carlo error.
 
-    In even light the chamber has its own spectrum. Otherwise it is the lamp, with radiance 1 in all bands, and is
-    seen like that. The film draws wavelengths; it adds no noise of its own where ``rays_per_pixel`` is a multiple of
-    the number of bands.
+    In even light the chamber has its own spectrum. Otherwise it is the light source, with radiance 1 in all bands.
+
+    Args:
+        scene: a scene without effects, or with motion effects and those of `COVERED_EFFECTS`.
+        frame: index of the frame.
+        transport: light transport.
+        rays_per_pixel: rays in each pixel; a multiple of the number of bands avoids noise of the spectral film.
+        seed: seed of Mitsuba's sampler.
 
     Raises:
         InputError: the scene names an effect that is neither motion nor one of `COVERED_EFFECTS`.
@@ -101,7 +106,7 @@ def render(
 
 
 def _camera(intrinsics: PinholeIntrinsics, camera_to_world: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """A pinhole camera whose principal point is the image's middle."""
+    """A pinhole camera with its principal point in the image centre."""
     return {
         "type": "perspective",
         "fov_axis": "x",
@@ -113,17 +118,17 @@ def _camera(intrinsics: PinholeIntrinsics, camera_to_world: Float[np.ndarray, "4
 
 
 def _band_edges_nm(scene: Scene) -> Float[np.ndarray, "bands+1"]:
-    """Edges of bands of equal width that fill the sensor's range.
+    """Edges of bands of equal width over the sensor's range.
 
-    The simulator's spectra are taken at the bands' centres. Here each of these values holds all over its band, so
-    that the width of the bands, and small differences between the widths, change nothing.
+    The simulator evaluates spectra at the band centres. Here each value is constant over its band, so the widths of
+    the bands do not matter.
     """
     centres_nm = sensor.band_centres_nm(scene.sensor.bands)
     return np.linspace(centres_nm[0], centres_nm[-1], scene.sensor.bands + 1)
 
 
 def _film(scene: Scene) -> dict[str, Any]:
-    """A film that counts the light in each band, over the pixel's square."""
+    """A film that integrates the light in each band over the pixel's square."""
     edges_nm = _band_edges_nm(scene)
     film: dict[str, Any] = {
         "type": "specfilm",
@@ -132,13 +137,13 @@ def _film(scene: Scene) -> dict[str, Any]:
         "rfilter": {"type": "box"},
         "component_format": "float32",
     }
-    # The film draws wavelengths from the sum of its bands, sampled at places of its own choice: the sum must be 1
-    # everywhere, lest it draws unevenly. So a band fades out as the next one fades in.
+    # The film samples wavelengths from the sum of its bands, which must be 1 everywhere for even sampling. So each
+    # band fades out where the next one fades in.
     seams_nm = edges_nm[1:-1, None] + np.array([-SEAM_NM, SEAM_NM])
     for band in range(scene.sensor.bands):
         rise_nm = edges_nm[:1] if band == 0 else seams_nm[band - 1]
         fall_nm = edges_nm[-1:] if band == scene.sensor.bands - 1 else seams_nm[band]
-        # Mitsuba orders bands by name.
+        # Mitsuba sorts bands by name.
         film[f"band_{band:04d}"] = {
             "type": "irregular",
             "wavelengths": _numbers(np.concatenate([rise_nm, fall_nm])),
@@ -170,7 +175,7 @@ def _numbers(values: Float[np.ndarray, "n"]) -> str:
 
 
 def _meshes(scene: Scene, part: Part) -> list[Any]:
-    """The part as one mesh for each set of materials that meet in its triangles."""
+    """The part as one mesh for each set of materials that occurs in its triangles."""
     meshes = []
     present = (part.weights[part.mesh.triangles] > 0.0).any(axis=1)
     for of_group in np.unique(present, axis=0):
@@ -192,11 +197,10 @@ def _meshes(scene: Scene, part: Part) -> list[Any]:
 
 
 def _mixture(scene: Scene, names: list[str]) -> dict[str, Any]:
-    """A matte surface whose reflectance is the sum of the materials' in the shares at the mesh's vertices.
+    """A matte surface whose reflectance is the sum of the materials' weighted by their fractions at the vertices.
 
-    Mitsuba interpolates shares between vertices as the simulator does, but only blends two surfaces by one share. Two
-    materials are one blend. Of n materials each is blended with black and made n times as bright; the even blend of
-    the n is then their sum.
+    Mitsuba only blends two surfaces with one weight. Two materials are one blend. Each of n > 2 materials is made n
+    times as bright and blended with black; the even blend of the n surfaces is then the weighted sum.
     """
     if len(names) == 1:
         return {"type": "diffuse", "reflectance": _material(scene, names[0])}
@@ -207,10 +211,10 @@ def _mixture(scene: Scene, names: list[str]) -> dict[str, Any]:
     mean: dict[str, Any] = {}
     for number, name in enumerate(names):
         bright = {"type": "diffuse", "reflectance": _material(scene, name, factor=float(len(names)))}
-        share = _blend(black, bright, {"type": "mesh_attribute", "name": f"vertex_{name}"})
-        mean = _blend(mean, share, 1.0 / (number + 1.0)) if mean else share
+        weighted = _blend(black, bright, {"type": "mesh_attribute", "name": f"vertex_{name}"})
+        mean = _blend(mean, weighted, 1.0 / (number + 1.0)) if mean else weighted
     return mean
 
 
-def _blend(first: dict[str, Any], second: dict[str, Any], share_of_second: dict[str, Any] | float) -> dict[str, Any]:
-    return {"type": "blendbsdf", "weight": share_of_second, "first": first, "second": second}
+def _blend(first: dict[str, Any], second: dict[str, Any], weight_of_second: dict[str, Any] | float) -> dict[str, Any]:
+    return {"type": "blendbsdf", "weight": weight_of_second, "first": first, "second": second}

@@ -1,4 +1,4 @@
-"""A user's own mesh as the object: read, stood on z = 0, its materials laid on, checked to be closed."""
+"""A user's own mesh as the scanned object: reading, scaling, material fractions and checks."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from plyfile import PlyData
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import snapped, subdivided, welded
-from hsi_sc_nerf.simulate.objects import OwnMesh
-from hsi_sc_nerf.simulate.texture import padded_shares, sampled
+from hsi_sc_nerf.simulate.scene import OwnMesh
+from hsi_sc_nerf.simulate.texture import padded_fractions, sampled
 
 Y_UP_FORMATS = (".gltf", ".glb")
-"""glTF's specification has y up; PLY and OBJ say nothing, and z is up in most tools that write them."""
+"""The y axis of glTF is vertical by specification; most tools write PLY and OBJ with a vertical z axis."""
 FORMATS = (".ply", ".obj", *Y_UP_FORMATS)
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 HEIGHTS_M = (0.01, 0.5)
 WIDEST_M = 1.0
-SAME_PLACE = 1e-6
-"""Vertices closer than this share of the mesh's size are one point (exporters repeat vertices along UV seams)."""
+MERGE_DISTANCE = 1e-6
+"""Distance below which vertices are merged, as a fraction of the mesh size; exporters repeat vertices at UV seams."""
 TEXTURE_SPACING_M = 0.001
-"""Edges are cut to at most this before a texture is sampled at vertices."""
+"""Largest edge length after the subdivision for sampling a texture at the vertices."""
 CHANNELS = 3
+"""Colour channels of vertex colours and textures, each the fraction of one material."""
 
 
 @dataclass(frozen=True)
-class _Surface:
-    """What a mesh file holds; vertices may repeat along seams."""
+class _MeshFile:
+    """Content of a mesh file; vertices may be repeated along seams."""
 
     vertices: Float[np.ndarray, "v 3"]
     triangles: Int[np.ndarray, "t 3"]
@@ -40,62 +41,69 @@ class _Surface:
     colours: Float[np.ndarray, "v 3"] | None
 
 
-def load(thing: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
-    """The mesh in metres, standing on z = 0 with its bounding box centred on the axis, and its materials' shares.
+def load(settings: OwnMesh) -> tuple[Mesh, Float[np.ndarray, "v materials"]]:
+    """Read a mesh, place it on z = 0 with its bounding box centred on the axis, and determine its materials.
 
-    Shares are interpolated linearly between vertices; where they come from a texture, triangles are cut first so
-    that no edge is longer than `TEXTURE_SPACING_M`. Triangles come out counter-clockwise seen from outside.
+    Fractions are interpolated linearly between vertices. For a texture, triangles are first subdivided to edges of at
+    most `TEXTURE_SPACING_M`. Triangles of the result are counter-clockwise seen from outside.
+
+    Returns:
+        The mesh in metres, and the fraction of each material at each vertex.
 
     Raises:
         InputError: a file is missing or cannot be read; it has no triangles, is not closed, or is not of a size
-            that fits on the turntable; the materials' shares, UVs or colours are missing or do not fit.
+            that fits on the turntable; the materials' fractions, UVs or colours are missing or do not fit.
     """
-    surface = _read_surface(thing)
-    vertices = _stood(surface.vertices, thing)
+    surface = _read_mesh_file(settings)
+    vertices = _upright_and_scaled(surface.vertices, settings)
     triangles = surface.triangles
-    if len(thing.materials) == 1:
+    if len(settings.materials) == 1:
         weights = np.ones((len(vertices), 1))
-    elif thing.weight_texture is not None:
-        vertices, triangles, weights = _textured(thing, vertices, surface)
-    elif (given := _vertex_weights(thing)) is not None:
+    elif settings.weight_texture is not None:
+        vertices, triangles, weights = _weights_from_texture(settings, vertices, surface)
+    elif (given := _vertex_weights(settings)) is not None:
         if len(given) != len(vertices):
-            raise InputError(f"{thing.mesh_file}: its vertices and its faces do not fit together; export it again.")
-        weights = _shares(given, f"{thing.mesh_file}: the weights of some vertices")
+            raise InputError(f"{settings.mesh_file}: its vertices and faces are inconsistent; export it again.")
+        weights = _normalised_weights(given, f"{settings.mesh_file}: the weights of some vertices")
     elif surface.colours is not None:
-        _check_channels(thing, "vertex colours")
-        weights = _shares(
-            surface.colours[:, : len(thing.materials)], f"{thing.mesh_file}: the colours of some vertices"
+        _check_channels(settings, "vertex colours")
+        weights = _normalised_weights(
+            surface.colours[:, : len(settings.materials)], f"{settings.mesh_file}: the colours of some vertices"
         )
     else:
         raise InputError(
-            f"{thing.mesh_file}: does not say where {', '.join(thing.materials)} lie; give it vertex properties "
-            f"weight_{thing.materials[0]} and so on (PLY) or vertex colours, or add a weight_texture to the scene."
+            f"{settings.mesh_file}: does not locate its materials {', '.join(settings.materials)}; give it vertex "
+            f"properties weight_{settings.materials[0]} and so on (PLY) or vertex colours, or add a weight_texture "
+            "to the scene."
         )
     mesh, weights = welded(vertices, triangles, weights)
-    return _facing_outwards(mesh, thing.mesh_file), weights
+    return _facing_outwards(mesh, settings.mesh_file), weights
 
 
-def _read_surface(thing: OwnMesh) -> _Surface:
-    path = thing.mesh_file
+def _read_mesh_file(settings: OwnMesh) -> _MeshFile:
+    path = settings.mesh_file
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of the mesh, relative to the scene file.")
     if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path}: is no mesh that can be read; give a file of the kind {', '.join(FORMATS)}.")
+        raise InputError(f"{path}: is not a mesh format that can be read; give one of {', '.join(FORMATS)}.")
     try:
-        # UVs of a PLY's faces split its vertices, which would leave those of the file without their weights.
-        read = trimesh.load_scene(path, process=False, fix_texture=thing.weight_texture is not None).dump()
-    except Exception as error:  # the readers fail in every way there is
+        # UVs of PLY faces would split vertices, which then no longer match the file's vertex properties.
+        read = trimesh.load_scene(path, process=False, fix_texture=settings.weight_texture is not None).dump()
+    except Exception as error:  # the readers raise many kinds of exceptions
         raise InputError(f"{path}: cannot be read as a mesh ({error!r}); export it again.") from error
     parts = [part for part in read if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise InputError(f"{path}: has no triangles; export a surface, not points or curves.")
     vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
     if not np.isfinite(vertices).all():
-        raise InputError(f"{path}: some vertices are not at finite places; export it again.")
+        raise InputError(f"{path}: some vertices are not finite; export it again.")
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = np.concatenate([np.asarray(part.faces) + offset for part, offset in zip(parts, first, strict=False)])
-    return _Surface(
-        vertices, triangles, _joined([_uv(part) for part in parts]), _joined([_colours(part) for part in parts])
+    return _MeshFile(
+        vertices,
+        triangles,
+        _concatenated([_uv(part) for part in parts]),
+        _concatenated([_colours(part) for part in parts]),
     )
 
 
@@ -107,94 +115,94 @@ def _uv(part: trimesh.Trimesh) -> np.ndarray | None:
 def _colours(part: trimesh.Trimesh) -> np.ndarray | None:
     if isinstance(part.visual, trimesh.visual.ColorVisuals) and part.visual.kind == "vertex":
         return np.asarray(part.visual.vertex_colors, float)[:, :CHANNELS]
-    # A glTF that has a material as well keeps its colours here.
+    # A glTF with a material has its vertex colours here.
     colours = part.vertex_attributes.get("color")
     return None if colours is None else np.asarray(colours, float)[:, :CHANNELS]
 
 
-def _joined(of_parts: list[np.ndarray | None]) -> np.ndarray | None:
-    """Columns of all parts one below the other; None if a part has none."""
+def _concatenated(of_parts: list[np.ndarray | None]) -> np.ndarray | None:
+    """Columns of all parts concatenated; None if a part has none."""
     found = [columns for columns in of_parts if columns is not None]
     return np.concatenate(found) if len(found) == len(of_parts) else None
 
 
-def _stood(vertices: Float[np.ndarray, "v 3"], thing: OwnMesh) -> Float[np.ndarray, "v 3"]:
-    """Turned upright, scaled, put on z = 0 and on the axis."""
-    is_y_up = thing.up_axis == "y" or (
-        thing.up_axis == "by_format" and thing.mesh_file.suffix.lower() in Y_UP_FORMATS
+def _upright_and_scaled(vertices: Float[np.ndarray, "v 3"], settings: OwnMesh) -> Float[np.ndarray, "v 3"]:
+    """Rotate the vertical axis to z, scale, and place on z = 0 and on the axis."""
+    is_y_up = settings.up_axis == "y" or (
+        settings.up_axis == "by_format" and settings.mesh_file.suffix.lower() in Y_UP_FORMATS
     )
     vertices = vertices @ Y_UP_TO_Z_UP.T if is_y_up else vertices
     size = np.ptp(vertices, axis=0)
     if size[2] == 0.0:
-        raise InputError(f"{thing.mesh_file}: is flat, so that it has no height; check up_axis.")
-    vertices = snapped(vertices, SAME_PLACE * float(size.max()))
-    scale = 1.0 if thing.height_m is None else thing.height_m / size[2]
+        raise InputError(f"{settings.mesh_file}: is flat and has no height; check up_axis.")
+    vertices = snapped(vertices, MERGE_DISTANCE * float(size.max()))
+    scale = 1.0 if settings.height_m is None else settings.height_m / size[2]
     size = size * scale
     low, high = HEIGHTS_M
     if not low <= size[2] * (1 + 1e-9) or size[2] > high * (1 + 1e-9) or size.max() > WIDEST_M:
         raise InputError(
-            f"{thing.mesh_file}: is {size[0]:.3g} x {size[1]:.3g} m wide and {size[2]:.3g} m tall, but must be "
+            f"{settings.mesh_file}: is {size[0]:.3g} x {size[1]:.3g} m wide and {size[2]:.3g} m tall, but must be "
             f"{low:g} to {high:g} m tall and at most {WIDEST_M:g} m wide; give object.height_m, or another up_axis."
         )
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     return (vertices - [centre[0], centre[1], vertices[:, 2].min()]) * scale
 
 
-def _textured(
-    thing: OwnMesh, vertices: Float[np.ndarray, "v 3"], surface: _Surface
+def _weights_from_texture(
+    settings: OwnMesh, vertices: Float[np.ndarray, "v 3"], surface: _MeshFile
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "w materials"]]:
-    """Vertices and triangles fine enough for the texture, and the shares that it gives them."""
-    path = thing.weight_texture
+    """Subdivided vertices and triangles, and the fractions that the texture gives the vertices."""
+    path = settings.weight_texture
     assert path is not None
-    _check_channels(thing, "a weight texture")
+    _check_channels(settings, "a weight texture")
     if surface.uv is None:
-        raise InputError(
-            f"{thing.mesh_file}: has no UVs to lay {path.name} on; unwrap it and export it with its UVs."
-        )
+        raise InputError(f"{settings.mesh_file}: has no UVs for {path.name}; unwrap it and export it with UVs.")
     try:
         with Image.open(path) as image:
             channels = image.getbands()
-            pixels = np.asarray(image.convert("RGB"), float)[..., : len(thing.materials)]
+            pixels = np.asarray(image.convert("RGB"), float)[..., : len(settings.materials)]
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read as an image ({error}); give a PNG with shares as colours."
+            f"{path}: cannot be read as an image ({error}); give a PNG with fractions as colours."
         ) from error
     if len(channels) < CHANNELS and channels != ("P",):
-        raise InputError(f"{path}: is grey, but the shares of materials are its red, green and blue; save it as RGB.")
+        raise InputError(
+            f"{path}: is grey, but the fractions of materials are its red, green and blue; save it as RGB."
+        )
     fine, triangles = subdivided(np.column_stack([vertices, surface.uv]), surface.triangles, TEXTURE_SPACING_M)
-    weights = sampled(padded_shares(pixels), fine[:, 3:])
-    return fine[:, :3], triangles, _shares(weights, f"{path}: the texture where some of the surface lies")
+    weights = sampled(padded_fractions(pixels), fine[:, 3:])
+    return fine[:, :3], triangles, _normalised_weights(weights, f"{path}: the texture where some of the surface lies")
 
 
-def _vertex_weights(thing: OwnMesh) -> Float[np.ndarray, "v materials"] | None:
-    """The PLY's vertex properties ``weight_NAME``; None where it has none of them."""
-    if thing.mesh_file.suffix.lower() != ".ply":
+def _vertex_weights(settings: OwnMesh) -> Float[np.ndarray, "v materials"] | None:
+    """Vertex properties ``weight_NAME`` of a PLY file; None if it has none of them."""
+    if settings.mesh_file.suffix.lower() != ".ply":
         return None
-    table = PlyData.read(thing.mesh_file)["vertex"].data
-    names = [f"weight_{name}" for name in thing.materials]
+    table = PlyData.read(settings.mesh_file)["vertex"].data
+    names = [f"weight_{name}" for name in settings.materials]
     missing = [name for name in names if name not in table.dtype.names]
     if len(missing) == len(names):
         return None
     if missing:
         raise InputError(
-            f"{thing.mesh_file}: its vertices have no property {', '.join(missing)}; add it, or take the material "
+            f"{settings.mesh_file}: its vertices have no property {', '.join(missing)}; add it, or take the material "
             "out of object.materials."
         )
     return np.stack([np.asarray(table[name], float) for name in names], axis=-1)
 
 
-def _check_channels(thing: OwnMesh, what: str) -> None:
-    if len(thing.materials) > CHANNELS:
+def _check_channels(settings: OwnMesh, what: str) -> None:
+    if len(settings.materials) > CHANNELS:
         raise InputError(
-            f"{thing.mesh_file}: {what} can tell {CHANNELS} materials apart (red, green, blue), not "
-            f"{len(thing.materials)}; name fewer, or use a PLY with vertex properties weight_NAME."
+            f"{settings.mesh_file}: {what} can represent {CHANNELS} materials (red, green, blue), not "
+            f"{len(settings.materials)}; name fewer, or use a PLY with vertex properties weight_NAME."
         )
 
 
-def _shares(weights: Float[np.ndarray, "v materials"], what: str) -> Float[np.ndarray, "v materials"]:
-    """Weights of any scale as shares that sum to 1."""
+def _normalised_weights(weights: Float[np.ndarray, "v materials"], what: str) -> Float[np.ndarray, "v materials"]:
+    """Scale weights to fractions that sum to 1."""
     if not (np.isfinite(weights).all() and (weights >= 0.0).all()):
-        raise InputError(f"{what} are negative or no numbers; give each material's share, 0 or more.")
+        raise InputError(f"{what} are negative or not numbers; give fractions of 0 or more.")
     total = weights.sum(axis=-1, keepdims=True)
     if not (total > 0.0).all():
         raise InputError(f"{what} are 0 for every material; give each point a material.")
@@ -202,14 +210,14 @@ def _shares(weights: Float[np.ndarray, "v materials"], what: str) -> Float[np.nd
 
 
 def _facing_outwards(mesh: Mesh, path: Path) -> Mesh:
-    """The mesh with all triangles counter-clockwise seen from outside."""
+    """Orient all triangles counter-clockwise seen from outside."""
     if not mesh.is_watertight():
         repaired = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
         trimesh.repair.fix_winding(repaired)
         mesh = Mesh(mesh.vertices, np.asarray(repaired.faces))
     if not mesh.is_watertight():
         raise InputError(
-            f"{path}: is not closed (edges without exactly two triangles), so that it has no volume; close its holes "
+            f"{path}: is not closed (edges without exactly two triangles) and has no volume; close its holes "
             "first, for instance with a mesh editor's 'fill holes' and 'remove non-manifold edges'."
         )
     return mesh if mesh.volume_m3() > 0.0 else Mesh(mesh.vertices, mesh.triangles[:, ::-1])

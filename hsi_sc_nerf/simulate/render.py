@@ -1,40 +1,48 @@
-"""Ray casting: what each pixel sees, and which materials, in which shares."""
+"""Ray casting: which surface each pixel sees, and the fraction of each material in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
-import open3d as o3d
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
-from hsi_sc_nerf.simulate.effects.stages import LensEffect
 from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19
 RAY_START_M = 2e-5
-"""How far above a surface a ray starts that leaves it, so that it does not hit what it leaves."""
+"""Offset of a ray's origin from the surface that it leaves, so that it does not hit that surface."""
 WEIGHT_STEPS = 2048
-"""Weights are multiples of 1 / 2048, which float16 holds exactly, so that stored weights sum to exactly 1."""
+"""Weights are multiples of 1 / 2048, which float16 represents exactly, so stored weights sum to exactly 1."""
+
+
+class Lens(Protocol):
+    """A lens that bends the rays of the pinhole camera; hashable."""
+
+    def straighten(
+        self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
+    ) -> Float[np.ndarray, "*n 2"]:
+        """Pixel coordinates in the pinhole image of what the lens images at ``pixels``."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A mesh with shares of materials at its vertices, in the object frame."""
+    """A mesh in the object frame with the fraction of each material at its vertices."""
 
     mesh: Mesh
     materials: tuple[str, ...]
     weights: Float[np.ndarray, "v m"]
     is_object: bool = False
-    """Whether this is the thing that is scanned, not its surroundings."""
+    """Whether this is the scanned object."""
 
     def refined(self, longest_edge_m: float) -> Part:
-        """The same surface of triangles with shorter edges."""
+        """The same surface with no edge longer than ``longest_edge_m``."""
         columns, triangles = subdivided(
             np.concatenate([self.mesh.vertices, self.weights], axis=1), self.mesh.triangles, longest_edge_m
         )
@@ -43,15 +51,15 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays hit; ``rays_per_pixel`` rays that follow one another belong to one pixel.
+    """The first hits of rays; each pixel has ``rays_per_pixel`` consecutive rays.
 
     Attributes:
-        renderer: whose parts are hit.
-        origins, directions: of all rays.
-        ray: the rays that hit something, by index; what follows has one entry for each of them.
-        triangle: of the renderer's.
-        barycentric: share of each of the triangle's corners.
-        distance_m: along the ray.
+        renderer: renderer whose parts the rays hit.
+        origins, directions: of all rays; directions have unit length.
+        ray: index of the ray of each hit.
+        triangle: index of the renderer's triangle of each hit.
+        barycentric: barycentric coordinates of each hit.
+        distance_m: distance along the ray of each hit.
     """
 
     renderer: Renderer
@@ -65,39 +73,41 @@ class Hits:
 
     @property
     def pixels(self) -> int:
-        """How many pixels the rays belong to."""
+        """Number of pixels."""
         return len(self.directions) // self.rays_per_pixel
 
     @property
     def pixel(self) -> Int[np.ndarray, "hits"]:
-        """The pixel of each hit."""
+        """Pixel of each hit."""
         return self.ray // self.rays_per_pixel
 
     @cached_property
     def is_object(self) -> Bool[np.ndarray, "hits"]:
-        """Whether the thing that is scanned is hit."""
+        """Whether the ray hits the scanned object."""
         return self.renderer.is_object[self.triangle]
 
     def positions(self) -> Float[np.ndarray, "hits 3"]:
-        """Places, metres."""
+        """Position of each hit, metres."""
         return self.origins[self.ray] + self.distance_m[:, None] * self.directions[self.ray]
 
     @cached_property
-    def is_behind(self) -> Bool[np.ndarray, "hits"]:
-        """Whether the triangle is seen from behind."""
+    def is_back_face(self) -> Bool[np.ndarray, "hits"]:
+        """Whether the ray hits the back of the triangle."""
         normals = self.renderer.facet_normals[self.triangle]
         return np.einsum("nk,nk->n", normals, self.directions[self.ray]) > 0.0
 
     @cached_property
     def facing_normals(self) -> Float[np.ndarray, "hits 3"]:
-        """Unit normals of the triangles on the side that is seen."""
+        """Unit normals of the triangles on the visible side."""
         normals = self.renderer.facet_normals[self.triangle]
-        return np.where(self.is_behind[:, None], -normals, normals)
+        return np.where(self.is_back_face[:, None], -normals, normals)
 
-    def is_free(self, directions: Float[np.ndarray, "*n 3"], some: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    def is_unoccluded(
+        self, directions: Float[np.ndarray, "*n 3"], some: Int[np.ndarray, "n"]
+    ) -> Bool[np.ndarray, "n"]:
         """Whether rays from some of the hits, one direction each or the same for all, hit nothing."""
         starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
-        return self.renderer.is_free(starts, np.broadcast_to(directions, starts.shape))
+        return self.renderer.is_unoccluded(starts, np.broadcast_to(directions, starts.shape))
 
     def mix(
         self,
@@ -105,9 +115,12 @@ class Hits:
         columns: int,
         factor: Float[np.ndarray, "hits"] | float = 1.0,
     ) -> scipy.sparse.csr_array:
-        """How much of each corner each pixel sees: the mean over its rays, each times ``factor``.
+        """Weight of each point in each pixel: the mean over the pixel's rays, each multiplied by ``factor``.
 
-        ``triangles`` are the renderer's triangles by whatever ``columns`` things lie at their corners.
+        Args:
+            triangles: the renderer's triangles as indices of points.
+            columns: number of points.
+            factor: weight of each hit.
         """
         return scipy.sparse.csr_array(
             (
@@ -118,17 +131,17 @@ class Hits:
         )
 
     def mean(self, values: Float[np.ndarray, "hits"]) -> Float[np.ndarray, "pixels"]:
-        """Mean over each pixel's rays of what is 0 where a ray hits nothing."""
+        """Mean of ``values`` over the rays of each pixel; rays that hit nothing count as 0."""
         return np.bincount(self.pixel, values, minlength=self.pixels) / self.rays_per_pixel
 
 
 class Renderer:
-    """Casts rays at a fixed set of parts; whatever a ray misses is the chamber.
+    """Casts rays at a fixed set of parts; rays that hit nothing see the chamber.
 
     Attributes:
-        materials: names the columns of the weights; the last one is the chamber, before it come the extra ones.
-        vertices, triangles, weights: of all parts, one after the other.
-        is_object: which triangles belong to the thing that is scanned.
+        materials: material of each column of the weights; extra materials and then the chamber come last.
+        vertices, triangles, weights: of all parts, concatenated.
+        is_object: which triangles belong to the scanned object.
     """
 
     def __init__(self, parts: Sequence[Part], chamber: str = "chamber", extra_materials: Sequence[str] = ()) -> None:
@@ -161,12 +174,11 @@ class Renderer:
         intrinsics: PinholeIntrinsics,
         camera_to_world: Float[np.ndarray, "4 4"],
         supersampling: int,
-        lens: LensEffect | None = None,
+        lens: Lens | None = None,
     ) -> tuple[Float[np.ndarray, "h w materials"], Float[np.ndarray, "h w"]]:
-        """Material weights of each pixel (float32, summing to exactly 1) and the object's share of it.
+        """Material weights of each pixel (float32, summing to exactly 1) and the fraction that the object covers.
 
-        A pixel is the mean over ``supersampling`` x ``supersampling`` rays, evenly spaced (a box filter), which a
-        ``lens`` bends.
+        A pixel is the mean over ``supersampling`` x ``supersampling`` evenly spaced rays (a box filter).
         """
         weights = np.empty((intrinsics.h, intrinsics.w, len(self.materials)), np.float32)
         coverage = np.empty((intrinsics.h, intrinsics.w), np.float32)
@@ -180,14 +192,14 @@ class Renderer:
         intrinsics: PinholeIntrinsics,
         camera_to_world: Float[np.ndarray, "4 4"],
         supersampling: int,
-        lens: LensEffect | None = None,
+        lens: Lens | None = None,
     ) -> Iterator[tuple[slice, Hits]]:
-        """What the rays of a camera hit: some lines of the image after the others, to keep the memory small."""
+        """Hits of the rays of a camera, a block of image lines at a time, which bounds the memory."""
         lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
         for first in range(0, intrinsics.h, lines):
             rows = slice(first, min(first + lines, intrinsics.h))
             directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling, lens)
-            # Three columns are too few for a matrix product to pay for its threads.
+            # For three columns einsum is faster than a multithreaded matrix product.
             directions = np.einsum("nk,jk->nj", directions, camera_to_world[:3, :3].astype(np.float32))
             origins = np.broadcast_to(camera_to_world[:3, 3].astype(np.float32), directions.shape)
             yield rows, self.cast(origins, directions, supersampling**2)
@@ -195,10 +207,10 @@ class Renderer:
     def cast(
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
     ) -> Hits:
-        """Where rays first hit a part; directions are of unit length."""
-        hits = self._scene.cast_rays(_ray_tensor(origins, directions))
-        triangle = hits["primitive_ids"].numpy()
-        ray = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
+        """First hits of rays with unit directions."""
+        hits = self._scene.cast_rays(_rays(origins, directions))
+        distance_m = hits["t_hit"].numpy()
+        ray = np.flatnonzero(np.isfinite(distance_m))
         u, v = hits["primitive_uvs"].numpy()[ray].T
         return Hits(
             renderer=self,
@@ -206,34 +218,33 @@ class Renderer:
             directions=directions,
             rays_per_pixel=rays_per_pixel,
             ray=ray,
-            triangle=triangle[ray],
+            triangle=hits["primitive_ids"].numpy()[ray],
             barycentric=np.stack([1.0 - u - v, u, v]),
-            distance_m=hits["t_hit"].numpy()[ray],
+            distance_m=distance_m[ray],
         )
 
-    def is_free(
+    def is_unoccluded(
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
     ) -> Bool[np.ndarray, "rays"]:
         """Whether rays hit nothing."""
-        return ~self._scene.test_occlusions(_ray_tensor(origins, directions)).numpy()
+        return ~self._scene.test_occlusions(_rays(origins, directions)).numpy()
 
     def material_weights(self, hits: Hits) -> Float[np.ndarray, "pixels materials"]:
-        """Share of each material in each pixel, summing to exactly 1."""
+        """Fraction of each material in each pixel, summing to exactly 1."""
         weights = hits.mix(self.triangles, len(self.weights)) @ self.weights
         weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
         return exact_weights(weights)
 
 
-def _ray_tensor(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> o3d.core.Tensor:
-    rays = np.empty((len(directions), 6), np.float32)
-    rays[:, :3], rays[:, 3:] = origins, directions
-    return o3d.core.Tensor.from_numpy(rays)
+def _rays(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> np.ndarray:
+    """Rays as Open3D takes them: origin and direction in one row, single precision."""
+    return np.concatenate([origins, directions], axis=1, dtype=np.float32)
 
 
 def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray, "n materials"]:
     """Round weights to multiples of 1 / `WEIGHT_STEPS` such that each row sums to exactly 1.
 
-    What rounding leaves over goes to the row's largest weight.
+    The rounding error is added to the row's largest weight.
     """
     steps = np.rint(np.clip(weights, 0.0, 1.0) * WEIGHT_STEPS)
     largest = steps.argmax(axis=1)
@@ -243,11 +254,11 @@ def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray
 
 @lru_cache(maxsize=16)
 def _camera_rays(
-    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int, lens: LensEffect | None
+    intrinsics: PinholeIntrinsics, first_line: int, end_line: int, supersampling: int, lens: Lens | None
 ) -> Float[np.ndarray, "rays 3"]:
-    """Directions, in the camera's axes, of the rays through some lines; a pixel's rays follow one another.
+    """Ray directions of some image lines in the camera frame, with the rays of each pixel consecutive.
 
-    Kept from frame to frame, since the camera stands still.
+    They are cached because the camera is stationary.
     """
     offsets = (np.arange(supersampling) + 0.5) / supersampling
     lines, samples = np.arange(first_line, end_line), np.arange(intrinsics.w)

@@ -1,7 +1,7 @@
-"""What a scene is, and reading it from a short YAML file.
+"""The description of a scene, and reading it from a short YAML file.
 
-A scene names the object, materials of its own, the camera, the turntable, the container with its markers, the
-sensor, and the physical effects beyond a matte object under even light that a perfect sensor sees.
+A scene describes the object, its materials, the camera, the turntable, the container with its markers, the sensor,
+and the effects: departures from a matte object, even light and a perfect sensor.
 """
 
 from __future__ import annotations
@@ -9,31 +9,105 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import yaml
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 from hsi_sc_nerf.simulate.effects import read_effects
-from hsi_sc_nerf.simulate.materials import MATERIALS, Material
-from hsi_sc_nerf.simulate.objects import Cylinder, Object, OwnMesh, Sphere
-from hsi_sc_nerf.simulate.own_materials import read_materials
-from hsi_sc_nerf.simulate.reading import between, check_ranges, read_dataclass
+from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 
 SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A camera that stands still and looks at a point on the turntable's axis."""
+class Fruit:
+    """A pear or an apple."""
+
+    shape: Literal["pear", "apple"]
+    height_m: float = between(0.01, 0.5)
+    """Height with the stem."""
+    blush: float = between(0.0, 1.0, default=0.0)
+    """Largest fraction of blush, in [0, 1]."""
+    lenticel_diameter_m: float = between(0.0, 0.02, default=0.0)
+    """Diameter of the lenticels (pale dots on the skin); 0 for none."""
+    bruise_diameter_m: float = between(0.0, 0.1, default=0.0)
+    """Diameter of the bruise; 0 for none."""
+
+
+@dataclass(frozen=True)
+class MaizeEar:
+    """A husked maize ear that stands on its shank."""
+
+    shape: Literal["maize"]
+    height_m: float = between(0.01, 0.5)
+    coloured_kernels: float = between(0.0, 1.0, default=0.0)
+    """Fraction of purple kernels; the fraction of white kernels is the same."""
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere of one material with the area pi d² and the volume pi d³ / 6."""
+
+    shape: Literal["sphere"]
+    height_m: float = between(0.01, 0.5)
+    """Diameter d."""
+    material: str = "matte_white"
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder of one material with the area pi d (d / 2 + h) and the volume pi d² h / 4."""
+
+    shape: Literal["cylinder"]
+    height_m: float = between(0.01, 0.5)
+    diameter_m: float = between(0.01, 0.5)
+    material: str = "matte_grey"
+
+
+@dataclass(frozen=True)
+class OwnMesh:
+    """A closed triangle mesh from a file with one or more materials.
+
+    The fractions of several materials come from ``weight_texture``, from PLY vertex properties ``weight_NAME`` (one
+    for each material), or from vertex colours (red, green and blue are the first, second and third material).
+    """
+
+    shape: Literal["mesh"]
+    mesh_file: Path
+    """PLY, OBJ, glTF or GLB; a path relative to the scene file."""
+    materials: tuple[str, ...]
+    """Names of built-in materials, or of those that the scene file defines."""
+    weight_texture: Path | None = None
+    """Image, mapped by the mesh's UVs, whose channels are the fractions of at most three materials."""
+    height_m: float | None = between(0.01, 0.5, default=None)
+    """Height to which the mesh is scaled; without it, lengths in the file are metres."""
+    up_axis: Literal["by_format", "y", "z"] = "by_format"
+    """Vertical axis of the file; ``by_format`` is y for glTF and GLB, z for PLY and OBJ."""
+
+    def in_folder(self, folder: Path) -> OwnMesh:
+        """The same object with its paths taken relative to ``folder``."""
+        texture = self.weight_texture
+        return replace(
+            self, mesh_file=folder / self.mesh_file, weight_texture=None if texture is None else folder / texture
+        )
+
+
+Object: TypeAlias = Fruit | MaizeEar | Sphere | Cylinder | OwnMesh
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """A stationary camera that looks at a point on the turntable axis."""
 
     elevation_deg: float = between(0.0, 85.0)
     distance_m: float = between(0.05, 10.0)
-    """From the camera to the point that it looks at."""
+    """Distance from the camera to that point."""
     aim_height_m: float = between(-1.0, 1.0)
     """Height of that point above the disc."""
     field_of_view_deg: float = between(1.0, 120.0, default=31.0)
@@ -43,27 +117,27 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Turntable:
-    """The disc and how it turns."""
+class TurntableSettings:
+    """The disc and its rotation."""
 
     disc_diameter_m: float = between(0.01, 2.0)
     frames: int = between(1, 3600, default=36)
     """Frames in one full turn, evenly spaced."""
     direction: Literal["ccw", "cw"] = "ccw"
-    """Seen from above."""
+    """Direction of rotation seen from above."""
 
 
 @dataclass(frozen=True)
-class Container:
-    """The cylinder that the object stands on."""
+class ContainerSettings:
+    """The cylinder on which the object stands."""
 
     diameter_m: float = between(0.01, 1.0, default=paper.CONTAINER_DIAMETER_M)
     height_m: float = between(0.005, 1.0, default=paper.CONTAINER_HEIGHT_M)
 
 
 @dataclass(frozen=True)
-class Markers:
-    """The ArUco markers, all of one size: some around the container, some on the disc."""
+class MarkerSettings:
+    """ArUco markers of one size around the container and on the disc."""
 
     side_m: float = between(0.002, 0.5)
     """Side of the black square."""
@@ -73,44 +147,52 @@ class Markers:
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """A perfect push-broom sensor: counts are linear in light, without noise."""
+class SensorSettings:
+    """A perfect push-broom sensor: counts are linear in light and free of noise."""
 
     bands: int = between(3, 2048, default=paper.BANDS)
     bit_depth: int = between(8, 16, default=12)
     lamp_temperature_k: float = between(1500.0, 10000.0, default=3000.0)
     white_level: float = between(0.05, 1.0, default=0.82)
-    """Counts of the white tarp in its brightest band, as a share of the largest count."""
+    """Counts of the white tarp in its brightest band, as a fraction of the largest count."""
     dark_level: int = between(0, 1000, default=120)
     """Counts without light."""
     full_well_electrons: float = between(100.0, 1e7, default=30_000.0)
-    """Electrons at the largest count, for the effects of noise."""
+    """Electrons at the largest count; used by the noise effects."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that a session is made from; the same scene with the same seed gives the same bytes."""
+    """The description of a simulated session; the same scene and seed give the same bytes."""
 
     name: str
     object: Object
-    camera: Camera
-    turntable: Turntable
-    markers: Markers
+    camera: CameraSettings
+    turntable: TurntableSettings
+    markers: MarkerSettings
     materials: dict[str, Material] = dataclasses.field(default_factory=dict)
-    """What the scene defines itself; a built-in material of the same name is replaced."""
-    container: Container = Container()
-    sensor: Sensor = Sensor()
+    """Materials of the scene; they replace built-in materials of the same name."""
+    container: ContainerSettings = ContainerSettings()
+    sensor: SensorSettings = SensorSettings()
     effects: tuple[Any, ...] = ()
-    """Physical effects beyond a matte object under even light that a perfect sensor sees (`effects.EFFECTS`)."""
+    """Effects from `effects.EFFECTS`, in the order in which they act."""
     seed: int = between(0, 2**31 - 1, default=0)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
-    """Read a shipped scene by its name, or a scene file.
+    """Read a shipped scene by name, or a scene file.
+
+    Args:
+        name_or_path: one of `SHIPPED_SCENES`, or the path of a YAML file.
 
     Raises:
         InputError: no such scene or file; not YAML; an unknown or missing key; a value of the wrong type or out
             of range; an effect that does not exist.
+
+    Example:
+        >>> scene = override(load_scene("pear"), frames=60, effects=["photon_noise", "{lamp: {fraction: 0.3}}"])
+        >>> scene.turntable.frames
+        60
     """
     if str(name_or_path) in SHIPPED_SCENES:
         with resources.as_file(resources.files(__package__).joinpath("scenes")) as folder:
@@ -128,9 +210,13 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 
 def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> Scene:
-    """Make a scene of YAML text; ``source`` names it in errors and ``name`` is used where the text has no name.
+    """Parse the YAML text of a scene.
 
-    Paths in the text are relative to ``folder``.
+    Args:
+        text: YAML.
+        source: name of the text in error messages.
+        name: name of the scene if the text has none.
+        folder: folder to which paths in the text are relative.
 
     Raises:
         InputError: see `load_scene`.
@@ -148,8 +234,8 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
     check_ranges(scene, source, "")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", scene.name):
         raise InputError(
-            f"{source}: name is {scene.name!r}, but must be of letters, digits, '_', '.' and '-', for captures are "
-            "named after it."
+            f"{source}: name is {scene.name!r}, but must consist of letters, digits, '_', '.' and '-', because it "
+            "names the captures."
         )
     _check_materials(scene, source)
     if isinstance(scene.object, OwnMesh):
@@ -158,7 +244,7 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
 
 
 def _check_materials(scene: Scene, source: str) -> None:
-    """Every material that is named exists, and every one that is defined is something's."""
+    """Check that every named material exists and every defined material is used."""
     named: tuple[str, ...] = ()
     if isinstance(scene.object, OwnMesh):
         named = scene.object.materials
@@ -189,9 +275,15 @@ def override(
     seed: int | None = None,
     effects: Sequence[str] | None = None,
 ) -> Scene:
-    """The scene with the given values in place of its own; ``None`` keeps the scene's.
+    """Replace values of a scene; ``None`` keeps a value.
 
-    Effects are given as in a scene file, each a text: ``photon_noise`` or ``{read_noise: {electrons: 40}}``.
+    Args:
+        scene: the scene.
+        frames: number of frames in a full turn.
+        size_px: side of the images in pixels.
+        bands: number of spectral bands.
+        seed: seed of all random numbers.
+        effects: effects as YAML texts: ``photon_noise`` or ``{read_noise: {electrons: 40}}``.
 
     Raises:
         InputError: a value is out of range.

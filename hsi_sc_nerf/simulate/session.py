@@ -1,4 +1,4 @@
-"""Writes a simulated turntable session as a SPECIM IQ would leave it, with the truth beside the captures."""
+"""Writes a simulated session in the layout of a SPECIM IQ, with the truth beside the captures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
-from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
-from hsi_sc_nerf.simulate.frames import Capture, Simulation
+from hsi_sc_nerf.simulate.effects.optics import ImageRotation
+from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_REFERENCE = "white_reference"
 WORKERS = 2
-"""Frames that are made at the same time."""
+"""Number of frames that are simulated at the same time."""
 SENSOR = "simulated SPECIM IQ"
 METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
 <properties xmlns="http://www.specim.fi/iq">
@@ -37,14 +37,26 @@ METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = True) -> Path:
-    """Render the scene's turntable session into ``session_dir``; returns that path.
+    """Simulate a turntable session.
 
-    The session is built in a hidden sibling folder and moved into place at the end, so a stopped run leaves no half
-    session; the same command goes on with the frames that are missing. An earlier simulated session at the same
-    place is replaced.
+    The session is written to a hidden sibling folder and moved into place at the end. After an interrupted run the
+    same call continues with the missing frames.
+
+    Args:
+        scene: the scene.
+        session_dir: folder to write; an earlier simulated session there is replaced.
+        progress: whether to show a progress bar.
+
+    Returns:
+        ``session_dir``.
 
     Raises:
         InputError: ``session_dir`` holds something else; the markers do not fit; the disk is full.
+
+    Example:
+        >>> session = simulate_session(load_scene("pear"), "pear-session")
+        >>> load_truth(session).captures[0]
+        'pear_000'
     """
     session_dir = Path(session_dir)
     _check_free(session_dir)
@@ -67,16 +79,16 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
 
 
 def _stamp(simulation: Simulation) -> str:
-    """Tells sessions apart, so that a run never goes on with frames of another object or other effects."""
+    """Hash of scene, mesh and version; a run continues only with frames of the same hash."""
     stamp = hashlib.sha256(f"{__version__} {simulation.scene!r}".encode())
-    # The scene has the path of a mesh of one's own, not what is in the file.
+    # The scene holds only the path of an own mesh.
     for array in (simulation.object_part.mesh.vertices, simulation.object_part.weights):
         stamp.update(np.ascontiguousarray(array).tobytes())
     return stamp.hexdigest()[:12]
 
 
 def _check_free(session_dir: Path) -> None:
-    """A new or empty folder, or an earlier simulated session; never anything that was measured."""
+    """Check that the folder is new, empty, or an earlier simulated session."""
     if not session_dir.exists() and not session_dir.is_symlink():
         return
     if not session_dir.is_dir() or session_dir.is_symlink():
@@ -111,7 +123,7 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     def write_frame(number: int) -> None:
         capture, frame = simulation.captures[number], simulation.frame(number)
         _write_capture(session_dir, capture, frame, simulation)
-        # Last, so that a frame whose truth is there is whole.
+        # Written last: a frame with truth is complete.
         truth.write_pixels(session_dir, capture, frame)
 
     captures = simulation.captures
@@ -129,7 +141,7 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
 
 
 def _session_values(simulation: Simulation) -> dict[str, object]:
-    """What the instrument can't tell, as a user would write it down."""
+    """Content of ``session.json``: what a user knows and the instrument does not."""
     scene, plan = simulation.scene, simulation.plan
     quarter_turns = sum(effect.quarter_turns for effect in scene.effects if isinstance(effect, ImageRotation))
     return {
@@ -145,7 +157,7 @@ def _session_values(simulation: Simulation) -> dict[str, object]:
     }
 
 
-def _write_capture(session_dir: Path, name: str, capture: Capture, simulation: Simulation) -> None:
+def _write_capture(session_dir: Path, name: str, capture: SimulatedCapture, simulation: Simulation) -> None:
     folder = session_dir / name / "capture"
     for prefix, cube in (("", capture.counts), ("DARKREF_", capture.dark)):
         write_cube(

@@ -1,4 +1,4 @@
-"""The surface of all parts as points that light can be computed at, and what each of them sees around it."""
+"""Points on the surface of all parts: occlusion, form factors and diffusion of light."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
-from hsi_sc_nerf.simulate.diffusion import diffused
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
 CREASE_DEG = 40.0
-"""Facets that meet at more than this have points of their own along the edge: light changes at once there."""
+"""Angle between facets above which they have separate points along their edge, where light is discontinuous."""
 POINTS_AT_ONCE = 4096
-COVER_DISTANCE_M, COVER_SHARE = 0.001, 0.6
-"""A point is covered if this share of what it sees is seen from behind or, on the object's support, is so near."""
+COVER_DISTANCE_M, COVER_FRACTION = 0.001, 0.6
+"""A point is covered if this fraction of its rays hits a back face or, on the support, hits within the distance."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+COLUMNS_AT_ONCE = 8
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the points of a surface see in the half space above them, weighted by the cosine to the normal.
+    """What is visible from the points of a surface, weighted by the cosine to the normal.
 
     Attributes:
-        free: share of directions in which nothing but the chamber is seen, in [0, 1].
-        seen: share of each point of the surface in what each point sees; what is seen from behind is left out.
+        chamber_visibility: fraction of directions in which nothing occludes the chamber, in [0, 1].
+        form_factors: fraction of each point of the surface (column) in the view of each point (row), without back
+            faces.
     """
 
-    free: Float[np.ndarray, "p"]
-    seen: scipy.sparse.csr_array
+    chamber_visibility: Float[np.ndarray, "p"]
+    form_factors: scipy.sparse.csr_array
 
 
 class Surface:
@@ -39,8 +41,8 @@ class Surface:
 
     Attributes:
         renderer: whose parts these are.
-        vertex: vertex of the renderer at which each point lies.
-        triangles: the renderer's triangles, by points.
+        vertex: the renderer's vertex of each point.
+        triangles: the renderer's triangles as indices of points.
     """
 
     def __init__(self, renderer: Renderer) -> None:
@@ -50,33 +52,33 @@ class Surface:
 
     @cached_property
     def positions(self) -> Float[np.ndarray, "p 3"]:
-        """Place of each point, metres."""
+        """Position of each point, metres."""
         return self.renderer.vertices[self.vertex]
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "p 3"]:
-        """Unit normal of each point, outwards: the mean of its facets, weighted by area."""
+        """Outward unit normal of each point: the area-weighted mean of its facets' normals."""
         doubled = self._doubled_normals()
         total = self._over_corners(np.repeat(doubled, 3, axis=0))
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "p"]:
-        """Each point's share of the surface: a third of each of its triangles."""
+        """Area of each point: a third of the area of each of its triangles."""
         thirds = np.linalg.norm(self._doubled_normals(), axis=1) / 6.0
         return self._over_corners(np.repeat(thirds, 3)[:, None])[:, 0]
 
     @cached_property
     def is_object(self) -> Bool[np.ndarray, "p"]:
-        """Which points lie on the thing that is scanned."""
+        """Which points belong to the scanned object."""
         is_object = np.zeros(len(self.vertex), bool)
         is_object[self.triangles[self.renderer.is_object]] = True
         return is_object
 
     def spread_over_object(self, values: Float[np.ndarray, "p c"], width_m: float) -> Float[np.ndarray, "p c"]:
-        """Values of the object's points (of all others 0), spread over its surface (`diffusion.diffused`).
+        """Values of the object's points, diffused over its surface (`diffused`); 0 at all other points.
 
-        Points of one vertex get the same value; each column's total over the object is kept.
+        Points of one vertex get the same value. The total of each column over the object stays the same.
         """
         points = np.flatnonzero(self.is_object)
         vertices, vertex = np.unique(self.vertex[points], return_inverse=True)
@@ -91,9 +93,9 @@ class Surface:
         return spread
 
     def surroundings(self, directions: int) -> Surroundings:
-        """What each point sees along so many directions; computed once."""
+        """What is visible from each point, sampled in so many directions; cached."""
         if directions not in self._surroundings:
-            self._surroundings[directions] = self._look_around(directions)
+            self._surroundings[directions] = self._sample_surroundings(directions)
         return self._surroundings[directions]
 
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
@@ -104,10 +106,10 @@ class Surface:
         point, points = self.triangles.ravel(), len(self.vertex)
         return np.stack([np.bincount(point, column, minlength=points) for column in of_corner.T], axis=-1)
 
-    def _look_around(self, directions: int) -> Surroundings:
+    def _sample_surroundings(self, directions: int) -> Surroundings:
         points = len(self.vertex)
-        free, covered, seen = np.empty(points), np.empty(points, bool), []
-        # Turned from point to point, so that neighbours do not share their errors.
+        visibility, covered, factors = np.empty(points), np.empty(points, bool), []
+        # Rotated from point to point, so that errors of neighbours are independent.
         turn = GOLDEN_ANGLE * np.arange(points)
         for first in range(0, points, POINTS_AT_ONCE):
             some = slice(first, min(first + POINTS_AT_ONCE, points))
@@ -118,19 +120,21 @@ class Surface:
             )
             hits = self.renderer.cast(start, along, directions)
             count = some.stop - some.start
-            free[some] = 1.0 - np.bincount(hits.pixel, minlength=count) / directions
+            visibility[some] = 1.0 - np.bincount(hits.pixel, minlength=count) / directions
             near = (hits.distance_m < COVER_DISTANCE_M) & ~self.is_object[some][hits.pixel]
             covered[some] = (
-                np.bincount(hits.pixel, hits.is_behind | near, minlength=count) >= COVER_SHARE * directions
+                np.bincount(hits.pixel, hits.is_back_face | near, minlength=count) >= COVER_FRACTION * directions
             )
-            seen.append(hits.mix(self.triangles, points, (~hits.is_behind).astype(np.float32)))
+            factors.append(hits.mix(self.triangles, points, (~hits.is_back_face).astype(np.float32)))
         uncover = self._from_uncovered_neighbours(covered)
-        return Surroundings(uncover @ free, scipy.sparse.csr_array(uncover @ scipy.sparse.vstack(seen, format="csr")))
+        return Surroundings(
+            uncover @ visibility, scipy.sparse.csr_array(uncover @ scipy.sparse.vstack(factors, format="csr"))
+        )
 
     def _from_uncovered_neighbours(self, covered: Bool[np.ndarray, "p"]) -> scipy.sparse.csr_array:
-        """Gives a covered point the mean of its uncovered neighbours.
+        """Matrix that replaces the value of a covered point by the mean of its uncovered neighbours.
 
-        Else the light next to where one part stands on another would be mixed with the dark between the two.
+        Otherwise the darkness between two parts in contact would be interpolated into the light beside the contact.
         """
         start, end = self.triangles.ravel(), np.roll(self.triangles, -1, axis=1).ravel()
         row, column = np.concatenate([start, end]), np.concatenate([end, start])
@@ -147,14 +151,15 @@ class Surface:
 def split_at_creases(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], crease_deg: float
 ) -> tuple[Int[np.ndarray, "t 3"], Int[np.ndarray, "p"]]:
-    """Points for the vertices, several where facets meet at more than ``crease_deg``.
+    """Split vertices into several points where facets meet at more than ``crease_deg``.
 
-    Returns the triangles by points, and the vertex of each point.
+    Returns:
+        The triangles as indices of points, and the vertex of each point.
     """
     a, b, c = (vertices[corner] for corner in triangles.T)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    # Corner 3 t + k is where edge k of triangle t starts. The two triangles of an edge come together by sorting.
+    # Corner 3 t + k is the start of edge k of triangle t. Sorting by edge pairs the two triangles of each edge.
     corner = np.arange(triangles.size)
     following = corner - corner % 3 + (corner + 1) % 3
     start, end = triangles.ravel(), triangles.ravel()[following]
@@ -176,10 +181,7 @@ def split_at_creases(
 
 
 def cosine_directions(directions: int, turn: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p directions 3"]:
-    """Directions about +z, each standing for the same share of the cosine-weighted half space (Malley's method).
-
-    They lie above the points of a Fibonacci spiral on the unit disc, turned by ``turn`` (radians).
-    """
+    """Cosine-distributed directions about +z (Malley's method on a Fibonacci spiral, rotated by ``turn`` radians)."""
     index = np.arange(directions) + 0.5
     radius = np.sqrt(index / directions)
     azimuth = GOLDEN_ANGLE * index + turn[:, None]
@@ -188,8 +190,54 @@ def cosine_directions(directions: int, turn: Float[np.ndarray, "p"]) -> Float[np
 
 
 def _frames(normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
-    """Rows: two tangents and the normal."""
+    """Tangent frames: rows are two tangents and the normal."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(helper, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-30)
     return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
+
+
+def diffused(
+    vertices: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    values: Float[np.ndarray, "v c"],
+    width_m: float,
+) -> Float[np.ndarray, "v c"]:
+    """Values at the vertices after diffusion over the surface.
+
+    Solves (1 - w² / 2 Laplacian) u = values with linear finite elements: the steady state of diffusion with
+    absorption. On a flat surface a point spreads to a spot of standard deviation w = ``width_m``. The total of each
+    column over the surface stays the same, and values stay within the range of their column.
+    """
+    laplacian, areas_m2 = cotangent_laplacian(vertices, triangles)
+    # Vertices without triangles keep their value.
+    areas_m2 = np.where(areas_m2 > 0.0, areas_m2, areas_m2.mean())
+    matrix = scipy.sparse.diags_array(areas_m2) + 0.5 * width_m**2 * laplacian
+    factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    spread = np.zeros_like(values)
+    used = np.flatnonzero(values.any(axis=0))
+    for first in range(0, len(used), COLUMNS_AT_ONCE):
+        columns = used[first : first + COLUMNS_AT_ONCE]
+        spread[:, columns] = factors.solve(areas_m2[:, None] * values[:, columns].astype(float))
+    return spread
+
+
+def cotangent_laplacian(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[scipy.sparse.csr_array, Float[np.ndarray, "v"]]:
+    """Positive semidefinite stiffness matrix of linear finite elements, and the area of each vertex (m²).
+
+    Negative cotangents of obtuse triangles are set to 0, which keeps diffused values within their range.
+    """
+    size = len(vertices)
+    matrix = scipy.sparse.csr_array((size, size))
+    areas_m2 = np.zeros(size)
+    for k in range(3):
+        apex, start, end = (triangles[:, (k + i) % 3] for i in range(3))
+        u, v = vertices[start] - vertices[apex], vertices[end] - vertices[apex]
+        doubled = np.linalg.norm(np.cross(u, v), axis=1)
+        half_cotangent = 0.5 * np.maximum(np.einsum("nk,nk->n", u, v), 0.0) / np.maximum(doubled, 1e-30)
+        matrix += scipy.sparse.csr_array((half_cotangent, (start, end)), shape=(size, size))
+        areas_m2 += np.bincount(apex, doubled / 6.0, minlength=size)
+    matrix = matrix + matrix.T
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(matrix.sum(axis=1)) - matrix), areas_m2

@@ -1,7 +1,7 @@
-"""What carries the object: a disc with ArUco markers, and on it a container with more of them around its side.
+"""Disc and container that carry the object, and the ArUco markers on them.
 
-Each marker on the container is a flat plaque that stands off the curved wall, and each on the disc lies flat in
-z = 0, so that the known corner positions are exact.
+Each marker on the container is a flat plaque in front of the curved wall, and each marker on the disc lies flat in
+z = 0, so the known corner positions are exact.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
-from hsi_sc_nerf.simulate.scene import Container, Markers, Turntable
+from hsi_sc_nerf.simulate.scene import ContainerSettings, MarkerSettings, TurntableSettings
 
 PLAQUE_STANDOFF_M = 0.0005
 PLAQUE_THICKNESS_M = 0.0003
 DISC_THICKNESS_M = 0.006
 PRINT_HEIGHT_M = 0.0003
-"""How far the disc lies below the markers printed on it."""
+"""Distance of the disc below the markers that are printed on it."""
 QUIET_ZONE_MODULES = 0.7
-"""White paper around a marker, in modules (the disc and the container around it are bright as well)."""
+"""Width of the white paper around a marker in modules; disc and container are bright as well."""
 
 # A marker's corners in its own plane (u right, v up), in OpenCV's order: upper left, then clockwise.
 UNIT_CORNERS = np.array([(-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)])
@@ -31,11 +31,11 @@ MarkerFrame = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre, unit u, unit 
 
 
 def marker_frames(
-    markers: Markers, container: Container, turntable: Turntable
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
 ) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
-    """Centre, right and up of each marker on the container and on the disc, by marker number, object frame.
+    """Centre, right and up vector of each marker on the container and on the disc, by marker number, object frame.
 
-    The container has the numbers from 0, the disc goes on after them.
+    The markers of the container have the first numbers.
 
     Raises:
         InputError: the markers do not fit on the container or on the disc.
@@ -57,7 +57,7 @@ def marker_frames(
         centre = apothem * outwards + np.array([0.0, 0.0, container.height_m / 2.0])
         on_container[number] = (centre, sideways, np.array([0.0, 0.0, 1.0]))
 
-    # As far in as the plaques and the neighbours allow: the inner edges touch no plaque's corner or each other.
+    # The smallest radius at which the inner edges touch neither a plaque's corner nor each other.
     plaque_corner = np.hypot(apothem, paper / 2.0)
     neighbours = paper / 2.0 / np.tan(np.pi / max(markers.on_disc, 3))
     inner_edge = max(plaque_corner, neighbours) + 0.001
@@ -71,19 +71,24 @@ def marker_frames(
         azimuth = 2.0 * np.pi * (number + 0.5) / markers.on_disc
         outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        # Read from outside, like a text that lies on a table before its reader.
+        # Upright for a reader outside of the disc.
         on_disc[markers.on_container + number] = ((inner_edge + paper / 2.0) * outwards, sideways, -outwards)
     return on_container, on_disc
 
 
-def marker_layout(markers: Markers, container: Container, turntable: Turntable) -> MarkerLayout:
+def marker_layout(
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
+) -> MarkerLayout:
     """The four corners of each marker's black square in OpenCV's order, metres, object frame."""
     on_container, on_disc = marker_frames(markers, container, turntable)
-    return {number: _corners(frame, markers.side_m) for number, frame in (on_container | on_disc).items()}
+    return {
+        number: _to_object_frame(UNIT_CORNERS, frame, markers.side_m)
+        for number, frame in (on_container | on_disc).items()
+    }
 
 
-def marker_mesh(frame: MarkerFrame, number: int, markers: Markers) -> tuple[Mesh, np.ndarray]:
-    """A marker as flat squares, one a module, in its frame of white paper; and which vertices are ink."""
+def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tuple[Mesh, np.ndarray]:
+    """A marker and its white paper as flat squares, one for each module; and which vertices are ink."""
     dictionary = aruco_dictionary(markers)
     modules = dictionary.markerSize + 2
     image = cv2.aruco.generateImageMarker(dictionary, number, modules, borderBits=1)
@@ -99,48 +104,44 @@ def marker_mesh(frame: MarkerFrame, number: int, markers: Markers) -> tuple[Mesh
     return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
 
 
-def plaque_back(frame: MarkerFrame, markers: Markers) -> Mesh:
-    """The back of a plaque, so that ink is not seen through the paper."""
+def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
+    """The back of a plaque, which makes the paper opaque."""
     centre, u, v = frame
     behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
     corners = _to_object_frame(UNIT_CORNERS * paper_side_in_markers(markers), behind, markers.side_m)
     return quads(corners[None])
 
 
-def container_mesh(container: Container, step_m: float | None = None) -> Mesh:
-    """The container with its flat lid, standing on the disc; ``step_m`` as in `mesh.cylinder`."""
-    return cylinder(container.diameter_m, container.height_m, step_m=step_m)
+def container_mesh(container: ContainerSettings, spacing_m: float | None = None) -> Mesh:
+    """The container with its flat lid on the disc; ``spacing_m`` as in `mesh.cylinder`."""
+    return cylinder(container.diameter_m, container.height_m, spacing_m=spacing_m)
 
 
-def disc_mesh(turntable: Turntable, step_m: float | None = None) -> Mesh:
-    """The turntable's disc, just below the markers that lie in z = 0; ``step_m`` as in `mesh.cylinder`."""
-    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, step_m=step_m).moved(
+def disc_mesh(turntable: TurntableSettings, spacing_m: float | None = None) -> Mesh:
+    """The turntable's disc just below z = 0; ``spacing_m`` as in `mesh.cylinder`."""
+    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, spacing_m=spacing_m).moved(
         np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M])
     )
 
 
-def aruco_dictionary(markers: Markers) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of the given name.
+def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of the markers.
 
     Raises:
         InputError: OpenCV has no such dictionary, or it has too few markers.
     """
     name = markers.dictionary
     if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
-        raise InputError(f"markers.dictionary {name!r} is no ArUco dictionary; use a name like DICT_5X5_50.")
+        raise InputError(f"markers.dictionary {name!r} is not an ArUco dictionary; use a name like DICT_5X5_50.")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     if len(dictionary.bytesList) < markers.on_container + markers.on_disc:
         raise InputError(f"{name} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary.")
     return dictionary
 
 
-def paper_side_in_markers(markers: Markers) -> float:
-    """Side of a marker's paper over the side of its black square."""
+def paper_side_in_markers(markers: MarkerSettings) -> float:
+    """Ratio of the side of a marker's paper to that of its black square."""
     return 1.0 + 2.0 * QUIET_ZONE_MODULES / (aruco_dictionary(markers).markerSize + 2)
-
-
-def _corners(frame: MarkerFrame, side_m: float) -> Float[np.ndarray, "4 3"]:
-    return _to_object_frame(UNIT_CORNERS, frame, side_m)
 
 
 def _to_object_frame(in_plane: Float[np.ndarray, "*n 2"], frame: MarkerFrame, side_m: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The truth beside a simulated session: written once, read back exactly (layout in docs/architecture.md)."""
+"""The truth of a simulated session: writing and reading it (layout in docs/architecture.md)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.frames import Frame, Simulation
+from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
@@ -25,7 +25,7 @@ from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known about a simulated session; big arrays stay on disk until asked for."""
+    """The truth of a simulated session; pixel data are read on demand."""
 
     session_dir: Path
     object: str
@@ -35,7 +35,7 @@ class Truth:
     camera_to_world: Float[np.ndarray, "n 4 4"]
     """OpenGL axes, object frame, metres."""
     marker_layout: MarkerLayout
-    """Four corners of each marker, metres, object frame, in OpenCV's order."""
+    """Four corners of each marker in OpenCV's order, metres, object frame."""
     wavelengths_nm: Float[np.ndarray, "bands"]
     materials: tuple[str, ...]
     endmembers: Float[np.ndarray, "materials bands"]
@@ -43,27 +43,27 @@ class Truth:
     area_m2: float
     volume_m3: float
     effects: dict[str, dict[str, Any]]
-    """Strengths of each effect that was on, by its name."""
+    """Settings of each effect of the session, by name."""
     distortion: tuple[float, float, float, float]
-    """k1, k2, p1, p2 of OpenCV's model; all 0 for a pinhole camera."""
+    """k1, k2, p1, p2 of OpenCV's model; 0 for a pinhole camera."""
 
     @property
     def mesh_path(self) -> Path:
-        """The object alone, PLY, object frame, metres."""
+        """PLY file of the object, object frame, metres."""
         return self.session_dir / "truth" / "mesh.ply"
 
     def mesh(self) -> Mesh:
-        """The object alone, object frame, metres."""
+        """The object's mesh, object frame, metres."""
         read = PlyData.read(str(self.mesh_path))
         vertices = np.stack([np.asarray(read["vertex"][axis], float) for axis in "xyz"], axis=-1)
         return Mesh(vertices, np.stack(read["face"]["vertex_indices"]).astype(np.int32))
 
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
-        """Share of each material in each pixel, summing to 1."""
+        """Fraction of each material in each pixel, summing to 1."""
         return self._pixels(capture, "material_weights").astype(np.float32)
 
     def object_coverage(self, capture: str) -> Float[np.ndarray, "lines samples"]:
-        """Share of each pixel that the object covers, in [0, 1]."""
+        """Fraction of each pixel that the object covers, in [0, 1]."""
         return self._pixels(capture, "object").astype(np.float32)
 
     def reflectance(self, capture: str) -> Float[np.ndarray, "lines samples bands"]:
@@ -71,7 +71,7 @@ class Truth:
         return self.material_weights(capture) @ self.endmembers.astype(np.float32)
 
     def light(self, capture: str) -> Light:
-        """The noise-free light on the sensor, lying as the counts do; `Light.radiance` makes an image of it."""
+        """Noise-free light on the sensor, rotated as the counts are; `Light.radiance` gives an image."""
         with np.load(pixels_path(self.session_dir, capture)) as arrays:
             factors = [name for name in arrays.files if name.startswith("illumination_")]
             weights = arrays["light_weights" if "light_weights" in arrays.files else "material_weights"]
@@ -82,9 +82,9 @@ class Truth:
             )
 
     def detector_maps(self) -> dict[str, np.ndarray]:
-        """What the detector's pixels (samples, bands) have in common in all captures, by name; empty without any.
+        """Maps (samples, bands) of the detector by name: ``dark_offset`` (counts), ``dead`` and ``hot`` (boolean).
 
-        ``dark_offset`` (counts), ``dead`` and ``hot`` (which pixels are).
+        Maps of effects that the scene does not name are missing.
         """
         path = detector_path(self.session_dir)
         if not path.exists():
@@ -101,7 +101,12 @@ def load_truth(session_dir: str | Path) -> Truth:
     """Read the truth of a simulated session.
 
     Raises:
-        InputError: the folder holds no truth, or one that cannot be read.
+        InputError: the folder holds no truth, or its truth cannot be read.
+
+    Example:
+        >>> truth = load_truth("pear-session")
+        >>> truth.reflectance(truth.captures[0]).shape
+        (128, 128, 204)
     """
     session_dir = Path(session_dir)
     path = session_dir / "truth" / "truth.json"
@@ -132,7 +137,7 @@ def load_truth(session_dir: str | Path) -> Truth:
 
 
 def write_truth(session_dir: Path, simulation: Simulation) -> None:
-    """Write everything but the pixels (`write_pixels` adds those, a frame at a time)."""
+    """Write the truth except the pixels, which `write_pixels` adds frame by frame."""
     scene, mesh = simulation.scene, simulation.object_part.mesh
     folder = session_dir / "truth"
     folder.mkdir(parents=True, exist_ok=True)
@@ -167,11 +172,11 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         np.savez_compressed(detector_path(session_dir), **maps)
 
 
-def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
-    """Write what each pixel of one frame sees, whole or not at all.
+def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None:
+    """Write the pixels of one frame atomically.
 
-    Weights are exact, being multiples of 1 / 2048 in float16. The light is written only where it is something else
-    than the materials in the weights' shares.
+    Weights are multiples of 1 / 2048 and exact in float16. The light is written only if it differs from the product
+    of material weights and endmembers.
     """
     path = pixels_path(session_dir, capture)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,17 +195,17 @@ def write_pixels(session_dir: Path, capture: str, frame: Frame) -> None:
 
 
 def detector_path(session_dir: Path) -> Path:
-    """Where the detector's maps lie."""
+    """Path of the detector's maps."""
     return session_dir / "truth" / "detector.npz"
 
 
 def pixels_path(session_dir: Path, capture: str) -> Path:
-    """Where a frame's pixels lie."""
+    """Path of a frame's pixels."""
     return session_dir / "truth" / "pixels" / f"{capture}.npz"
 
 
 def write_mesh(path: Path, part: Part) -> None:
-    """Write a part as binary PLY: vertices, and a property ``weight_NAME`` a material, as own meshes have them."""
+    """Write a part as binary PLY with one vertex property ``weight_NAME`` for each material."""
     names = ["x", "y", "z", *(f"weight_{name}" for name in part.materials)]
     vertices = np.zeros(len(part.mesh.vertices), [(name, "f8" if name in "xyz" else "f4") for name in names])
     for name, column in zip(names, np.column_stack([part.mesh.vertices, part.weights]).T, strict=True):

@@ -1,1 +1,1 @@
-"""What `ns-viewer`, and the viewer of a training run, show of spectra."""
+"""Spectral controls and images for nerfstudio's viewer."""

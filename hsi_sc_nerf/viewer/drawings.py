@@ -1,10 +1,11 @@
-"""Small drawings for the viewer's panel: a plot of spectra, and a colour bar; as PNG in the text of a web page."""
+"""Plots, colour bars and Markdown for the viewer's control panel."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -14,12 +15,14 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from viser import GuiMarkdownHandle, ViserServer
 
 WIDTH_PX = 240
-"""Width that the viewer shows pictures at."""
-_DPI = 3 * 96  # three dots to a pixel of the page: sharp on screens with many
+"""Width of images in the viewer's panel."""
+_DPI = 3 * 96  # three dots a pixel, sharp on high-resolution screens
 _STYLE: Any = {"font.size": 7, "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False}
-# Okabe and Ito's blue and vermilion, which colour-blind readers tell apart.
+# Blue and vermilion of Okabe and Ito, which colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00")
 
 
@@ -51,7 +54,7 @@ def colour_bar(drawn_range: tuple[float, float], colours: str, label: str) -> by
 
 
 def inline_image(png: bytes, text: str) -> str:
-    """Markdown that shows a picture, or ``text`` where pictures are not shown."""
+    """Markdown of an image with the alternative text ``text``."""
     return f"![{text}](data:image/png;base64,{base64.b64encode(png).decode()})"
 
 
@@ -65,3 +68,30 @@ def _png(figure: Figure) -> bytes:
     memory = io.BytesIO()
     figure.savefig(memory, format="png")
     return memory.getvalue()
+
+
+class ViewerMarkdown(ViewerElement[str]):
+    """Markdown in the control panel.
+
+    Args:
+        first: gives the initial content; called when a viewer shows the panel.
+    """
+
+    gui_handle: GuiMarkdownHandle | None  # type: ignore[assignment]
+
+    def __init__(self, first: Callable[[], str] = str) -> None:
+        super().__init__(name="")
+        self.first = first
+
+    def show(self, content: str) -> None:
+        """Replace the content; the element must be in a panel."""
+        assert self.gui_handle is not None
+        self.gui_handle.content = content
+
+    def install(self, viser_server: ViserServer) -> None:
+        """Add the element to the panel."""
+        self._create_gui_handle(viser_server)
+
+    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+        # An image root avoids one warning for each image.
+        self.gui_handle = viser_server.gui.add_markdown(self.first(), image_root=Path())

@@ -1,16 +1,18 @@
-"""The controls of the spectral viewer and the pictures that they ask for."""
+"""The controls of the spectral viewer and the images that they select."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.viewer.viewer_elements import (
     ViewerCheckbox,
     ViewerClick,
@@ -30,9 +32,7 @@ from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
-from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
-from hsi_sc_nerf.viewer.picking import PickedPoint, pick
+from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
@@ -44,34 +44,41 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 Outputs = dict[str, Tensor]
-
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
 
 
 def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
-    """Add the panel to the viewer of a pipeline, whose renderings of a viewer's camera then follow its controls.
+    """Add the spectral controls to a pipeline, and their images to what its model renders for a viewer.
 
-    nerfstudio's viewer finds the controls as an attribute of the pipeline and renders by ``get_outputs_for_camera``
-    of the model.
+    Args:
+        pipeline: pipeline whose model is a `SpectralModel`. It gets the attribute ``spectral_panel``, in
+            which nerfstudio's viewer finds the controls.
+
+    Returns:
+        The panel. It has no parameters and leaves checkpoints unchanged.
+
+    Example:
+        >>> pipeline = config.pipeline.setup(device="cpu")
+        >>> attach_spectral_panel(pipeline)
     """
     model = cast("SpectralModel", pipeline.model)
     panel = SpectralPanel(model.wavelengths_nm, model.num_train_data)
     render = model.get_outputs_for_camera
 
-    def render_for_viewer(camera: Cameras, obb_box: OrientedBox | None = None) -> Outputs:
-        return panel.render(camera, lambda of_viewer: render(of_viewer, obb_box=obb_box))
+    def render_with_panel(camera: Cameras, obb_box: OrientedBox | None = None) -> Outputs:
+        return panel.render(camera, lambda camera: render(camera, obb_box=obb_box))
 
-    model.get_outputs_for_camera = render_for_viewer  # type: ignore[method-assign]
+    model.get_outputs_for_camera = render_with_panel  # type: ignore[method-assign]
     pipeline.spectral_panel = panel
     return panel
 
 
 class BrowserControl(ViewerControl):
-    """nerfstudio's access to the viewer, which also tells of each browser that opens it.
+    """nerfstudio's access to the viewer, which also reports every browser that opens it.
 
     Args:
-        opened: called with the browser. Left alone, its camera would stand inside the object.
+        opened: called with the browser, whose initial camera is inside the object.
     """
 
     def __init__(self, opened: Callable[[ClientHandle], None]) -> None:
@@ -85,11 +92,11 @@ class BrowserControl(ViewerControl):
 class SpectralPanel(torch.nn.Module):
     """Controls of the viewer: wavelength, composite, index, training view, spectrum of a clicked point.
 
-    A module, without parameters, because nerfstudio looks for controls in modules; it shows them in the alphabetical
-    order of their names here. As long as no viewer is attached it does nothing.
+    The panel is a module without parameters, because nerfstudio looks for controls in modules. The viewer shows the
+    controls in the alphabetical order of their attribute names. Without a viewer the panel does nothing.
 
     Args:
-        wavelengths_nm: centres of the bands. A composite or an index that needs others is not offered.
+        wavelengths_nm: band centres; composites and indices that need other wavelengths are not offered.
         num_views: number of training views.
     """
 
@@ -117,27 +124,26 @@ class SpectralPanel(torch.nn.Module):
             min_value=0,
             max_value=max(1, num_views - 1),
             step=1,
-            cb_hook=lambda slider: self._stand_at(min(slider.value, num_views - 1)),
-            hint="Puts the camera where this view was taken, where output 'spectral_angle' compares with it",
+            cb_hook=lambda slider: self._move_all_to(min(slider.value, num_views - 1)),
+            hint="Moves the camera to this view, with which output 'spectral_angle' compares",
         )
         self.picking = ViewerCheckbox(
             "Click for spectrum",
             False,
             cb_hook=self._switch_picking,
-            hint="A click shows the spectrum of a point; until this is off again, the mouse does not move the camera",
+            hint="A click shows the spectrum of a point; while this is on, the mouse does not move the camera",
         )
         self.spectrum = ViewerMarkdown()
-        self.control = BrowserControl(lambda client: self._place(client, 0))
+        self.control = BrowserControl(lambda client: self._move_to(client, 0))
 
     def render(self, camera: Cameras, render: Callable[[Cameras], Outputs]) -> Outputs:
-        """Render a camera; a viewer's with the pictures that the controls ask for in place of whole spectra.
+        """Render a camera; for the viewer's camera, replace the spectra by the images that the controls select.
 
-        A viewer's camera that stands where a training view was taken is rendered as that view's, so that the view's
-        pose refinement and background are in force.
+        A viewer's camera at the position of a training view gets that view's pose refinement and background.
 
         Args:
-            camera: one camera, of a frame or of a viewer.
-            render: nerfstudio's ``get_outputs_for_camera``.
+            camera: one camera, of a frame or of the viewer.
+            render: the model's ``get_outputs_for_camera``.
         """
         viewer = self._viewer()
         if viewer is None or FRAME_INDEX in (camera.metadata or {}):
@@ -165,7 +171,7 @@ class SpectralPanel(torch.nn.Module):
         return pictures | outputs
 
     def show_spectrum(self, click: ViewerClick) -> None:
-        """Show the spectrum of what a click meets and, where a training view saw it, what was measured there."""
+        """Show the rendered spectrum at a click and, at a training view, the measured one."""
         viewer = self._viewer()
         assert viewer is not None
         views = _training_views(viewer)
@@ -189,7 +195,7 @@ class SpectralPanel(torch.nn.Module):
         self._mark(viewer, point)
 
     def _viewer(self) -> Viewer | None:
-        """The viewer, once one is attached."""
+        """The attached viewer; None without one."""
         return getattr(self.control, "viewer", None)
 
     def _dropdown(self, label: str, output: str, names: list[str]) -> ViewerDropdown | None:
@@ -204,7 +210,7 @@ class SpectralPanel(torch.nn.Module):
         )
 
     def _legend(self) -> str:
-        """What the colours of the outputs mean, as the controls stand."""
+        """Explanation of the colours of the selected outputs."""
         parts = []
         if self.composite is not None:
             chosen = COMPOSITES[self.composite.value]
@@ -228,26 +234,26 @@ class SpectralPanel(torch.nn.Module):
         panel = viewer.control_panel
         return output == panel.output_render or (panel.split and output == panel.split_output_render)
 
-    def _stand_at(self, view: int) -> None:
-        """Put the cameras of all browsers where a training view was taken."""
+    def _move_all_to(self, view: int) -> None:
+        """Move the cameras of all browsers to a training view."""
         viewer = self._viewer()
         assert viewer is not None
         for client in viewer.viser_server.get_clients().values():
-            self._place(client, view)
+            self._move_to(client, view)
 
-    def _place(self, client: ClientHandle, view: int) -> None:
-        """Put a browser's camera where a training view was taken; dragging then turns it around the object."""
+    def _move_to(self, client: ClientHandle, view: int) -> None:
+        """Move a browser's camera to a training view, with the object as its centre of rotation."""
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
         viewer = self._viewer()
         assert viewer is not None
         views = _training_views(viewer)
         rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
-        place = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
+        position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
         ahead = rotation.as_matrix()[:, 2] * views.distance(view) * VISER_NERFSTUDIO_SCALE_RATIO
         with client.atomic():
-            client.camera.position = place
-            client.camera.look_at = place + ahead
+            client.camera.position = position
+            client.camera.look_at = position + ahead
             client.camera.wxyz = rotation.wxyz
             client.camera.fov = views.vertical_fov(view, client.camera.aspect)
 
@@ -273,6 +279,50 @@ def _training_views(viewer: Viewer) -> TrainingViews:
 
 
 def _object_frame(viewer: Viewer) -> tuple[float, Float[Tensor, "3 4"]]:
-    """Scale and transform that brought metres in the object frame into the scene."""
+    """Scale and transform from metres in the object frame to the scene."""
     parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
     return parsed.dataparser_scale, parsed.dataparser_transform
+
+
+@dataclass(frozen=True, eq=False)
+class PickedPoint:
+    """The rendered surface point of a ray."""
+
+    position: Float[Tensor, "3"]
+    """Position at the median depth, scene units."""
+    opacity: float
+    spectrum: Float[Tensor, "bands"]
+    """Rendered spectrum, background included."""
+
+
+def pick(
+    model: SpectralModel,
+    origin: Float[Tensor, "3"],
+    direction: Float[Tensor, "3"],
+    metadata: dict[str, Float[Tensor, "1 ..."]],
+) -> PickedPoint:
+    """Render one ray in evaluation mode and restore the mode of the model.
+
+    Args:
+        model: the model; no other thread may use it meanwhile.
+        origin: origin of the ray, scene units.
+        direction: direction of the ray, of any length.
+        metadata: metadata of the frame to which the ray belongs; empty for none.
+    """
+    unit = direction / direction.norm()
+    rays = RayBundle(
+        origins=origin[None],
+        directions=unit[None],
+        pixel_area=torch.ones(1, 1),
+        camera_indices=torch.zeros(1, 1, dtype=torch.long),
+        metadata={"directions_norm": torch.ones(1, 1), **metadata},
+    )
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            outputs = model(rays.to(model.device))
+    finally:
+        model.train(was_training)
+    depth, opacity, spectrum = (outputs[name][0].cpu() for name in ("depth", "accumulation", "spectral"))
+    return PickedPoint(origin + unit * depth, float(opacity), spectrum)

@@ -1,4 +1,4 @@
-"""The training views as the viewer meets them: where their cameras stand, and what they measured along a ray."""
+"""The training views in the viewer: positions of their cameras and measured spectra along rays."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.cube import unpack
 
-SAME_PLACE = 1e-4
-"""A camera this near to a view's (scene units, of which the scene box has two) sees what the view sees."""
+SAME_POSITION = 1e-4
+"""Largest distance (scene units) at which the viewer's camera counts as that of a view."""
 
 
 class TrainingViews:
-    """The frames that a run is trained on, with the poses that were measured.
+    """The training frames of a run with their measured poses.
 
-    Who looks from where a view's camera stands sees the view's rays, whichever way and however wide he looks.
+    A camera at the position of a view has the rays of that view, whatever its orientation and field of view.
     """
 
     def __init__(self, dataset: SpectralDataset) -> None:
@@ -29,29 +29,29 @@ class TrainingViews:
         self.rotations: Float[Tensor, "views 3 3"] = cameras.camera_to_worlds[:, :, :3]
         self.centres: Float[Tensor, "views 3"] = cameras.camera_to_worlds[:, :, 3]
 
-    def at(self, place: Float[Tensor, "3"]) -> int | None:
-        """The view whose camera stands at a place, in scene units; None for none."""
-        distances = (self.centres - place.to(self.centres)).norm(dim=-1)
+    def at(self, position: Float[Tensor, "3"]) -> int | None:
+        """The view whose camera is at a position (scene units); None if there is none."""
+        distances = (self.centres - position.to(self.centres)).norm(dim=-1)
         view = int(distances.argmin())
-        return view if distances[view] <= SAME_PLACE else None
+        return view if distances[view] <= SAME_POSITION else None
 
     def name(self, view: int) -> str:
-        """The capture that a view was made from."""
+        """Name of the view's capture."""
         return self.dataset.frames[view].capture
 
     def metadata(self, view: int, device: torch.device | str) -> dict[str, Float[Tensor, "1 ..."]]:
-        """What tells the model that rays are this view's."""
+        """Metadata that assign rays to this view in the model."""
         metadata = self.dataset.cameras[view : view + 1].metadata
         assert metadata is not None
         return {name: values.to(device) for name, values in metadata.items()}
 
     def distance(self, view: int) -> float:
-        """How far before a view's camera the object's middle lies, scene units."""
+        """Depth of the object's centre in front of a view's camera, scene units."""
         to_object = self.dataset.metadata["object_box"].mean(dim=0) - self.centres[view]
         return float(-to_object @ self.rotations[view][:, 2])
 
     def vertical_fov(self, view: int, aspect: float) -> float:
-        """Vertical field of view (radians) of a window, ``aspect`` times as wide as high, that shows a whole view."""
+        """Vertical field of view (radians) of a window of the aspect ratio width / height that contains a view."""
         lens, _ = self._lens(view)
         half_height = max(lens.h / 2.0 / lens.fl_y, lens.w / 2.0 / lens.fl_x / aspect)
         return 2.0 * float(np.arctan(half_height))
@@ -59,15 +59,15 @@ class TrainingViews:
     def measured(
         self, view: int, directions: Float[Tensor, "*rays 3"]
     ) -> tuple[Float[Tensor, "n bands"], Bool[Tensor, "n bands"], Bool[Tensor, "*rays"]]:
-        """What a view measured along rays from its camera's centre.
+        """Measured spectra of a view along rays from its camera's centre.
 
         Args:
-            view: which.
-            directions: of the rays, in the scene.
+            view: index of the view.
+            directions: directions of the rays in the scene.
 
         Returns:
-            Reflectance of the nearest pixels, which of its values are measurements, and which rays the view saw: the
-            first two are theirs, in order.
+            Reflectance of the nearest pixels of the rays within the view, which of its values are valid, and which of
+            the rays are within the view.
         """
         pixels, seen = frame_pixels(directions.cpu(), self.rotations[view], *self._lens(view))
         lines, samples = pixels[seen].numpy().T

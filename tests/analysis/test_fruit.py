@@ -18,10 +18,9 @@ from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
-from hsi_sc_nerf.simulate.objects import Fruit
+from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights
+from hsi_sc_nerf.simulate.scene import Fruit
 from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
-from hsi_sc_nerf.simulate.shapes import apple
-from hsi_sc_nerf.simulate.texture import FRUIT_MATERIALS, fruit_weights
 
 NM = np.linspace(400.0, 1000.0, 25)
 STAND_M = 0.07

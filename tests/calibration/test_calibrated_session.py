@@ -25,7 +25,7 @@ LARGEST_COUNT = 4095
 ODDITIES = [
     "{illumination_falloff: {edge_loss: 0.2}}",
     "{lamp_drift: {percent: -6, temperature_change_k: -80}}",
-    "{bad_pixels: {dead_share: 0.001, hot_share: 0.001, dead_bands: 2}}",
+    "{bad_pixels: {dead_fraction: 0.001, hot_fraction: 0.001, dead_bands: 2}}",
     "gloss",
     "{saturation: {exposure_factor: 1.6}}",
     "{tarp_exposure: {exposure_factor: 0.6}}",

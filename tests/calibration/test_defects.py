@@ -56,7 +56,7 @@ def truth_of(simulation):
 HARD = {
     "default": {"bad_pixels": {}},
     "dark pattern, smile, falloff, lamp": {
-        "bad_pixels": {"dead_share": 0.002, "hot_share": 0.002},
+        "bad_pixels": {"dead_fraction": 0.002, "hot_fraction": 0.002},
         "dark_pattern": {"spread": 30.0},
         "spectral_smile": {"shift_nm": 6.0},
         "illumination_falloff": {},
@@ -68,7 +68,10 @@ HARD = {
         "saturation": {},
         "textured_background": {},
     },
-    "one in fifty": {"bad_pixels": {"dead_share": 0.01, "hot_share": 0.01, "dead_bands": 3}, "dark_pattern": {}},
+    "one in fifty": {
+        "bad_pixels": {"dead_fraction": 0.01, "hot_fraction": 0.01, "dead_bands": 3},
+        "dark_pattern": {},
+    },
     "noisy": {"bad_pixels": {"dead_bands": 1}, "read_noise": {"electrons": 120.0}},
 }
 
@@ -112,7 +115,7 @@ def test_nothing_is_found_where_nothing_is(effects, bands, bit_depth, noise):
 @pytest.mark.parametrize("bit_depth", [8, 10, 14, 16])
 def test_saturation_is_where_the_digitiser_stops(bit_depth, noise):
     simulation = session(
-        size_px=40, bands=24, bit_depth=bit_depth, saturation={}, bad_pixels={"hot_share": 0.01}, **noise
+        size_px=40, bands=24, bit_depth=bit_depth, saturation={}, bad_pixels={"hot_fraction": 0.01}, **noise
     )
     white, frames = readings(simulation)
     assert find_defects(white, frames).saturation_counts == 2**bit_depth - 1
@@ -123,7 +126,7 @@ def test_saturation_is_where_the_digitiser_stops(bit_depth, noise):
 
 
 def test_hot_elements_alone_do_not_saturate_anything():
-    simulation = session(size_px=40, bands=24, bad_pixels={"hot_share": 0.02}, **NOISE)
+    simulation = session(size_px=40, bands=24, bad_pixels={"hot_fraction": 0.02}, **NOISE)
     assert (simulation.white().counts == 4095).any()
     assert find_defects(*readings(simulation)).saturation_counts is None
 
@@ -221,7 +224,7 @@ def test_bad_bands_are_listed_unlit_or_mostly_dead():
 
 
 def test_session_without_dark_cubes():
-    simulation = session(size_px=40, bands=40, bad_pixels={"dead_share": 0.01, "hot_share": 0.0}, **NOISE)
+    simulation = session(size_px=40, bands=40, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.0}, **NOISE)
     white, frames = readings(simulation)
     defects = find_defects(Readings(white.counts), [Readings(frame.counts) for frame in frames])
     # Where the light is weak, the dark counts hide it.

@@ -12,7 +12,7 @@ def test_somebody_elses_runs_are_left_alone(tmp_path):
         (tmp_path / name).mkdir()
     kept = tmp_path / "runs" / "config.yml"
     kept.write_text("months of work")
-    with pytest.raises(InputError, match="something else than a demo"):
+    with pytest.raises(InputError, match="other than a demo"):
         DemoCommand(output_dir=tmp_path).main()
     assert kept.read_text() == "months of work"
 

@@ -43,7 +43,7 @@ def test_both_exposures_multiply():
 
 
 def test_dead_bands_come_on_top_of_the_other_bad_pixels():
-    strengths = {"dead_share": 0.05, "hot_share": 0.05}
+    strengths = {"dead_fraction": 0.05, "hot_fraction": 0.05}
     without = simulation(bad_pixels=strengths).detector_maps["bad_pixels"]
     changed = simulation(bad_pixels={**strengths, "dead_bands": 3})
     maps = changed.detector_maps["bad_pixels"]

@@ -7,19 +7,17 @@ import pytest
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.colours import Colour, colour_spectra
-from hsi_sc_nerf.simulate.diffusion import diffused
-from hsi_sc_nerf.simulate.effects.gloss import Gloss, fresnel, mean_fresnel
-from hsi_sc_nerf.simulate.effects.lamp import Lamp
-from hsi_sc_nerf.simulate.effects.shading import ChamberShading, InterReflection
+from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection
+from hsi_sc_nerf.simulate.effects.illumination import Lamp
+from hsi_sc_nerf.simulate.effects.object import Gloss, Translucency, fresnel, mean_fresnel
 from hsi_sc_nerf.simulate.effects.stages import LightEffect
-from hsi_sc_nerf.simulate.effects.translucency import Translucency
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.lighting import Lighting, even_light
+from hsi_sc_nerf.simulate.light import Colour, colour_spectra, even_light
+from hsi_sc_nerf.simulate.lighting import Lighting
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, split_at_creases
+from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, diffused, split_at_creases
 
 RADIUS_M = 0.03
 CAMERA = PinholeIntrinsics(24, 24, 60.0, 60.0, 12.0, 12.0)
@@ -42,8 +40,8 @@ def still_life():
     """A ball of two materials on a white drum on a white table."""
     mesh = ball(32).moved(np.array([0.0, 0.0, 0.05 + RADIUS_M]))
     red = (mesh.vertices[:, :1] > 0).astype(float)
-    drum = part(cylinder(0.06, 0.05, 32, step_m=0.005), "drum")
-    table = part(cylinder(0.2, 0.01, 32, step_m=0.005).moved(np.array([0.0, 0.0, -0.0103])), "table")
+    drum = part(cylinder(0.06, 0.05, 32, spacing_m=0.005), "drum")
+    table = part(cylinder(0.2, 0.01, 32, spacing_m=0.005).moved(np.array([0.0, 0.0, -0.0103])), "table")
     return Renderer([Part(mesh, ("red", "green"), np.concatenate([red, 1.0 - red], axis=1), True), drum, table])
 
 
@@ -92,7 +90,7 @@ def test_every_effect_of_light_can_be_named():
 
 
 @pytest.mark.parametrize("effect", ["lamp", "{chamber_shading: {directions: 8}}"])
-def test_true_shares_of_materials_do_not_change(effect):
+def test_true_fractions_of_materials_do_not_change(effect):
     small = {"size_px": 32, "bands": 4, "frames": 2}
     plain = Simulation(override(load_scene("sphere"), **small, effects=[])).frame(1)
     lit = Simulation(override(load_scene("sphere"), **small, effects=[effect])).frame(1)
@@ -185,7 +183,7 @@ def wall_and_floor(height_m=0.1):
 
 def test_wall_hides_its_form_factor_of_the_sky():
     surface, on_floor, _, hidden = wall_and_floor()
-    free = surface.surroundings(2048).free[on_floor]
+    free = surface.surroundings(2048).chamber_visibility[on_floor]
     np.testing.assert_allclose(free, 1.0 - hidden, atol=5e-3)
     assert free[0] == pytest.approx(0.5, abs=0.015)
 
@@ -210,8 +208,8 @@ def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
 
 def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     radius_m, height_m = 0.045, 0.07
-    drum = part(cylinder(2 * radius_m, height_m, 128, step_m=0.0025), "drum")
-    disc = part(cylinder(0.2, 0.006, 128, step_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
+    drum = part(cylinder(2 * radius_m, height_m, 128, spacing_m=0.0025), "drum")
+    disc = part(cylinder(0.2, 0.006, 128, spacing_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
     distance_m = np.array([0.0003, 0.001, 0.0022, 0.005, 0.01, 0.02, 0.04])
     lighting = Lighting(Renderer([drum, disc]), [ChamberShading(512)])
     # The mean over azimuths is free of most of the chance in single points.
@@ -234,7 +232,7 @@ def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
 
 
 def test_points_split_at_the_rims_of_a_drum_only():
-    drum = cylinder(0.05, 0.05, 64, step_m=0.01)
+    drum = cylinder(0.05, 0.05, 64, spacing_m=0.01)
     triangles, vertex = split_at_creases(drum.vertices, drum.triangles, 40.0)
     np.testing.assert_array_equal(vertex[triangles], drum.triangles)
     repeated = np.flatnonzero(np.bincount(vertex) > 1)
@@ -248,7 +246,7 @@ def test_points_split_at_the_rims_of_a_drum_only():
 
 def test_lambert_cosine_on_a_ball():
     lighting = Lighting(
-        Renderer([part(ball(336), "white", True)]), [Lamp(share=1.0, azimuth_deg=40.0, elevation_deg=0)]
+        Renderer([part(ball(336), "white", True)]), [Lamp(fraction=1.0, azimuth_deg=40.0, elevation_deg=0)]
     )
     x = np.linspace(-0.95, 0.95, 41)
     seen = light_below(lighting, RADIUS_M * np.column_stack([x, np.zeros(41)]))[Colour((0,))]
@@ -257,17 +255,17 @@ def test_lambert_cosine_on_a_ball():
     np.testing.assert_allclose(seen, np.maximum(cosine, 0.0), atol=0.015)
 
 
-@pytest.mark.parametrize("share", [0.3, 1.0])
-def test_shadow_of_a_post_ends_where_geometry_says(share):
+@pytest.mark.parametrize("fraction", [0.3, 1.0])
+def test_shadow_of_a_post_ends_where_geometry_says(fraction):
     height_m, azimuth_deg = 0.05, 60.0
     post = part(cylinder(0.01, height_m), "post")
     floor = part(quads(np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]], float)), "floor")
-    lighting = Lighting(Renderer([post, floor]), [Lamp(share, azimuth_deg, 0.0)])
+    lighting = Lighting(Renderer([post, floor]), [Lamp(fraction, azimuth_deg, 0.0)])
     end_m = 0.005 + height_m * np.tan(np.deg2rad(azimuth_deg))
     x = -np.array([0.02, end_m - 5e-4, end_m + 5e-4, 0.2])
     light = light_below(lighting, np.column_stack([x, np.zeros(4)]))[Colour((1,))]
-    lit = 1.0 - share + share * np.cos(np.deg2rad(azimuth_deg))
-    np.testing.assert_allclose(light, [1 - share, 1 - share, lit, lit], atol=1e-5)
+    lit = 1.0 - fraction + fraction * np.cos(np.deg2rad(azimuth_deg))
+    np.testing.assert_allclose(light, [1 - fraction, 1 - fraction, lit, lit], atol=1e-5)
 
 
 def test_shading_stays_with_the_camera_when_the_object_turns():
@@ -326,12 +324,12 @@ def test_translucency_keeps_totals_and_softens_more_the_longer_the_wavelength(st
     for material in range(2):
         only = np.zeros((len(still_life.materials), len(wavelengths_nm)))
         only[material] = 1.0
-        share = light.chamber_lit @ colour_spectra(light.colours, only, wavelengths_nm)
-        on_object = share[surface.is_object]
+        fraction = light.chamber_lit @ colour_spectra(light.colours, only, wavelengths_nm)
+        on_object = fraction[surface.is_object]
         areas = surface.areas_m2[surface.is_object, None]
         totals.append((areas * on_object).sum(axis=0))
         contrasts.append((areas * on_object**2).sum(axis=0))
-        np.testing.assert_allclose(share[~surface.is_object], 0.0)
+        np.testing.assert_allclose(fraction[~surface.is_object], 0.0)
     for total, contrast in zip(totals, contrasts, strict=True):
         np.testing.assert_allclose(total, total[0], rtol=1e-5)
         assert (np.diff(contrast[1:]) < 0).all()
@@ -349,7 +347,7 @@ def by_colour(renderer, effects):
 
 @pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16), Translucency(5.0)], ids=lambda e: e.name)
 def test_lamp_with_an_effect_of_the_chamber_is_the_sum_of_both_lights(still_life, baked):
-    """(1 - share) of what the chamber gives with its effect, and the lamp's light, which that does not change."""
+    """(1 - fraction) of what the chamber gives with its effect, and the lamp's light, which that does not change."""
     lamp, only_lamp = Lamp(0.4), Lamp(1.0)
     both = by_colour(still_life, [baked, lamp])
     chamber = by_colour(still_life, [baked])

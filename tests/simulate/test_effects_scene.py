@@ -13,7 +13,8 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, project, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.simulate import assemble, effects
-from hsi_sc_nerf.simulate.effects import ageing, illumination, motion, surroundings
+from hsi_sc_nerf.simulate.effects import chamber, illumination, motion
+from hsi_sc_nerf.simulate.effects import object as object_effects
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.materials import MATERIALS, PlantTissue, endmembers
 from hsi_sc_nerf.simulate.render import Renderer
@@ -23,11 +24,12 @@ from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
 
+METHODS = ("replan", "offset_m", "deform", "cover", "spectra", "factor")
 OURS = [
     cls
-    for module in (ageing, illumination, motion, surroundings)
+    for module in (chamber, illumination, motion, object_effects)
     for cls in vars(module).values()
-    if isinstance(cls, type) and cls.__module__ == module.__name__
+    if isinstance(cls, type) and cls.__module__ == module.__name__ and {*vars(cls)} & {*METHODS}
 ]
 SMALL = {"frames": 4, "size_px": 40, "bands": 10}
 
@@ -288,15 +290,15 @@ def test_bone_dry_tissue_reflects_what_tissue_without_water_does():
     nm = np.linspace(397.0, 1003.0, 60)
     wet = {"wet": PlantTissue(1.0, chlorophyll=0.3, water=2.0), "flat": MATERIALS["paper"]}
     dry = {"wet": PlantTissue(1.0, chlorophyll=0.3), "flat": MATERIALS["paper"]}
-    dried = ageing.Drying(1.0).spectra(endmembers(wet, nm, wet), list(wet.values()), nm, 1.0)
+    dried = object_effects.Drying(1.0).spectra(endmembers(wet, nm, wet), list(wet.values()), nm, 1.0)
     np.testing.assert_allclose(dried, endmembers(dry, nm, dry), atol=1e-12)
     assert dried.max() <= 1.0
     # A table a sample, as for a detector's smile, is as many tables.
     samples_nm = nm + np.array([[0.0], [3.0]])
     tables = np.moveaxis(endmembers(wet, samples_nm, wet), 0, -2)
-    both = ageing.Drying(0.5).spectra(tables, list(wet.values()), samples_nm, 0.6)
+    both = object_effects.Drying(0.5).spectra(tables, list(wet.values()), samples_nm, 0.6)
     for table, one, at_nm in zip(tables, both, samples_nm, strict=True):
-        np.testing.assert_array_equal(one, ageing.Drying(0.5).spectra(table, list(wet.values()), at_nm, 0.6))
+        np.testing.assert_array_equal(one, object_effects.Drying(0.5).spectra(table, list(wet.values()), at_nm, 0.6))
 
 
 # --- illumination ---------------------------------------------------------------------------------------------------
@@ -331,14 +333,14 @@ def test_drift_is_what_is_left_after_dividing_truth_out():
 
 
 def test_drift_is_smooth_and_ends_at_its_strength():
-    drift = illumination.LampDrift(percent=8.0)
+    drift = illumination.DriftingLamps(percent=8.0)
     nm = np.array([500.0, 700.0])
     course = np.array([drift.factor(8, nm, 3000.0, e)[0, 0, 0] for e in np.linspace(0.0, 1.0, 101)])
     assert (course[0], course[-1]) == (1.0, pytest.approx(1.08))
     rate = np.diff(course)
     assert (rate > 0.0).all()
     assert (np.diff(rate) < 1e-7).all()
-    steady = illumination.LampDrift(percent=8.0, settling=100.0)
+    steady = illumination.DriftingLamps(percent=8.0, settling=100.0)
     assert steady.factor(8, nm, 3000.0, 0.5)[0, 0, 1] == pytest.approx(1.04, abs=2e-4)
 
 
@@ -389,10 +391,10 @@ def test_the_background_stands_still_and_nothing_else_changes():
         full = without.material_weights[..., -1] == 0.0
         np.testing.assert_array_equal(frame.material_weights[full][:, same], without.material_weights[full])
     # All three materials are there, and the wall's own is gone.
-    shares = frames[0].material_weights[wall].mean(axis=0)
-    for name in surroundings.TexturedBackground.materials:
-        assert shares[simulation.materials.index(name)] > 0.05
-    assert shares[-1] == 0.0
+    fractions = frames[0].material_weights[wall].mean(axis=0)
+    for name in chamber.TexturedBackground.materials:
+        assert fractions[simulation.materials.index(name)] > 0.05
+    assert fractions[-1] == 0.0
     half = Simulation(scene("{textured_background: {contrast: 0.5}}", size_px=64)).frame(0)
     np.testing.assert_allclose(half.material_weights[wall][:, -1], 0.5, atol=1e-3)
     # A larger image shows the same wall.
@@ -431,9 +433,8 @@ def raise_in(monkeypatch, classes):
         raise AssertionError(f"{self.name} was not named")
 
     for cls in classes:
-        for method in ("replan", "offset_m", "deform", "cover", "spectra", "factor"):
-            if method in vars(cls):
-                monkeypatch.setattr(cls, method, stop)
+        for method in {*vars(cls)} & {*METHODS}:
+            monkeypatch.setattr(cls, method, stop)
 
 
 def files(session):
@@ -455,7 +456,7 @@ def test_a_session_without_effects_is_one_of_a_build_without_them(tmp_path, monk
 @pytest.mark.parametrize("named", OURS, ids=lambda cls: cls.name)
 def test_no_effect_runs_that_is_not_named(named, monkeypatch):
     raise_in(monkeypatch, [cls for cls in OURS if cls is not named])
-    small = {"name": "pear" if named is ageing.Drying else "cylinder", "frames": 3, "size_px": 16, "bands": 3}
+    small = {"name": "pear" if named is object_effects.Drying else "cylinder", "frames": 3, "size_px": 16, "bands": 3}
     simulation, even = Simulation(scene(named.name, **small)), Simulation(scene(**small))
     # And what is named runs: it changes the frames or their number.
     last = len(simulation.captures) - 1

@@ -17,7 +17,7 @@ from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble, frames, sensor
 from hsi_sc_nerf.simulate.effects import EFFECTS, read_effects
-from hsi_sc_nerf.simulate.effects.noise import FEW_ELECTRONS, many_electrons, poisson
+from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
 from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur, distort, gaussian_kernel, undistort
 from hsi_sc_nerf.simulate.effects.stages import effect_rng
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -113,9 +113,9 @@ def test_many_electrons_are_distributed_like_poisson_numbers(mean):
 
 def test_few_electrons_are_poisson_numbers():
     drawn = poisson(np.full((300, 100), 0.7, np.float32), np.random.default_rng(0))
-    shares = np.bincount(drawn.astype(int).ravel(), minlength=5)[:5] / drawn.size
+    fractions = np.bincount(drawn.astype(int).ravel(), minlength=5)[:5] / drawn.size
     error = np.sqrt(stats.poisson.pmf(range(5), 0.7) / drawn.size)
-    assert (np.abs(shares - stats.poisson.pmf(range(5), 0.7)) < ALL_BUT_A_MILLIONTH * error).all()
+    assert (np.abs(fractions - stats.poisson.pmf(range(5), 0.7)) < ALL_BUT_A_MILLIONTH * error).all()
     assert (poisson(np.zeros((4, 4), np.float32), np.random.default_rng(0)) == 0.0).all()
 
 
@@ -157,7 +157,7 @@ def test_dark_pattern_is_the_same_in_all_exposures_and_truth_knows_it(tmp_path):
 
 
 def test_bad_pixels_are_where_truth_says_and_nothing_else_changes(tmp_path):
-    with_bad = scene(size_px=40, bands=30, bad_pixels={"dead_share": 0.01, "hot_share": 0.02})
+    with_bad = scene(size_px=40, bands=30, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.02})
     simulate_session(with_bad, tmp_path / "s", False)
     maps = load_truth(tmp_path / "s").detector_maps()
     dead, hot = maps["dead"], maps["hot"]
@@ -332,7 +332,7 @@ def test_a_rotated_image_is_the_upright_one_turned(quarter_turns):
 
 
 def test_rotation_leaves_the_detector_where_it_is(tmp_path):
-    turned = scene(size_px=32, image_rotation={}, dark_pattern={"spread": 30.0}, bad_pixels={"hot_share": 0.02})
+    turned = scene(size_px=32, image_rotation={}, dark_pattern={"spread": 30.0}, bad_pixels={"hot_fraction": 0.02})
     session_dir = simulate_session(turned, tmp_path / "s", False)
     truth = load_truth(session_dir)
     assert truth.effects["image_rotation"] == {"quarter_turns": 1}
@@ -357,7 +357,7 @@ STRENGTHS = {
     "photon_noise": {},
     "dark_pattern": {"spread": 9.0},
     "read_noise": {"electrons": 50.0},
-    "bad_pixels": {"dead_share": 0.05, "hot_share": 0.05},
+    "bad_pixels": {"dead_fraction": 0.05, "hot_fraction": 0.05},
 }
 
 
@@ -414,10 +414,10 @@ def by_definition(changed, renderer, exposure):
     if "bad_pixels" in on:
         shape = counts.shape[1:]
         order = rng("bad_pixels").permutation(shape[0] * shape[1])
-        share = round(0.05 * len(order))
-        samples, bands = np.unravel_index(order[: 2 * share], shape)
-        counts[:, samples[:share], bands[:share]] = DARK
-        counts[:, samples[share:], bands[share:]] = LARGEST
+        fraction = round(0.05 * len(order))
+        samples, bands = np.unravel_index(order[: 2 * fraction], shape)
+        counts[:, samples[:fraction], bands[:fraction]] = DARK
+        counts[:, samples[fraction:], bands[fraction:]] = LARGEST
     return np.clip(np.rint(counts), 0, LARGEST)
 
 

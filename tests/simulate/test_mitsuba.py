@@ -34,7 +34,7 @@ def agreement(scene, transport, effects=(), frame=2):
 @pytest.mark.parametrize("name", ["sphere", "pear"])
 def test_matte_scene_in_even_light_agrees_within_monte_carlo_error(name):
     found = agreement(small(name), "even")
-    # The pear's skin, blush and pale dots meet in single triangles: shares of three materials are right as well.
+    # The pear's skin, blush and pale dots meet in single triangles: fractions of three materials are right as well.
     assert found.rms < 1.15 * found.expected
     assert found.expected < 0.015
     for bias, error in (found.bias, *found.bias_of_material.values()):

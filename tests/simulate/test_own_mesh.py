@@ -11,9 +11,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
-from hsi_sc_nerf.simulate.objects import OwnMesh
-from hsi_sc_nerf.simulate.scene import load_scene
-from hsi_sc_nerf.simulate.texture import padded_shares, sampled
+from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
+from hsi_sc_nerf.simulate.texture import padded_fractions, sampled
 
 RADIUS_M = 0.03
 TWO, THREE = ("a", "b"), ("a", "b", "c")
@@ -70,9 +69,9 @@ def ramp(path, axis):
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_texture_lies_where_the_uvs_say(tmp_path, suffix, axis):
     save(tmp_path / f"ball{suffix}", *uv_sphere())
-    ramp(tmp_path / "shares.png", axis)
+    ramp(tmp_path / "fractions.png", axis)
     mesh, weights = own_mesh.load(
-        OwnMesh("mesh", tmp_path / f"ball{suffix}", TWO, weight_texture=tmp_path / "shares.png")
+        OwnMesh("mesh", tmp_path / f"ball{suffix}", TWO, weight_texture=tmp_path / "fractions.png")
     )
     assert mesh.is_watertight()
     edges = mesh.vertices[mesh.triangles] - mesh.vertices[np.roll(mesh.triangles, 1, axis=1)]
@@ -125,7 +124,7 @@ def test_vertex_properties_come_through_normalised_and_in_the_order_of_the_scene
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
-def test_vertex_colours_are_shares(tmp_path, suffix):
+def test_vertex_colours_are_fractions(tmp_path, suffix):
     vertices, triangles, _ = uv_sphere()
     if suffix == ".glb":
         vertices = vertices[:, [0, 2, 1]] * [1, 1, -1]
@@ -171,8 +170,8 @@ def test_a_seam_that_an_exporter_rounded_is_closed(tmp_path):
     save(
         tmp_path / "ball.obj", vertices + np.random.default_rng(0).uniform(-1e-9, 1e-9, vertices.shape), triangles, uv
     )
-    ramp(tmp_path / "shares.png", 0)
-    texture = tmp_path / "shares.png"
+    ramp(tmp_path / "fractions.png", 0)
+    texture = tmp_path / "fractions.png"
     mesh, _ = own_mesh.load(OwnMesh("mesh", tmp_path / "ball.obj", TWO, weight_texture=texture))
     assert mesh.is_watertight()
 
@@ -198,9 +197,9 @@ def test_sampling_is_bilinear_with_v_upwards_and_repeats():
 def test_paint_is_grown_a_little_beyond_its_islands():
     image = np.zeros((20, 20, 2))
     image[:, 0] = [0.5, 1.5]
-    shares = padded_shares(image)
-    np.testing.assert_allclose(shares[:, :9], np.broadcast_to([0.25, 0.75], (20, 9, 2)))
-    assert not shares[:, 9:].any()
+    fractions = padded_fractions(image)
+    np.testing.assert_allclose(fractions[:, :9], np.broadcast_to([0.25, 0.75], (20, 9, 2)))
+    assert not fractions[:, 9:].any()
 
 
 def test_the_shipped_pepper_is_what_its_script_makes(tmp_path):
@@ -235,7 +234,7 @@ def test_bad_meshes_get_one_sentence(tmp_path):
     vertices, triangles, _ = uv_sphere()
     refused(tmp_path, "there is no such file")
     (tmp_path / "ball.stl").write_text("solid")
-    refused(tmp_path, "is no mesh that can be read", "ball.stl")
+    refused(tmp_path, "not a mesh format", "ball.stl")
     for suffix in own_mesh.FORMATS:
         (tmp_path / f"broken{suffix}").write_bytes(b"ply\nnonsense\x00\xff")
         with pytest.raises(InputError, match=r"cannot be read as a mesh|has no triangles"):
@@ -249,13 +248,13 @@ def test_bad_meshes_get_one_sentence(tmp_path):
     save_ply(tmp_path / "ball.ply", vertices * [1, 1, 0], triangles, {})
     refused(tmp_path, "is flat", materials=("a",))
     save_ply(tmp_path / "ball.ply", np.where(vertices > 3.0, np.nan, vertices), triangles, {})
-    refused(tmp_path, "not at finite places", materials=("a",))
+    refused(tmp_path, "not finite", materials=("a",))
 
 
 def test_bad_weights_get_one_sentence(tmp_path):
     vertices, triangles, uv = uv_sphere()
     save_ply(tmp_path / "ball.ply", vertices, triangles, {})
-    refused(tmp_path, "does not say where a, b lie")
+    refused(tmp_path, "does not locate its materials a, b")
     save_ply(tmp_path / "ball.ply", vertices, triangles, {"weight_a": uv[:, 0]})
     refused(tmp_path, "have no property weight_b")
     save_ply(tmp_path / "ball.ply", vertices, triangles, {"weight_a": uv[:, 0], "weight_b": 0 * uv[:, 0]})
@@ -266,16 +265,16 @@ def test_bad_weights_get_one_sentence(tmp_path):
 
 def test_bad_textures_get_one_sentence(tmp_path):
     surface = uv_sphere()
-    texture = {"weight_texture": tmp_path / "shares.png"}
+    texture = {"weight_texture": tmp_path / "fractions.png"}
     save(tmp_path / "ball.obj", *surface)
     refused(tmp_path, "cannot be read as an image", "ball.obj", **texture)
-    (tmp_path / "shares.png").write_text("no image")
+    (tmp_path / "fractions.png").write_text("no image")
     refused(tmp_path, "cannot be read as an image", "ball.obj", **texture)
-    Image.new("L", (8, 8), 255).save(tmp_path / "shares.png")
+    Image.new("L", (8, 8), 255).save(tmp_path / "fractions.png")
     refused(tmp_path, "is grey", "ball.obj", **texture)
-    Image.new("RGB", (64, 64)).save(tmp_path / "shares.png")
+    Image.new("RGB", (64, 64)).save(tmp_path / "fractions.png")
     refused(tmp_path, "are 0 for every material", "ball.obj", **texture)
-    ramp(tmp_path / "shares.png", 0)
-    refused(tmp_path, "can tell 3 materials apart", "ball.obj", ("a", "b", "c", "d"), **texture)
+    ramp(tmp_path / "fractions.png", 0)
+    refused(tmp_path, "can represent 3 materials", "ball.obj", ("a", "b", "c", "d"), **texture)
     save_ply(tmp_path / "ball.ply", *surface[:2], {})
     refused(tmp_path, "has no UVs", **texture)

@@ -81,13 +81,13 @@ def with_cubes(dataset, folder, change):
 def test_flagged_values_are_counted_and_not_judged(dataset_and_truth, tmp_path):
     dataset, truth = dataset_and_truth
     honest = score_processing(dataset, truth)
-    assert honest.flagged_share == 0.0
+    assert honest.flagged_fraction == 0.0
 
     def flag(reflectance, valid):
         valid[:28, :, ::2] = False  # a quarter of 112 lines, half of the bands
 
     score = score_processing(with_cubes(dataset, tmp_path, flag), truth)
-    assert score.flagged_share == pytest.approx(1 / 8)
+    assert score.flagged_fraction == pytest.approx(1 / 8)
     assert score.reflectance_rmse == pytest.approx(honest.reflectance_rmse, rel=0.2)
 
     def flag_all(reflectance, valid):

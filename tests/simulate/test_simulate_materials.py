@@ -6,7 +6,7 @@ import pytest
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
-from hsi_sc_nerf.simulate.scene import Sensor
+from hsi_sc_nerf.simulate.scene import SensorSettings
 from hsi_sc_nerf.simulate.sensor import band_centres_nm, digitise, lamp_photons, quantum_efficiency, white_signal
 
 WAVELENGTHS_NM = band_centres_nm(204)
@@ -67,7 +67,7 @@ def test_lamp_is_plancks_law():
 
 
 def test_white_peaks_at_its_level_and_dark_at_its():
-    sensor = Sensor()
+    sensor = SensorSettings()
     signal = white_signal(sensor, WAVELENGTHS_NM)
     white = digitise(signal + sensor.dark_level, sensor)
     assert white.dtype == np.uint16
@@ -79,10 +79,10 @@ def test_white_peaks_at_its_level_and_dark_at_its():
 
 def test_a_dark_level_without_room_for_light_is_refused():
     with pytest.raises(InputError, match=r"sensor\.dark_level is 250, but the white counts no more than 209.1"):
-        white_signal(Sensor(bit_depth=8, dark_level=250), WAVELENGTHS_NM)
+        white_signal(SensorSettings(bit_depth=8, dark_level=250), WAVELENGTHS_NM)
 
 
 def test_counts_are_whole_and_stop_at_both_ends():
-    counts = digitise(np.array([-3.0, 0.4, 0.6, 4094.4, 4096.0, 1e9]), Sensor())
+    counts = digitise(np.array([-3.0, 0.4, 0.6, 4094.4, 4096.0, 1e9]), SensorSettings())
     assert counts.dtype == np.uint16
     assert counts.tolist() == [0, 0, 1, 4094, 4095, 4095]

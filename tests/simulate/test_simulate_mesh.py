@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate import shapes
+from hsi_sc_nerf.simulate import plants
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 
 
@@ -60,9 +60,9 @@ def test_revolve_refuses_a_profile_that_cannot_close(profile):
 @pytest.mark.parametrize(
     ("make", "height_m", "volume_ml", "radius_m"),
     [
-        (shapes.pear, 0.10, (110, 200), 0.040),
-        (shapes.apple, 0.075, (130, 230), 0.043),
-        (shapes.maize, 0.16, (170, 300), 0.03),
+        (plants.pear, 0.10, (110, 200), 0.040),
+        (plants.apple, 0.075, (130, 230), 0.043),
+        (plants.maize, 0.16, (170, 300), 0.03),
     ],
 )
 @pytest.mark.parametrize("seed", [0, 7])
@@ -78,7 +78,7 @@ def test_shapes_are_closed_stand_on_zero_and_have_real_sizes(make, height_m, vol
 
 
 def test_maize_kernels_are_relief_and_not_paint():
-    shape = shapes.maize(0.16, np.random.default_rng(0))
+    shape = plants.maize(0.16, np.random.default_rng(0))
     assert shape.kernel is not None
     assert shape.groove is not None
     x, y, z = shape.mesh.vertices.T

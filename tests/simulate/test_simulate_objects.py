@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate import assemble, shapes
+from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.materials import MATERIALS, Measured, Plain, PlantTissue, endmembers
-from hsi_sc_nerf.simulate.objects import Cylinder, Fruit, OwnMesh, Sphere
-from hsi_sc_nerf.simulate.scene import load_scene, override, parse_scene
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
+from hsi_sc_nerf.simulate.scene import Cylinder, Fruit, OwnMesh, Sphere, load_scene, override, parse_scene
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -28,7 +28,7 @@ def parse(text, folder):
 
 @pytest.mark.parametrize("diameter_m", [0.01, 0.07, 0.3])
 def test_sphere_has_its_closed_forms(diameter_m):
-    mesh = shapes.sphere(diameter_m)
+    mesh = sphere(diameter_m)
     radius_m = diameter_m / 2
     assert mesh.is_watertight()
     assert mesh.area_m2() == pytest.approx(np.pi * diameter_m**2, rel=2e-4)
@@ -38,7 +38,7 @@ def test_sphere_has_its_closed_forms(diameter_m):
 
 @pytest.mark.parametrize(("diameter_m", "height_m"), [(0.01, 0.01), (0.06, 0.08), (0.02, 0.4)])
 def test_cylinder_has_its_closed_forms(diameter_m, height_m):
-    mesh = shapes.cylinder(diameter_m, height_m)
+    mesh = cylinder(diameter_m, height_m, SEGMENTS, VERTEX_SPACING_M)
     assert mesh.is_watertight()
     assert mesh.area_m2() == pytest.approx(np.pi * diameter_m * (diameter_m / 2 + height_m), rel=2e-4)
     assert mesh.volume_m3() == pytest.approx(np.pi / 4 * diameter_m**2 * height_m, rel=2e-4)
@@ -188,10 +188,10 @@ def test_bad_materials_get_one_sentence(tmp_path, definition, sentence):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("", "is no table of numbers with the columns wavelength_nm and reflectance|must cover"),
-        ("nm,r\n390,0.1\n1010,0.2\n", "is no table of numbers with the columns"),
-        ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "is no table of numbers"),
-        ("wavelength_nm,reflectance\n390,0.1\n1010\n", "is no table of numbers"),
+        ("", "not a table of numbers with the columns wavelength_nm and reflectance|must cover"),
+        ("nm,r\n390,0.1\n1010,0.2\n", "not a table of numbers with the columns"),
+        ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "not a table of numbers"),
+        ("wavelength_nm,reflectance\n390,0.1\n1010\n", "not a table of numbers"),
         ("wavelength_nm,reflectance\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n400,0.1\n1010,0.2\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n1010,0.1\n390,0.2\n", "wavelengths must increase"),

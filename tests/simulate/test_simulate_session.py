@@ -19,9 +19,8 @@ from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import revolve
-from hsi_sc_nerf.simulate.objects import OwnMesh
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.target import marker_layout
 from hsi_sc_nerf.simulate.truth import load_truth
@@ -167,8 +166,8 @@ def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
 def test_white_things_in_a_white_chamber_cannot_be_seen():
     intrinsics = PinholeIntrinsics(32, 32, 64.0, 64.0, 16.0, 16.0)
     mesh = unit_sphere()
-    shares = np.random.default_rng(0).dirichlet([1.0, 1.0], len(mesh.vertices))
-    renderer = Renderer([Part(mesh, ("a", "b"), shares)], chamber="c")
+    fractions = np.random.default_rng(0).dirichlet([1.0, 1.0], len(mesh.vertices))
+    renderer = Renderer([Part(mesh, ("a", "b"), fractions)], chamber="c")
     weights, _ = renderer.render(intrinsics, look_at(np.array([5.0, 2.0, 1.0]), np.zeros(3)), 3)
     assert (weights[..., 0] > 0).any()
     np.testing.assert_array_equal(weights @ np.full(3, 0.75, np.float32), 0.75)

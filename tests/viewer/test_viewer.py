@@ -18,8 +18,7 @@ from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.plotting.false_colour import BLANK, coloured
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
-from hsi_sc_nerf.viewer.panel import SpectralPanel
-from hsi_sc_nerf.viewer.picking import pick
+from hsi_sc_nerf.viewer.panel import SpectralPanel, attach_spectral_panel, pick
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -168,6 +167,19 @@ def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
     assert set(alone.render(server.moved_camera(), rendered_as(spectral))) == {"rgb", "spectral", "depth"}
     assert not list(panel.parameters())
     assert not panel.state_dict()
+
+
+def test_an_attached_panel_is_found_by_the_viewer_and_keeps_checkpoints(pipeline):
+    before = pipeline.state_dict().keys()
+    panel = attach_spectral_panel(pipeline)
+    found = [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements")]
+    assert "Custom Elements/spectral_panel/band" in found
+    assert pipeline.state_dict().keys() == before
+    # Without a viewer the model renders as before.
+    frame = pipeline.datamanager.train_dataset.cameras[2:3]
+    frame.rescale_output_resolution(0.1)
+    assert "spectral" in pipeline.model.get_outputs_for_camera(frame)
+    assert panel.wavelengths_nm is pipeline.model.wavelengths_nm
 
 
 def test_a_viewer_gets_pictures_of_one_or_three_channels(attached, pipeline):

@@ -1,4 +1,4 @@
-"""Physical effects beyond a matte object under even light that a perfect sensor sees; each absent unless named."""
+"""The effects that a scene can name: departures from a matte object, even light and a perfect sensor."""
 
 from __future__ import annotations
 
@@ -6,11 +6,18 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.effects.ageing import Deformation, Drying
-from hsi_sc_nerf.simulate.effects.detector import BadPixels, DarkPattern, Saturation, SpectralSmile, TarpExposure
-from hsi_sc_nerf.simulate.effects.gloss import Gloss
-from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff, LampDrift
-from hsi_sc_nerf.simulate.effects.lamp import Lamp
+from hsi_sc_nerf.settings_file import check_ranges, read_dataclass
+from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection, TexturedBackground
+from hsi_sc_nerf.simulate.effects.detector import (
+    BadPixels,
+    DarkPattern,
+    PhotonNoise,
+    ReadNoise,
+    Saturation,
+    SpectralSmile,
+    TarpExposure,
+)
+from hsi_sc_nerf.simulate.effects.illumination import DriftingLamps, IlluminationFalloff, Lamp
 from hsi_sc_nerf.simulate.effects.motion import (
     AngleJitter,
     AxisTilt,
@@ -21,14 +28,9 @@ from hsi_sc_nerf.simulate.effects.motion import (
     RepeatedFrames,
     Wobble,
 )
-from hsi_sc_nerf.simulate.effects.noise import PhotonNoise, ReadNoise
-from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur
-from hsi_sc_nerf.simulate.effects.orientation import ImageRotation
-from hsi_sc_nerf.simulate.effects.shading import ChamberShading, InterReflection
+from hsi_sc_nerf.simulate.effects.object import Deformation, Drying, Gloss, Translucency
+from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
 from hsi_sc_nerf.simulate.effects.stages import Effect
-from hsi_sc_nerf.simulate.effects.surroundings import TexturedBackground
-from hsi_sc_nerf.simulate.effects.translucency import Translucency
-from hsi_sc_nerf.simulate.reading import check_ranges, read_dataclass
 
 _ORDER: tuple[type[Effect], ...] = (
     PartialTurn,
@@ -47,7 +49,7 @@ _ORDER: tuple[type[Effect], ...] = (
     Gloss,
     TexturedBackground,
     Drying,
-    LampDrift,
+    DriftingLamps,
     IlluminationFalloff,
     LensDistortion,
     OpticalBlur,
@@ -61,37 +63,43 @@ _ORDER: tuple[type[Effect], ...] = (
     BadPixels,
 )
 EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
-"""Every effect by its name, in the order in which effects of one stage act."""
+"""All effects by name, in the order in which effects of one stage act."""
 
 Stage = TypeVar("Stage", bound=Effect)
 
 
 def of_stage(effects: Sequence[Effect], stage: type[Stage]) -> tuple[Stage, ...]:
-    """The effects that act in a stage, in order."""
+    """The effects of one stage, in order."""
     return tuple(effect for effect in effects if isinstance(effect, stage))
 
 
 def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
-    """Effects of a scene file's list: each a name, or a name with strengths (``read_noise: {electrons: 40}``).
+    """Effects of a scene file's list, in the order in which they act.
 
-    They come back in the order in which they act.
+    Args:
+        values: names, or names with settings such as ``{"read_noise": {"electrons": 40}}``.
+        source: name of the file or option in error messages.
 
     Raises:
-        InputError: an unknown or repeated effect; an unknown, missing, mistyped or out-of-range strength.
+        InputError: an unknown or repeated effect; an unknown, missing, mistyped or out-of-range setting.
+
+    Example:
+        >>> read_effects(["photon_noise", {"lamp": {"fraction": 0.3}}], "scene.yaml")
+        (Lamp(fraction=0.3, azimuth_deg=-35.0, elevation_deg=30.0), PhotonNoise())
     """
     found: dict[str, Effect] = {}
-    strengths: dict[str, Any]
+    settings: dict[str, Any]
     for value in values:
         if isinstance(value, str):
-            name, strengths = value, {}
+            name, settings = value, {}
         elif isinstance(value, dict) and len(value) == 1:
-            ((name, strengths),) = value.items()
+            ((name, settings),) = value.items()
         else:
-            raise InputError(f"{source}: effect {value!r} is neither a name nor `name: {{strength: value}}`.")
+            raise InputError(f"{source}: effect {value!r} is neither a name nor `name: {{setting: value}}`.")
         if name not in EFFECTS:
             raise InputError(f"{source}: effect {name!r} is unknown; known are {', '.join(EFFECTS)}.")
         if name in found:
             raise InputError(f"{source}: effect {name} is named twice; name it once.")
-        found[name] = read_dataclass(EFFECTS[name], strengths or {}, source, f"effects.{name}.")
+        found[name] = read_dataclass(EFFECTS[name], settings or {}, source, f"effects.{name}.")
         check_ranges(found[name], source, f"effects.{name}.")
     return tuple(found[name] for name in EFFECTS if name in found)

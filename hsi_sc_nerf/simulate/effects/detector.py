@@ -1,4 +1,9 @@
-"""The detector: what belongs to its pixels, one for each sample and band, and is the same in every exposure."""
+"""Effects of the detector: spectral smile, exposure, fixed patterns, bad pixels and noise.
+
+With `PhotonNoise` and `ReadNoise` the variance of a pixel's counts is linear in its mean, the photon transfer curve
+(Janesick, "Photon Transfer", SPIE 2007): ``variance = (mean - dark) / g + (electrons / g)^2``, where g is the number
+of electrons per count. The digitiser adds 1/12.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +13,24 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effects.stages import DetectorEffect, ExposureEffect, ReadoutContext, ReadoutEffect
-from hsi_sc_nerf.simulate.reading import between
+
+FEW_ELECTRONS = 50.0
+"""Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
 
 
 @dataclass(frozen=True)
 class SpectralSmile(DetectorEffect):
-    """Lines of one wavelength are curved on the detector: its pixels see other wavelengths than the header states.
+    """The wavelength of a band varies along the detector's line (spectral smile).
 
-    The shift is a parabola along the detector's line: nothing in the middle, ``shift_nm`` at both ends. It is in all
-    captures, and calibration with the tarp's mean spectrum leaves it in.
+    The shift is a parabola: 0 in the middle of the line, ``shift_nm`` at both ends. It affects all captures, and
+    calibration with the mean spectrum of the tarp does not remove it.
     """
 
     name: ClassVar[str] = "spectral_smile"
     shift_nm: float = between(-20.0, 20.0, default=1.5)
-    """Wavelength at the ends of the line less that in its middle, nm."""
+    """Wavelength at the ends of the line minus that in its middle, nm."""
 
     def wavelengths_nm(
         self, centres_nm: Float[np.ndarray, "bands"], samples: int
@@ -34,42 +42,42 @@ class SpectralSmile(DetectorEffect):
 
 @dataclass(frozen=True)
 class Saturation(ExposureEffect):
-    """The integration time is too long: what is too bright stops at the largest count.
+    """The integration time is too long, and bright pixels saturate.
 
-    It lengthens the integration time of the whole session, white tarp included, because the paper's session has one
-    (10 ms), here set for a dark object. So calibration stays right wherever neither the object nor the tarp stops; a
-    tarp at 0.82 of the largest count stops, in its brightest bands, from a factor of about 1.2 on. `tarp_exposure`
-    gives the tarp a time of its own.
+    The effect changes the integration time of the whole session, white tarp included, as the paper's session has one
+    integration time. Calibration stays correct where neither object nor tarp saturates. With the default
+    ``white_level`` the tarp saturates in its brightest bands above a factor of 1.2; `TarpExposure` gives the tarp an
+    integration time of its own.
     """
 
     name: ClassVar[str] = "saturation"
     exposure_factor: float = between(1.0, 100.0, default=1.5)
-    """Integration time over the one at which the tarp counts the sensor's ``white_level``."""
+    """Ratio of the integration time to the one at which the tarp counts the sensor's ``white_level``."""
 
     def factor(self, of_white: bool) -> float:
-        """`exposure_factor`, in all captures."""
+        """`exposure_factor` in all captures."""
         return self.exposure_factor
 
 
 @dataclass(frozen=True)
 class TarpExposure(ExposureEffect):
-    """The white tarp is taken with another integration time than the frames, as one sets it by hand for each.
+    """White tarp and frames are captured with different integration times.
 
-    The metadata of each capture states its own; reflectance is off by the factor for who does not read them.
+    The metadata of each capture state its integration time.
     """
 
     name: ClassVar[str] = "tarp_exposure"
     exposure_factor: float = between(0.01, 100.0, default=0.5)
-    """Integration time of the white tarp over that of the frames."""
+    """Ratio of the white tarp's integration time to that of the frames."""
 
     def factor(self, of_white: bool) -> float:
-        """`exposure_factor` for the tarp; the frames keep theirs."""
+        """`exposure_factor` for the tarp, 1 for the frames."""
         return self.exposure_factor if of_white else 1.0
 
 
 @dataclass(frozen=True)
 class DarkPattern(ReadoutEffect):
-    """The dark level is another one in each detector pixel; a dark cube takes it off."""
+    """Each detector pixel has its own dark level (fixed pattern), which a dark cube records."""
 
     name: ClassVar[str] = "dark_pattern"
     spread: float = between(0.0, 1000.0, default=6.0)
@@ -82,40 +90,37 @@ class DarkPattern(ReadoutEffect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Add the pattern."""
+        """Add the fixed pattern."""
         counts += context.maps["dark_offset"]
         return counts
 
 
 @dataclass(frozen=True)
 class BadPixels(ReadoutEffect):
-    """Some detector pixels do not follow the light: dead ones stay at the dark level, hot ones at the largest count.
+    """Some detector pixels are dead (constant dark level) or hot (constant largest count).
 
-    A detector pixel is one sample in one band, so each is a line across the image of its band. Whole bands can be
-    dead, too.
+    A detector pixel is one sample in one band, so each bad pixel is a line in the image of its band. Whole bands can
+    be dead as well.
     """
 
     name: ClassVar[str] = "bad_pixels"
-    dead_share: float = between(0.0, 0.5, default=0.0005)
-    """Share of the detector pixels that are dead."""
-    hot_share: float = between(0.0, 0.5, default=0.0005)
-    """Share of the detector pixels that are hot."""
+    dead_fraction: float = between(0.0, 0.5, default=0.0005)
+    """Fraction of the detector pixels that are dead."""
+    hot_fraction: float = between(0.0, 0.5, default=0.0005)
+    """Fraction of the detector pixels that are hot."""
     dead_bands: int = between(0, 2048, default=0)
     """Number of bands that are dead in all samples."""
 
     def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """``dead`` and ``hot``: which pixels are, never both.
-
-        Their numbers are the shares, rounded; the pixels of dead bands come on top and are dead, not hot.
-        """
+        """Boolean maps ``dead`` and ``hot``, which are disjoint; pixels of dead bands are dead in addition."""
         pixels = samples * bands
-        dead, hot = round(self.dead_share * pixels), round(self.hot_share * pixels)
+        dead, hot = round(self.dead_fraction * pixels), round(self.hot_fraction * pixels)
         chosen = rng.permutation(pixels)
         maps = np.zeros((2, pixels), bool)
         maps[0, chosen[:dead]] = True
         maps[1, chosen[dead : dead + hot]] = True
         of_dead, of_hot = maps.reshape(2, samples, bands)
-        # Drawn last, so that the other pixels are the same with and without dead bands.
+        # Drawn last: the other bad pixels do not depend on the number of dead bands.
         dead_bands = rng.permutation(bands)[: self.dead_bands]
         of_dead[:, dead_bands] = True
         of_hot[:, dead_bands] = False
@@ -124,7 +129,69 @@ class BadPixels(ReadoutEffect):
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Overwrite what the bad pixels read."""
+        """Overwrite the counts of bad pixels."""
         counts[:, context.maps["dead"]] = context.dark_level
         counts[:, context.maps["hot"]] = context.largest_count
         return counts
+
+
+@dataclass(frozen=True)
+class PhotonNoise(ReadoutEffect):
+    """Shot noise: the number of electrons is Poisson distributed, so its variance equals its mean."""
+
+    name: ClassVar[str] = "photon_noise"
+
+    def read_out(
+        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
+    ) -> Float[np.ndarray, "lines samples bands"]:
+        """Draw the electrons of the signal above the dark level and convert them back to counts."""
+        electrons = np.maximum(counts - np.float32(context.dark_level), 0.0, dtype=np.float32)
+        electrons *= np.float32(context.electrons_per_count)
+        # One line at a time fits in the processor's cache.
+        for line in electrons:
+            line[...] = poisson(line, context.rng)
+        electrons /= np.float32(context.electrons_per_count)
+        electrons += np.float32(context.dark_level)
+        return electrons
+
+
+@dataclass(frozen=True)
+class ReadNoise(ReadoutEffect):
+    """The amplifier adds normally distributed noise that does not depend on the signal."""
+
+    name: ClassVar[str] = "read_noise"
+    electrons: float = between(0.0, 1e5, default=40.0)
+    """Root mean square, electrons."""
+
+    def read_out(
+        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
+    ) -> Float[np.ndarray, "lines samples bands"]:
+        """Add the noise."""
+        spread = np.float32(self.electrons / context.electrons_per_count)
+        for line in counts:
+            line += spread * context.rng.standard_normal(line.shape, dtype=np.float32)
+        return counts
+
+
+def poisson(mean: Float[np.ndarray, "*n"], rng: np.random.Generator) -> Float[np.ndarray, "*n"]:
+    """Poisson numbers as float32: exact below `FEW_ELECTRONS`, else by `many_electrons`."""
+    drawn = many_electrons(mean, rng.standard_normal(mean.shape, dtype=np.float32))
+    few = mean < FEW_ELECTRONS
+    drawn[few] = rng.poisson(mean[few])
+    return drawn
+
+
+def many_electrons(mean: Float[np.ndarray, "*n"], normal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Approximate Poisson numbers of a large mean from standard normal numbers z.
+
+    Rounded Cornish-Fisher expansion ``mean + s z + (z^2 - 1) / 6``. Mean and variance are exact with
+    ``s^2 = mean - 1/18 - 1/12``, where 1/18 is the variance of the square and 1/12 that of the rounding. For means of
+    at least `FEW_ELECTRONS` the error of the cumulative distribution is at most 2e-4.
+    """
+    number = np.sqrt(np.maximum(mean - np.float32(5.0 / 36.0), 0.0, dtype=np.float32))
+    # s z + (z^2 - 1) / 6 = (s + z / 6) z - 1 / 6, in place.
+    number += normal / np.float32(6.0)
+    number *= normal
+    number += mean - np.float32(1.0 / 6.0)
+    np.rint(number, out=number)
+    return np.maximum(number, 0.0, out=number)

@@ -1,4 +1,4 @@
-"""The lens: what is not sharp, and what is not straight."""
+"""Effects of the camera optics: blur, lens distortion and rotation of the image."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from scipy.special import ive
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect
-from hsi_sc_nerf.simulate.reading import between
+from hsi_sc_nerf.settings_file import between
+from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect, OrientationEffect
 
 Coefficients = tuple[float, float, float, float]
 NEWTON_STEPS = 20
 UNDISTORTED_TO = 1e-10
-"""Of the focal length: a ten-millionth of a pixel."""
+"""Residual of the undistortion as a fraction of the focal length, about 1e-7 pixel."""
 
 
 @dataclass(frozen=True)
 class OpticalBlur(OpticsEffect):
-    """The lens spreads each point over a Gaussian of the same width in all bands."""
+    """The lens blurs the image with a Gaussian of the same width in all bands."""
 
     name: ClassVar[str] = "optical_blur"
     sigma_px: float = between(0.05, 50.0, default=0.6)
     """Standard deviation along each axis, pixels."""
 
     def image(self, light: Float[np.ndarray, "lines samples columns"]) -> Float[np.ndarray, "lines samples columns"]:
-        """The image of the light; at the borders what leaves is reflected, so that nothing is lost."""
+        """The blurred image; reflection at the borders conserves the total."""
         kernel = gaussian_kernel(self.sigma_px)
         for axis in (0, 1):
             light = correlate1d(light, kernel, axis=axis, mode="reflect")
@@ -39,15 +39,15 @@ class OpticalBlur(OpticsEffect):
 
 @dataclass(frozen=True)
 class LensDistortion(LensEffect):
-    """Straight lines come out curved (Brown-Conrady, in OpenCV's terms and coordinates, y down).
+    """Lens distortion after Brown and Conrady, with the coefficients and axes of OpenCV.
 
-    The poses and the pinhole intrinsics of the truth hold; its ``distortion`` says where the lens moves their
-    projections to, as ``cv2.projectPoints`` takes it.
+    Poses and pinhole intrinsics of the truth do not change; ``distortion`` of the truth holds the coefficients as
+    ``cv2.projectPoints`` takes them.
     """
 
     name: ClassVar[str] = "lens_distortion"
     k1: float = between(-2.0, 2.0, default=-0.15)
-    """Radial, second order: below 0 is a barrel, above 0 a pincushion."""
+    """Radial, second order: negative is barrel, positive pincushion distortion."""
     k2: float = between(-2.0, 2.0, default=0.0)
     """Radial, fourth order."""
     p1: float = between(-0.1, 0.1, default=0.0)
@@ -62,10 +62,10 @@ class LensDistortion(LensEffect):
     def straighten(
         self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
     ) -> Float[np.ndarray, "*n 2"]:
-        """Where the pinhole camera sees what the lens brings to these pixel coordinates.
+        """Undistorted pixel coordinates.
 
         Raises:
-            InputError: the lens folds the image within its frame, so that a pixel sees no single direction.
+            InputError: the distortion is not invertible within the image.
         """
         focal = np.array([intrinsics.fl_x, intrinsics.fl_y])
         centre = np.array([intrinsics.cx, intrinsics.cy])
@@ -81,7 +81,7 @@ class LensDistortion(LensEffect):
 def gaussian_kernel(sigma_px: float) -> Float[np.ndarray, "2*radius+1"]:
     """The discrete Gaussian ``exp(-t) I_n(t)``, t = sigma^2 (Lindeberg 1990, "Scale-space for discrete signals").
 
-    Unlike samples of a Gaussian, its variance is t exactly, however narrow it is, and one after another add theirs.
+    Unlike samples of a Gaussian, its variance is exactly t, and variances of successive kernels add.
     """
     radius = int(np.ceil(8.0 * max(sigma_px, 1.0)))
     kernel = ive(np.abs(np.arange(-radius, radius + 1)), sigma_px**2)
@@ -89,7 +89,7 @@ def gaussian_kernel(sigma_px: float) -> Float[np.ndarray, "2*radius+1"]:
 
 
 def distort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens moves points of the image plane at distance 1, y down (OpenCV's model)."""
+    """Distorted points of the image plane at distance 1, y down (OpenCV's model)."""
     k1, k2, p1, p2 = coefficients
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
@@ -104,10 +104,7 @@ def distort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Fl
 
 
 def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Float[np.ndarray, "*n 2"] | None:
-    """The points that `distort` moves to the given ones, by Newton's method.
-
-    None where it does not get there, or only beyond a fold of the lens.
-    """
+    """Inverse of `distort` by Newton's method; None if it does not converge or the model is not invertible there."""
     k1, k2, p1, p2 = coefficients
     found = points
     for _ in range(NEWTON_STEPS):
@@ -128,3 +125,20 @@ def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> 
         step_y = (xx * missing_y - xy * missing_x) / determinant
         found = found + np.stack([step_x, step_y], axis=-1)
     return None
+
+
+@dataclass(frozen=True)
+class ImageRotation(OrientationEffect):
+    """The file holds a rotated image, as that of a SPECIM IQ, whose slit is upright and scans sideways.
+
+    The image is rotated before it reaches the sensor. Fixed patterns, smile and noise belong to the sensor, whose
+    line is the sample axis of every cube, and are not rotated.
+    """
+
+    name: ClassVar[str] = "image_rotation"
+    quarter_turns: int = between(1, 3, default=1)
+    """Counter-clockwise rotations by 90 degrees from the upright image to the file (k of ``np.rot90``)."""
+
+    def orient(self, image: np.ndarray) -> np.ndarray:
+        """Rotate an upright image (lines, samples, ...)."""
+        return np.ascontiguousarray(np.rot90(image, self.quarter_turns))

@@ -1,22 +1,22 @@
-"""The places in the simulation where an effect can act, in the order in which they are passed.
+"""The stages of the simulation at which an effect can act, in the order of the simulation.
 
-An effect is a frozen dataclass whose fields are its strengths; it derives from the stages that it acts in and
-overrides their one method. A stage is a loop over the named effects of its kind: without any, no code of any effect
-runs. Within a stage effects act in the order of `effects.EFFECTS`, whatever the order in the scene file.
+An effect is a frozen dataclass whose fields are its settings. It derives from the base class of each stage in which
+it acts and overrides that class's method. Within a stage, effects act in the order of `effects.EFFECTS`, whatever
+their order in the scene file. A scene without effects runs no code of any effect.
 
-    motion        which frames are taken, at which angles, from where
-    placement     where disc, container and object lie with respect to the axis
-    deformation   the object's shape in each frame
-    lens          which ray each pixel looks along
-    light         how much light each visible point sends to the camera, and of which materials' colours
-    chamber       what is seen where the rays miss everything that turns
-    optics        the image on the sensor
-    material      the materials' spectra in each frame
-    illumination  the lamps, in time and over the image
-    orientation   how the image lies on the sensor, and so in the file
-    detector      which wavelength each detector pixel sees
-    exposure      how long the sensor collects light
-    readout       from noise-free counts to what is digitised
+    motion        which frames are taken, at which turntable angles and from which camera poses
+    placement     position of disc, container and object relative to the turntable axis
+    deformation   shape of the object in each frame
+    lens          direction of the ray of each pixel
+    light         light that each visible point sends to the camera
+    chamber       what is visible where rays miss everything on the turntable
+    optics        image on the sensor
+    material      reflectance of the materials in each frame
+    illumination  lamps, over time and over the image
+    orientation   rotation of the image in the file
+    detector      wavelength of each detector pixel
+    exposure      integration time
+    readout       noise-free counts to digitised counts
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ from jaxtyping import Float
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.simulate.lighting import HitLight, SurfaceLight
+    from hsi_sc_nerf.simulate.light import HitLight, SurfaceLight
     from hsi_sc_nerf.simulate.materials import Material
     from hsi_sc_nerf.simulate.render import Hits
 
 
 class Effect:
-    """A physical phenomenon beyond a matte object under even light that a perfect sensor sees."""
+    """A departure from a matte object, even light and a perfect sensor."""
 
     name: ClassVar[str]
-    """As it is written in a scene file."""
+    """Name in scene files."""
 
 
 def effect_rng(seed: int, effect: Effect, *exposure: int) -> np.random.Generator:
-    """The random numbers of one effect, in one exposure or (without) for the whole session.
+    """Random generator of one effect, for one exposure or, without ``exposure``, for the whole session.
 
-    They depend on the scene's seed, the effect's name and the exposure alone, so that neither another effect nor the
-    order in which frames are made changes them.
+    It depends on the scene's seed, the effect's name and the exposure only. Other effects and the order in which
+    frames are simulated do not change it.
     """
-    # The length goes with them, because NumPy takes a seed that ends in zeros for the shorter one.
+    # The length is part of the seed because NumPy ignores trailing zeros of a seed.
     return np.random.default_rng([seed, zlib.crc32(effect.name.encode()), len(exposure), *exposure])
 
 
@@ -59,12 +59,12 @@ class FramePlan:
     """The frames of a session, in the order in which they are taken.
 
     Attributes:
-        room_camera: camera-to-world of the camera that stands still, for a turntable at angle 0.
-        angles_deg: the turntable's true angle in each frame, positive counter-clockwise.
-        elapsed: time of each frame as a share of the session, 0 to 1.
-        nominal_step_deg: what the operator believes the step to be, positive.
-        direction: what the operator believes the turn to be, seen from above.
-        tilts: rotation of the turntable's axis out of its place in each frame, or None where it keeps its place.
+        room_camera: camera-to-world pose of the stationary camera, with the turntable at angle 0.
+        angles_deg: true angle of the turntable in each frame, positive counter-clockwise.
+        elapsed: time of each frame as a fraction of the session, in [0, 1].
+        nominal_step_deg: step as the operator states it in ``session.json``, positive.
+        direction: direction of rotation as the operator states it, seen from above.
+        tilts: rotation of the turntable axis in each frame; None if the axis does not move.
     """
 
     room_camera: Float[np.ndarray, "4 4"]
@@ -76,10 +76,10 @@ class FramePlan:
 
     @property
     def camera_to_world(self) -> Float[np.ndarray, "n 4 4"]:
-        """Pose of the camera in each frame, object frame.
+        """Camera pose of each frame in the object frame.
 
-        A point X of the object lies at ``tilt Rot(z, angle) X`` in the room, so the camera lies at the inverse of
-        that times its place in the room.
+        A point X of the object is at ``tilt Rot(z, angle) X`` in the room; the camera pose is transformed by the
+        inverse.
         """
         poses = []
         for i, angle in enumerate(self.angles_deg):
@@ -91,7 +91,7 @@ class FramePlan:
         return np.stack(poses)
 
     def select(self, frames: np.ndarray) -> FramePlan:
-        """Only the given frames, by index, in the given order; the times stay the ones of their places."""
+        """The plan of the given frame indices, in that order, with their times."""
         return replace(
             self,
             angles_deg=self.angles_deg[frames],
@@ -101,33 +101,33 @@ class FramePlan:
 
 
 class MotionEffect(Effect):
-    """Changes which frames are taken and from where."""
+    """Changes which frames are taken, and the camera poses."""
 
     def replan(self, plan: FramePlan, rng: np.random.Generator) -> FramePlan:
-        """The plan with the effect in it."""
+        """The plan under the effect."""
         raise NotImplementedError
 
 
 class PlacementEffect(Effect):
-    """Puts all that turns somewhere else with respect to the axis."""
+    """Moves disc, container and object relative to the turntable axis."""
 
     def offset_m(self) -> Float[np.ndarray, "3"]:
-        """Shift of disc, markers, container and object in the object frame, metres."""
+        """Shift in the object frame, metres."""
         raise NotImplementedError
 
 
 class DeformationEffect(Effect):
-    """Changes the object's shape in the course of the session."""
+    """Changes the shape of the object during the session."""
 
     def deform(
         self, vertices: Float[np.ndarray, "v 3"], foot_m: Float[np.ndarray, "3"], elapsed: float
     ) -> Float[np.ndarray, "v 3"]:
-        """The object's vertices at a time of the session; ``foot_m`` is the point that it stands on."""
+        """Vertices of the object at time ``elapsed``, in [0, 1]; the object stands on the point ``foot_m``."""
         raise NotImplementedError
 
 
 class LensEffect(Effect):
-    """Bends the rays of the pinhole camera."""
+    """Bends the rays of the pinhole camera (a `render.Lens`)."""
 
     def coefficients(self) -> tuple[float, float, float, float]:
         """k1, k2, p1, p2 of OpenCV's model."""
@@ -136,53 +136,53 @@ class LensEffect(Effect):
     def straighten(
         self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
     ) -> Float[np.ndarray, "*n 2"]:
-        """Where a camera without the effect sees what is seen at these pixel coordinates."""
+        """Pixel coordinates in the pinhole image of what the lens images at ``pixels``."""
         raise NotImplementedError
 
 
 class LightEffect(Effect):
-    """Changes how much light each visible point sends to the camera, and of which colours."""
+    """Changes the light that visible points send to the camera."""
 
 
 class SurfaceLightEffect(LightEffect):
-    """Changes the light of the surface, which is the same from everywhere and turns with the object."""
+    """Changes the light that leaves the surface equally in all directions and rotates with the object."""
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
-        """The surface's light with the effect."""
+        """The light of the surface under the effect."""
         raise NotImplementedError
 
 
 class ViewLightEffect(LightEffect):
-    """Changes what the surface's light becomes on its way to the camera; acts after those on the surface."""
+    """Changes light that depends on the view; acts after all `SurfaceLightEffect`."""
 
     def at_hits(self, hits: Hits, light: HitLight, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
-        """The light with the effect, where the camera's rays hit."""
+        """The light under the effect at the hits of the camera's rays."""
         raise NotImplementedError
 
 
 class ChamberEffect(Effect):
-    """Puts something in front of the chamber's wall: it stands still in the image."""
+    """Covers the wall of the chamber with a pattern that is stationary in the image."""
 
     materials: ClassVar[tuple[str, ...]]
-    """Materials that it needs beside the scene's."""
+    """Materials of the pattern."""
 
     def cover(
         self, size_px: int, materials: tuple[str, ...], rng: np.random.Generator
     ) -> Float[np.ndarray, "lines samples materials"]:
-        """What each pixel sees where it sees the chamber: shares of ``materials`` that sum to 1."""
+        """Fractions of ``materials`` in each pixel of the wall, summing to 1."""
         raise NotImplementedError
 
 
 class OpticsEffect(Effect):
-    """Changes the image between the object and the sensor."""
+    """Changes the image on the sensor."""
 
     def image(self, light: Float[np.ndarray, "lines samples columns"]) -> Float[np.ndarray, "lines samples columns"]:
-        """The image on the sensor; acts on each column alone and keeps their sum over the image."""
+        """The image on the sensor; each column is filtered alone, and its sum over the image stays the same."""
         raise NotImplementedError
 
 
 class MaterialEffect(Effect):
-    """Changes the object's spectra in the course of the session."""
+    """Changes the reflectance of the object during the session."""
 
     def spectra(
         self,
@@ -191,51 +191,52 @@ class MaterialEffect(Effect):
         wavelengths_nm: Float[np.ndarray, "*samples bands"],
         elapsed: float,
     ) -> Float[np.ndarray, "*samples materials bands"]:
-        """Reflectance of the object's materials at a time of the session; tables a sample for a detector's smile."""
+        """Reflectance of the object's materials at time ``elapsed``; one table a sample under a spectral smile."""
         raise NotImplementedError
 
 
 class IlluminationEffect(Effect):
-    """Changes the lamps in time or over the image, for the object and the white tarp alike."""
+    """Changes the light of the lamps over time or over the image, for object and white tarp alike."""
 
     def factor(
         self, size_px: int, wavelengths_nm: Float[np.ndarray, "bands"], lamp_temperature_k: float, elapsed: float
     ) -> Float[np.ndarray, "#lines #samples #bands"]:
-        """Light with the effect over light without it; 1 at the image's centre at the start of the session."""
+        """Ratio of the light with and without the effect; 1 at the image centre at the start of the session."""
         raise NotImplementedError
 
 
 class DetectorEffect(Effect):
-    """Changes which wavelength a detector pixel sees."""
+    """Changes the wavelength of detector pixels."""
 
     def wavelengths_nm(
         self, centres_nm: Float[np.ndarray, "bands"], samples: int
     ) -> Float[np.ndarray, "samples bands"]:
-        """Wavelength at each sample of the detector's line, for the band centres that the header states."""
+        """Wavelength of each detector pixel, for the band centres that the header states."""
         raise NotImplementedError
 
 
 class ExposureEffect(Effect):
-    """Changes how long the sensor collects light."""
+    """Changes the integration time."""
 
     def factor(self, of_white: bool) -> float:
-        """The integration time over the one for which the sensor's ``white_level`` is right.
+        """Ratio of the integration time to the one at which the white tarp counts the sensor's ``white_level``.
 
-        ``of_white`` asks for that of the white tarp's capture, otherwise it is the one that all frames share.
+        Args:
+            of_white: whether the capture is that of the white tarp; all other frames have one integration time.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class ReadoutContext:
-    """What a read-out knows beside the counts.
+    """Properties of the sensor and of the exposure that a read-out effect needs.
 
     Attributes:
-        largest_count: of the digitiser.
+        largest_count: largest count of the digitiser.
         dark_level: counts without light.
-        electrons_per_count: the sensor's gain.
-        maps: of this effect, from its `ReadoutEffect.detector_maps`.
-        rng: random numbers of this exposure.
+        electrons_per_count: gain of the sensor.
+        maps: result of the effect's `ReadoutEffect.detector_maps`.
+        rng: random generator of this exposure.
     """
 
     largest_count: int
@@ -246,28 +247,22 @@ class ReadoutContext:
 
 
 class ReadoutEffect(Effect):
-    """Changes counts between the light and the digitiser: of frames, white and dark cubes alike."""
+    """Changes counts before they are digitised, in frames, white and dark cubes alike."""
 
     def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """What belongs to the detector's pixels (samples, bands) and is the same in every exposure, by name.
-
-        It is drawn once and kept in the truth; by default there is nothing.
-        """
+        """Maps (samples, bands) that are the same in every exposure, by name; stored with the truth."""
         return {}
 
     def read_out(
         self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
     ) -> Float[np.ndarray, "lines samples bands"]:
-        """Counts with the effect, not yet rounded or clipped; dark counts are in them already.
-
-        ``counts`` (float32) may be overwritten.
-        """
+        """Counts under the effect, dark level included, neither rounded nor clipped; may overwrite ``counts``."""
         raise NotImplementedError
 
 
 class OrientationEffect(Effect):
-    """Changes how the image lies on the sensor, whose line is the samples of the file."""
+    """Rotates the image on the sensor, whose line is the sample axis of the file."""
 
     def orient(self, image: np.ndarray) -> np.ndarray:
-        """An upright image (lines, samples, ...) as it lies in the file."""
+        """An upright image (lines, samples, ...) as the file holds it."""
         raise NotImplementedError

@@ -1,1 +1,1 @@
-"""How well a simulated session was processed, against its known truth."""
+"""Errors of processing and analysis against the truth of simulated sessions."""

@@ -1,4 +1,4 @@
-"""Traits against the truth of a simulated object: ideal clouds of it, and what its surface really holds."""
+"""The true surface of a simulated object: ideal clouds, true spectra and material fractions."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
-# A surface point is seen where a camera's ray ends at it, to within this.
-_OCCLUSION_M = 0.0001
+_OCCLUSION_M = 0.0001  # tolerance of the distance at which a camera's ray hits a visible point
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class TrueSurface:
     Attributes:
         materials: names.
         mesh: metres, object frame.
-        weights: share of each material at each vertex.
+        weights: fraction of each material at each vertex.
         endmembers: reflectance of each material.
         wavelengths_nm: band centres.
     """
@@ -44,7 +43,7 @@ class TrueSurface:
 
     @classmethod
     def of(cls, truth: Truth) -> TrueSurface:
-        """That of a simulated session."""
+        """The true surface of a simulated session."""
         vertex = PlyData.read(str(truth.mesh_path))["vertex"]
         columns = {p.name.removeprefix("weight_"): vertex[p.name] for p in vertex.properties if "weight_" in p.name}
         endmembers = truth.endmembers[[truth.materials.index(name) for name in columns]]
@@ -57,11 +56,11 @@ class TrueSurface:
         return (self.weights[chosen] @ self.endmembers).astype(np.float32)
 
     def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the surface's nearest place to each point: unit normal, shares of materials, and distance (m)."""
+        """Unit normal, material fractions and distance (m) of the nearest surface point of each point."""
         found = self._scene().compute_closest_points(np.asarray(points_m, np.float32))
         triangle, uv = found["primitive_ids"].numpy().astype(np.int64), found["primitive_uvs"].numpy()
-        share = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
-        weights = np.einsum("nc,ncm->nm", share, self.weights[self.mesh.triangles[triangle]])
+        barycentric = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+        weights = np.einsum("nc,ncm->nm", barycentric, self.weights[self.mesh.triangles[triangle]])
         normals = found["primitive_normals"].numpy().astype(float)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         return normals, weights, np.linalg.norm(found["points"].numpy() - points_m, axis=1)
@@ -69,12 +68,12 @@ class TrueSurface:
     def seen(
         self, points_m: Float[np.ndarray, "n 3"], eyes_m: Float[np.ndarray, "cameras 3"]
     ) -> Bool[np.ndarray, "n"]:
-        """Which points of the surface some camera sees, hidden by nothing but the object itself."""
+        """Which points of the surface are visible from at least one camera position, occluded by the object only."""
         scene, seen = self._scene(), np.zeros(len(points_m), bool)
         for eye in eyes_m:
-            along = points_m - eye
-            distance_m = np.linalg.norm(along, axis=1)
-            rays = np.concatenate([np.broadcast_to(eye, along.shape), along / distance_m[:, None]], axis=1)
+            offset_m = points_m - eye
+            distance_m = np.linalg.norm(offset_m, axis=1)
+            rays = np.concatenate([np.broadcast_to(eye, offset_m.shape), offset_m / distance_m[:, None]], axis=1)
             hit_m = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy()
             seen |= hit_m > distance_m - _OCCLUSION_M
         return seen
@@ -82,13 +81,13 @@ class TrueSurface:
     def cloud(
         self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0
     ) -> SpectralCloud:
-        """A cloud as an ideal reconstruction would give it: even, of what the cameras see, with true spectra.
+        """The cloud of an ideal reconstruction: uniform, visible points with true spectra.
 
         Args:
-            count: of points on the whole surface; those that no camera sees are missing.
-            eyes_m: places of the cameras.
-            noise_m: standard deviation of each point's place in each direction; normals scatter by 0.3 rad with any.
-            seed: of places and noise.
+            count: number of points on the whole surface, invisible ones included.
+            eyes_m: positions of the cameras.
+            noise_m: standard deviation of the position in each direction; if positive, normals scatter by 0.3 rad.
+            seed: seed of positions and noise.
         """
         rng = np.random.default_rng(seed)
         points = sample_surface(self.mesh.vertices, self.mesh.triangles, count, seed)
@@ -109,5 +108,5 @@ class TrueSurface:
 
 
 def relative_rms(measured: Float[np.ndarray, "bands"], true: Float[np.ndarray, "bands"]) -> float:
-    """Root mean square of a spectrum's error as a share of the root mean square of the true spectrum."""
+    """Root mean square error of a spectrum relative to the root mean square of the true spectrum."""
     return float(np.sqrt(np.mean(np.square(measured - true)) / np.mean(np.square(true))))

@@ -1,4 +1,4 @@
-"""Which parts of a simulated object some view sees: the rest of the truth nobody can reconstruct."""
+"""The parts of a simulated object that are visible in at least one view, and so can be reconstructed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from hsi_sc_nerf.meshes.mesh import ray_scene
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
 COVERED = 0.5
-"""Share of a pixel that the object must cover for the pixel to show it."""
+"""Smallest fraction of an object pixel that the object covers."""
 LIFT_M = 1e-5
-"""How far above its own surface a point's line of sight starts."""
+"""Offset of the origin of a line of sight from the surface."""
 
 
 def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:
@@ -55,17 +55,21 @@ def seen_points(
     triangles: Int[np.ndarray, "t 3"],
     track: Callable[[tuple[str, ...]], Iterable[str]] = iter,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether some view sees each point of the object's surface.
+    """Whether each point of the object's surface is visible in at least one view.
 
-    A view sees a point that projects into a pixel which shows the object, and whose line of sight the object itself
-    does not block. What stands before the object (the container's wall) leaves the pixel without the object.
+    A point is visible in a view if it projects into an object pixel and the object does not occlude it. Pixels in
+    which another part occludes the object are not object pixels.
 
     Args:
-        truth: Of the session.
-        points_m: On the surface, object frame.
-        vertices_m: Of the object's mesh.
-        triangles: Of the object's mesh.
-        track: Wrapped around the captures, for a progress bar.
+        truth: truth of the session.
+        points_m: points on the surface, object frame, metres.
+        vertices_m: vertices of the object's mesh, metres.
+        triangles: triangles of the object's mesh.
+        track: wrapper of the captures that shows a progress bar.
+
+    Example:
+        >>> mesh = truth.mesh()
+        >>> seen_points(truth, mesh.vertices, mesh.vertices, mesh.triangles).mean()
     """
     scene = ray_scene(vertices_m, triangles)
     seen = np.zeros(len(points_m), bool)

@@ -1,4 +1,7 @@
-"""Typed values from YAML: dataclasses whose keys, types and ranges are checked, each fault one clear sentence."""
+"""Typed reader of settings files: fills dataclasses from YAML values and checks keys, types and ranges.
+
+Every error is one sentence that names the file and the key.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,22 @@ def between(low: float, high: float, **kwargs: Any) -> Any:
 
 
 def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
-    """Fill the dataclass ``cls`` from a mapping, checking keys and types; ``prefix`` is the path down to here."""
+    """Fill a dataclass from a mapping and check its keys and types.
+
+    Args:
+        cls: the dataclass; fields may be numbers, texts, paths, literals, tuples, optional values, dataclasses, or
+            unions of dataclasses whose first field is a literal that tells them apart.
+        values: content of the file or of one of its keys.
+        source: name of the file in error messages.
+        prefix: path of keys down to ``values``, with a dot at its end; empty for the whole file.
+
+    Raises:
+        InputError: an unknown or missing key, or a value of the wrong type.
+
+    Example:
+        >>> read_dataclass(MarkerSettings, {"side_m": 0.036}, "scene.yaml", "markers.").side_m
+        0.036
+    """
     where = prefix.rstrip(".") or "the file"
     if not isinstance(values, dict):
         raise InputError(f"{source}: {where} must hold `key: value` lines, not {values!r}.")
@@ -33,11 +51,11 @@ def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
 
 
 def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
-    """Check one value against its declared type; whole numbers pass for floats, YAML lists become tuples."""
+    """Check one value against its declared type; integers are accepted as floats, lists become tuples."""
     if get_origin(expected) is dict:
         return value
     if get_origin(expected) is types.UnionType:
-        expected = _chosen(expected, value, source, key)
+        expected = _union_member(expected, value, source, key)
     if dataclasses.is_dataclass(expected):
         return read_dataclass(expected, value, source, key + ".")
     if get_origin(expected) is Literal:
@@ -62,9 +80,8 @@ def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
     return expected(value)
 
 
-def _chosen(union: Any, value: Any, source: str, key: str) -> Any:
-    """The member of a union that a value is for: of an optional type the type, of dataclasses the one whose first
-    field, the kind, allows what the value gives there."""
+def _union_member(union: Any, value: Any, source: str, key: str) -> Any:
+    """The type of a union to which a value belongs: of dataclasses the one whose first field allows the value's."""
     kinds = [kind for kind in get_args(union) if kind is not types.NoneType]
     if len(kinds) == 1:
         return kinds[0]
@@ -79,7 +96,7 @@ def _chosen(union: Any, value: Any, source: str, key: str) -> Any:
 
 
 def check_ranges(values: Any, source: str, prefix: str) -> None:
-    """Check the fields made by `between`, down into dataclasses; ``prefix`` is the path down to here.
+    """Check the ranges of fields made by `between`, also of nested dataclasses; arguments as in `read_dataclass`.
 
     Raises:
         InputError: a value lies outside its range.
