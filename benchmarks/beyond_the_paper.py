@@ -25,20 +25,21 @@ from rich.table import Table
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.machine import describe_machine
-from hsi_sc_nerf.benchmark.results import TrainedRun, describe_in_words
-from hsi_sc_nerf.benchmark.run import HeldOutViews
-from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.results import describe_in_words
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock, HeldOutViews
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
-from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
+from hsi_sc_nerf.evaluation.comparison import CompareConfig
+from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
-from hsi_sc_nerf.evaluation.threshold_curves import score_at
+from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.scores.processing import score_processing
+from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -97,7 +98,7 @@ class BeyondThePaper:
         if self.page is not None:
             write_table(self.page, "beyond the paper", TITLES, rows, self._caption())
 
-    def _train(self, name: str, folder: Path) -> list[TrainedRun]:
+    def _train(self, name: str, folder: Path) -> list[BenchmarkRun]:
         for session, effects in (("session", (*NOISE, *SHADING)), ("noise-free", SHADING)):
             scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=effects)
             if not (folder / session).exists():
@@ -114,7 +115,7 @@ class BeyondThePaper:
         )
         return train_all([named_configuration(known) for known in self.configurations], command)
 
-    def _judged(self, folder: Path, run: TrainedRun) -> dict[str, float]:
+    def _judged(self, folder: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
         trained = folder / "runs" / run.name
         kept = trained / "judged.json"
@@ -166,13 +167,14 @@ def cloud_scores(config: Path, folder: Path, output_dir: Path) -> dict[str, floa
     options = ["--output-dir", str(output_dir), "--num-points", str(CLOUD_POINTS)]
     run_step("export", [*export, *options], output_dir / "export.log")
     scores = {}
+    cloud = Surface(read_surface(output_dir / "point_cloud.ply")[0])
     for name, whole in (("whole", True), ("seen", False)):
-        compared = compare(
-            output_dir / "point_cloud.ply",
-            folder / "session",
-            CompareConfig(distances="points", whole_reference=whole),
-        )
-        score = score_at(compared.to_reference_m, compared.to_cloud_m, paper.F_SCORE_THRESHOLD_M)
+        reference = true_reference(folder / "session", CompareConfig(whole_reference=whole))
+        points_m = reference.surface.points_m
+        counted_m = points_m if reference.seen is None else points_m[reference.seen]
+        # Distances between points are the paper's.
+        distances = Surface(points_m).distances_m(cloud.points_m), cloud.distances_m(counted_m)
+        score = score_at(*distances, paper.F_SCORE_THRESHOLD_M)
         scores |= {f"{name}_{figure}": value for figure, value in asdict(score).items()}
     return scores
 
@@ -190,7 +192,7 @@ TITLES = [
 ]
 
 
-def object_rows(name: str, runs: Sequence[TrainedRun], judged: Sequence[Mapping[str, float]]) -> list[list[str]]:
+def object_rows(name: str, runs: Sequence[BenchmarkRun], judged: Sequence[Mapping[str, float]]) -> list[list[str]]:
     """The paper's row, one for each run, and what the noise and the views would allow."""
     printed: Mapping[str, float] = PAPER.get(name, {})
     cells = [f"{printed[metric]:.{digits}f}" if metric in printed else "-" for metric, (_, digits) in METRICS.items()]

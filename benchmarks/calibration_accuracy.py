@@ -20,9 +20,8 @@ from rich.progress import track
 from rich.table import Table
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig, LampDriftConfig
 from hsi_sc_nerf.calibration.report import draw_calibration
-from hsi_sc_nerf.calibration.session_calibration import calibrate_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -40,7 +39,7 @@ SENSOR = (
     "image_rotation",
 )
 NOISE = ("photon_noise", "read_noise", "dark_pattern")
-PLAIN = CalibrationConfig(lamp_drift=LampDriftConfig(correct="never"))
+PLAIN = CalibrationConfig(lamp_drift="never")
 CORRECTED = CalibrationConfig(flat_field=True)
 SESSIONS: dict[str, tuple[tuple[str, ...], CalibrationConfig]] = {
     "none": ((), PLAIN),

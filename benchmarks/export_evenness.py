@@ -2,11 +2,11 @@
 
     uv run python benchmarks/export_evenness.py SESSION point_cloud.ply
 
-The part of the true mesh that at least one frame sees, less than 80 degrees from the front, is cut into patches
-around evenly spread centres. The spread of points per area over the patches is compared with chance (points thrown
-at the surface independently) and with rays through random pixels, whose density is the sum of cos / distance^2 over
-frames that see a place. What is uneven is told by height: a stalk that the model makes too thick gets more points,
-and what the dataset's masks leave out, less.
+The part of the true mesh that at least one frame sees at less than 80 degrees is cut into patches around evenly
+spread centres. The coefficient of variation of points per area over the patches is compared with that of independent
+random points, and of rays through random pixels, whose density is the sum of cos / distance^2 over the frames that
+see a point. Points per area are also given by height: a stalk that the model makes too thick gets more points, and
+parts that the dataset's masks leave out get fewer.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.scores.visible_surface import seen_points
 from hsi_sc_nerf.simulate.truth import load_truth
-from hsi_sc_nerf.surface.surface_mesh import SurfaceMesh
-from hsi_sc_nerf.surface.visibility import MIN_COSINE
+from hsi_sc_nerf.surface.surface_depth import MIN_COSINE
+from hsi_sc_nerf.surface.tsdf_fusion import SurfaceMesh
 
 REFERENCE_POINTS = 100_000
 HEIGHTS = 10
@@ -33,7 +33,7 @@ HEIGHTS = 10
 def coefficient_of_variation(
     weights: Float[np.ndarray, "n"], patches: np.ndarray, areas: Float[np.ndarray, "patches"]
 ) -> float:
-    """Of the weights' sum per area over patches, patches weighted by their area."""
+    """Coefficient of variation of the weights' sum per area over patches, weighted by the patches' area."""
     density = np.bincount(patches, weights, minlength=len(areas)) / areas
     mean = np.average(density, weights=areas)
     return float(np.sqrt(np.average((density - mean) ** 2, weights=areas)) / mean)
@@ -60,18 +60,18 @@ class ExportEvenness:
         for capture, pose in zip(truth.captures, truth.camera_to_world, strict=True):
             alone = replace(truth, captures=(capture,), camera_to_world=pose[None])
             visible = seen_points(alone, surface, mesh.vertices, mesh.triangles)
-            way = pose[:3, 3] - surface
-            distance = np.linalg.norm(way, axis=1)
-            cosine = (way * normals).sum(axis=1) / distance
+            to_camera = pose[:3, 3] - surface
+            distance = np.linalg.norm(to_camera, axis=1)
+            cosine = (to_camera * normals).sum(axis=1) / distance
             density += np.where(visible, cosine.clip(0.0) / distance**2, 0.0)
             seen |= visible & (cosine > MIN_COSINE)
         centres = cKDTree(_spread(surface[seen], self.patches))
         patch = centres.query(surface[seen])[1]
         areas = np.bincount(patch, minlength=self.patches).astype(float)
         points = centres.query(cloud.points)[1]
-        print(f"{len(points):,} points, {self.patches} patches; spread of points per area:")
+        print(f"{len(points):,} points, {self.patches} patches; coefficient of variation of points per area:")
         print(f"  this cloud           {coefficient_of_variation(np.ones(len(points)), points, areas):.3f}")
-        print(f"  chance               {np.sqrt(self.patches / len(points)):.3f}")
+        print(f"  random points        {np.sqrt(self.patches / len(points)):.3f}")
         print(f"  rays through pixels  {coefficient_of_variation(density[seen], patch, areas):.3f} beside chance")
         edges = np.linspace(surface[seen, 2].min(), surface[seen, 2].max(), HEIGHTS + 1)
         area, of_rays, of_cloud = (
@@ -82,11 +82,11 @@ class ExportEvenness:
                 (cloud.points[:, 2], np.full(len(points), seen.sum() / len(points))),
             )
         )
-        print("height, mm; share of the area; points per area: this cloud, rays through pixels")
-        for low, high, share, cloud_share, ray_share in zip(
+        print("height, mm; fraction of the area; points per area: this cloud, rays through pixels")
+        for low, high, fraction, cloud_density, ray_density in zip(
             edges[:-1], edges[1:], area / area.sum(), of_cloud / area, of_rays / area, strict=True
         ):
-            print(f"  {1e3 * low:5.1f} to {1e3 * high:5.1f}  {share:.2f}  {cloud_share:.2f}  {ray_share:.2f}")
+            print(f"  {1e3 * low:5.1f} to {1e3 * high:5.1f}  {fraction:.2f}  {cloud_density:.2f}  {ray_density:.2f}")
 
 
 def _surface(

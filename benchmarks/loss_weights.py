@@ -18,8 +18,8 @@ from rich.table import Table
 
 from hsi_sc_nerf.benchmark.configurations import Configuration, named_configuration
 from hsi_sc_nerf.benchmark.machine import describe_machine
-from hsi_sc_nerf.benchmark.results import TrainedRun, describe_in_words
-from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.results import describe_in_words
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import process_session
@@ -118,7 +118,7 @@ class LossWeights:
         if self.page is not None:
             write_table(self.page, "loss weights", titles, rows, self._caption(runs))
 
-    def _caption(self, runs: list[TrainedRun]) -> str:
+    def _caption(self, runs: list[BenchmarkRun]) -> str:
         ends = [run.checkpoints[-1] for run in runs]
         iterations = sorted(end.iteration for end in ends)
         seconds = sorted(end.train_seconds for end in ends)
@@ -138,7 +138,7 @@ def weighted(base: str, angular: float, hsi: float) -> Configuration:
     return Configuration(f"{base}-angular-{angular:g}-hsi-{hsi:g}", known.method, known.words + words)
 
 
-def comparison(runs: list[TrainedRun]) -> tuple[list[str], list[list[str]]]:
+def comparison(runs: list[BenchmarkRun]) -> tuple[list[str], list[list[str]]]:
     """Titles and rows: each weighting as the paper printed it, and as it came out here."""
     stages = ("pre-trained", "fine-tuned")
     titles = ["(angular, hsi)", "", *(f"{title}, {stage}" for title, _ in METRICS.values() for stage in stages)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hsi_sc_nerf.benchmark.results import markdown_table
+from hsi_sc_nerf.tables import markdown_table
 
 
 def write_table(

@@ -40,7 +40,8 @@ from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
-from hsi_sc_nerf.surface.point_cloud import sample_surface_points
+from hsi_sc_nerf.surface.depth_renders import render_depth_maps
+from hsi_sc_nerf.surface.surface_points import sample_surface_points
 
 COLUMNS = {
     "poses": "{poses}",
@@ -267,14 +268,10 @@ def _cloud_m(trainer: StagedTrainer) -> Float[np.ndarray, "n 3"]:
     """Points of the learned surface, metres."""
     manager = trainer.pipeline.datamanager
     scene = manager.train_dataparser_outputs
-    cloud = sample_surface_points(
-        trainer.pipeline.model,
-        manager.train_dataset.cameras,
-        manager.train_pixel_sampler.masks,
-        CLOUD_POINTS,
-        rays_per_batch=4096,
-        box=scene.metadata["object_box"],
-    )
+    model, masks = trainer.pipeline.model, manager.train_pixel_sampler.masks
+    renders = render_depth_maps(model, manager.train_dataset.cameras, masks, rays_per_batch=4096)
+    box = scene.metadata["object_box"].cpu().numpy()
+    cloud = sample_surface_points(model, renders, CLOUD_POINTS, rays_per_batch=4096, box=box)
     return cloud.points / scene.dataparser_scale - scene.dataparser_transform[:, 3].numpy()
 
 

@@ -32,9 +32,8 @@ from rich.table import Table
 from spectral.io import envi
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.calibration.session_calibration import calibrate_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.envi import Cube, write_cube
 from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.cli.steps import run_step

@@ -1,10 +1,10 @@
-"""How far below the true surface of a simulated session a trained model's rays have collected how much opacity.
+"""Opacity that rays of a trained model have collected by depth below the true surface of a simulated session.
 
     uv run python benchmarks/surface_depth.py SESSION RUN/config.yml
 
-Rays of training frames through the object, which meet the true surface less than 60 degrees from the front, are
-followed from 6 mm before it to 8 mm behind it. Opacity is what a ray from the front would have collected on the way.
-`export.camera_views.SURFACE_OPACITY` is chosen by these figures.
+The rays are those of training frames that hit the true surface at less than 60 degrees from its normal. They are
+followed from 6 mm before the surface to 8 mm behind it. Opacity is that of a ray along the normal. The figures give
+`surface.surface_depth.SURFACE_OPACITY`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from rich.table import Table
 from hsi_sc_nerf.meshes.mesh import ray_scene
 from hsi_sc_nerf.models.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.simulate.truth import load_truth
-from hsi_sc_nerf.surface.crossing import opacity_crossing_depth
-from hsi_sc_nerf.surface.depth_renders import camera_rays
+from hsi_sc_nerf.surface.surface_depth import camera_rays, opacity_crossing_depth
 
 LEVELS = (0.05, 0.07, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
 BEFORE_M, BEHIND_M, STEP_M = 0.006, 0.008, 0.0001
@@ -40,9 +39,9 @@ class SurfaceDepth:
     load_config: tyro.conf.Positional[Path]
     """The run's config.yml."""
     rays: int = 4000
-    """Rays that are followed."""
+    """Number of rays."""
     seed: int = 0
-    """Of their choice."""
+    """Seed of the random rays."""
 
     def main(self) -> None:
         """Measure and print."""
@@ -56,7 +55,7 @@ class SurfaceDepth:
         below_m = depths_below_surface(
             run, origins_m[frontal], directions[frontal], depths_m[frontal], cosines[frontal]
         )
-        table = Table("opacity", "below the true surface, mm: mean", "standard deviation", "share of rays, %")
+        table = Table("opacity", "below the true surface, mm: mean", "standard deviation", "fraction of rays, %")
         for level, below in zip(LEVELS, below_m, strict=True):
             reached = np.isfinite(below)
             figures = (1e3 * below[reached].mean(), 1e3 * below[reached].std(), 100.0 * reached.mean())
@@ -82,12 +81,12 @@ def depths_below_surface(
     depths_m: Float[np.ndarray, "n"],
     cosines: Float[np.ndarray, "n"],
 ) -> list[Float[np.ndarray, "n"]]:
-    """For each of `LEVELS`, how far below the surface (m) rays reach it; NaN for those that do not."""
+    """Depth below the surface (m) at which rays reach each of `LEVELS`; NaN for those that do not."""
     below = np.arange(-BEFORE_M, BEHIND_M, STEP_M)
     along_m = depths_m[:, None] + below / cosines[:, None]
     middles_m = (along_m[:, 1:] + along_m[:, :-1]) / 2.0
-    places = run.to_scene(origins_m[:, None] + directions[:, None] * middles_m[..., None])
-    densities = run.model.field.density_fn(torch.from_numpy(places).float().to(run.model.device))[..., 0].cpu()
+    points = run.to_scene(origins_m[:, None] + directions[:, None] * middles_m[..., None])
+    densities = run.model.field.density_fn(torch.from_numpy(points).float().to(run.model.device))[..., 0].cpu()
     densities = densities * torch.from_numpy(cosines[:, None]).float()
     edges = torch.from_numpy(along_m * run.scale).float()
     results = []

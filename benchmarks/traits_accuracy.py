@@ -17,19 +17,18 @@ import torch
 import tyro
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh, open_edges
-from hsi_sc_nerf.analysis.regions import PickedRegion, region_spectrum
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
-from hsi_sc_nerf.analysis.traits import classified
-from hsi_sc_nerf.benchmark.results import markdown_table
+from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.tables import markdown_table
 
 EVERY_KTH_CAMERA = 5
 ROI_RADIUS_M = 0.005
@@ -114,7 +113,7 @@ def _roi_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
     centres = ideal.mesh.vertices[rng.choice(len(chances), ROIS, p=chances / chances.sum())]
     errors = []
     for centre in centres:
-        spot = PickedRegion("spot", tuple(centre.tolist()), ROI_RADIUS_M)
+        spot = RegionOfInterest("spot", tuple(centre.tolist()), ROI_RADIUS_M)
         measured, true = (region_spectrum("spot", one, spot.of(one)).mean for one in (surface, ideal))
         errors.append(relative_rms(measured, true))
     x, y, z = 1000.0 * centres[int(np.argmax(errors))]

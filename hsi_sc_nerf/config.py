@@ -1,6 +1,6 @@
-"""What nerfstudio discovers: the methods `hsi-sc-nerf` and `hsi-sc-nerf-paper`.
+"""The methods that nerfstudio discovers: `hsi-sc-nerf` and `hsi-sc-nerf-paper`.
 
-(The data parser that goes with them is found in `data.dataparser`.)
+nerfstudio discovers the data parser in `data.dataparser`.
 """
 
 from __future__ import annotations
@@ -13,25 +13,33 @@ from nerfstudio.plugins.types import MethodSpecification
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataManagerConfig
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
-from hsi_sc_nerf.export.nerfstudio_adapter import extend_export_point_cloud
+from hsi_sc_nerf.export.ns_export import extend_export_point_cloud
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
-from hsi_sc_nerf.models.pipeline import SpectralPipelineConfig
+from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
-from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 from hsi_sc_nerf.models.stages import StageConfig, exponential_decay, full_frame_stage, masked_stage
+from hsi_sc_nerf.viewer.panel import attach_spectral_panel
 
 allow_nerfstudio_checkpoints()
 extend_export_point_cloud()
 
 
+def pipeline_with_panel(config: SpectralPipelineConfig, **options) -> SpectralPipeline:
+    """The pipeline of a run, with the viewer's spectral panel. Saved ``config.yml`` files name this function."""
+    pipeline = SpectralPipeline(config, **options)
+    attach_spectral_panel(pipeline)
+    return pipeline
+
+
 def _adam(lr: float) -> dict:
-    """An optimiser whose learning rate the stages scale; nerfstudio's own schedules stay off."""
+    """An optimiser without a schedule; the stages scale its learning rate."""
     return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
 
 
 def _published_lr(step: int) -> float:
-    """Factor on the learning rates of the released schedule."""
+    """Factor on the learning rates in the paper's released schedule."""
     return exponential_decay(paper.LEARNING_RATE_DECAY, paper.LEARNING_RATE_DECAY_STEPS, step)
 
 
@@ -42,7 +50,7 @@ def _method(
     full_frame: StageConfig,
     masked: StageConfig,
 ) -> StagedTrainerConfig:
-    """A method's trainer: everything in it that the two methods have in common."""
+    """Configuration of a method's trainer, with all that the two methods have in common."""
     return StagedTrainerConfig(
         method_name=method_name,
         max_num_iterations=sum(paper.STAGE_ITERATIONS),
@@ -53,7 +61,7 @@ def _method(
         pipeline=pipeline,
         optimizers={name: _adam(lr) for name, lr in optimizers.items()},
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-        # The progress bar of the stages takes the place of nerfstudio's table of lines.
+        # The progress bar of the stages replaces nerfstudio's table.
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),
         viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer+tensorboard",
@@ -62,27 +70,27 @@ def _method(
     )
 
 
-_BASIS_AND_BACKGROUND = {"basis": 1e-3, "background": 1e-2}
-
 hsi_sc_nerf = MethodSpecification(
     config=_method(
         "hsi-sc-nerf",
-        SpectralPipelineConfig(datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()),
-        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4} | _BASIS_AND_BACKGROUND,
+        SpectralPipelineConfig(
+            _target=pipeline_with_panel, datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()
+        ),
+        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4},
         full_frame=full_frame_stage(),
         masked=masked_stage(),
     ),
     description="HSI-SC-NeRF: hyperspectral 3D reconstruction of turntable captures from a stationary camera.",
 )
 
-# The published recipe as text and released settings give it; what neither names is nerfacto's own default. What we
-# think is wrong with it is left as it is: an unbounded scene round a bounded object, the chamber explained by
-# whatever floats in it, corrections of the poses that are thrown away, empty space that the second stage does not
-# look at, learning rates that hardly fall.
+# The recipe of the paper's text and released settings; settings that neither names are nerfacto's defaults. It keeps
+# an unbounded scene around a bounded object, no background, pose corrections that are discarded after the first
+# stage, no background rays in the second stage, and learning rates that hardly fall.
 hsi_sc_nerf_paper = MethodSpecification(
     config=_method(
         "hsi-sc-nerf-paper",
         SpectralPipelineConfig(
+            _target=pipeline_with_panel,
             datamanager=SpectralDataManagerConfig(
                 dataparser=SpectralDataParserConfig(scene="cameras"),
                 train_num_rays_per_batch=paper.RAYS_PER_BATCH,
@@ -114,20 +122,18 @@ hsi_sc_nerf_paper = MethodSpecification(
                 camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
             ),
         ),
-        # The preset itself has neither basis nor picture of the chamber: they wait for those who ask for them.
-        {"fields": paper.LEARNING_RATE, "proposal_networks": paper.LEARNING_RATE, "camera_opt": 1e-3}
-        | _BASIS_AND_BACKGROUND,
+        {"fields": paper.LEARNING_RATE, "proposal_networks": paper.LEARNING_RATE, "camera_opt": 1e-3},
         full_frame=StageConfig(
             name="full-frame",
-            share=0.5,
+            fraction=0.5,
             learn_after={},
             lr_end=_published_lr(paper.STAGE_ITERATIONS[0]),
             group_lr={"camera_opt": (1.0, 0.1)},
         ),
         masked=StageConfig(
             name="masked",
-            share=0.5,
-            foreground_share=1.0,
+            fraction=0.5,
+            foreground_ray_fraction=1.0,
             frozen_groups=("camera_opt",),
             learn_after={},
             lr_start=_published_lr(paper.STAGE_ITERATIONS[0]),

@@ -1,9 +1,9 @@
-"""The one exception that bad input raises."""
+"""The exception for bad input."""
 
 
 class InputError(Exception):
     """Something that the user gave cannot be used.
 
-    The message is one sentence for the user: which file, what is wrong with it, and what to do. Command lines
-    print it without a traceback and exit with status 2.
+    The message is one sentence: which file, what is wrong with it, and what to do. The command line prints it without
+    a traceback and exits with status 2.
     """

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing: files appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ TEMPORARY_PREFIX = ".partial-"
 
 @contextmanager
 def atomic_write(*paths: Path) -> Iterator[list[Path]]:
-    """Temporary siblings to write to, moved on to ``paths`` (in their order) when the block ends well.
+    """Context manager that gives a temporary file for each path and renames it to the path at the end of the block.
 
-    A sibling keeps its file's suffix and is hidden (its name begins with a dot). When the block fails, the
-    siblings are deleted and the files that were at ``paths`` stay as they were. Missing folders are made.
+    The temporary files lie beside the paths, are hidden, and have the same suffixes. If the block fails, they are
+    deleted and the files at ``paths`` stay as they are. Missing folders are made.
 
     Raises:
         InputError: the operating system refused to write (full disk, no permission).
+
+    Example:
+        >>> with atomic_write(Path("out/table.csv")) as (temporary,):
+        ...     temporary.write_text("a,b")
     """
     temporary = [path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}") for path in paths]
     try:
@@ -41,13 +45,13 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
         ) from error
     finally:
         for source in temporary:
-            # What cannot be deleted was not written either; the error above says why.
+            # A file that cannot be deleted was not written; the error above says why.
             with suppress(OSError):
                 source.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and what it lies in, where they are missing.
+    """Make a folder and its missing parents.
 
     Raises:
         InputError: the operating system refused, or something else has that name.
@@ -61,7 +65,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` as readable JSON, whole or not at all.
+    """Write ``content`` as indented JSON.
 
     Raises:
         InputError: the operating system refused to write.
@@ -71,12 +75,12 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:
-    """Write an 8-bit gray or RGB picture, whole or not at all.
+    """Write an 8-bit gray or RGB image.
 
     Raises:
         InputError: the operating system refused to write.
     """
-    in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(in_opencv_order))
+    bgr = image if image.ndim == 2 else image[..., ::-1]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(bgr))
     with atomic_write(path) as (temporary,):
         temporary.write_bytes(encoded.tobytes())

@@ -11,7 +11,7 @@ from scipy import ndimage
 def ellipse_close_open(
     mask: Bool[np.ndarray, "lines samples"], *, close_px: int, open_px: int
 ) -> Bool[np.ndarray, "lines samples"]:
-    """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is left out)."""
+    """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is skipped)."""
     for operation, size in ((cv2.MORPH_CLOSE, close_px), (cv2.MORPH_OPEN, open_px)):
         if size >= 2:
             ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -42,7 +42,7 @@ def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarra
 
 
 def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
-    """The mask with everything that it encloses."""
+    """The mask with its holes filled."""
     return ndimage.binary_fill_holes(mask)
 
 

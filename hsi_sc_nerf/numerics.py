@@ -1,4 +1,4 @@
-"""Numerically safe norms, ratios, roots, logarithms and spectral angles (torch); losses and metrics rest on these.
+"""Numerically safe ratios, roots, logarithms and spectral angles (torch), which losses and metrics are made of.
 
 Two rules hold for every function here:
 
@@ -71,11 +71,6 @@ def _root(values: Tensor) -> Tensor:
 def safe_sqrt(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Square root; 0 with gradient 0 for 0 and for what rounding made negative."""
     return narrow(_root(widen(values)), values)
-
-
-def safe_norm(values: Float[Tensor, "*shape"], dim: int = -1, keepdim: bool = False) -> Float[Tensor, "*rest"]:
-    """Euclidean norm along ``dim``; its gradient at the zero vector is 0."""
-    return narrow(_root(widen(values).square().sum(dim, keepdim)), values)
 
 
 def safe_ratio(

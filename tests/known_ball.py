@@ -55,7 +55,7 @@ class BallModel:
 
     background: object | None = object()
 
-    def spectra_behind(self, rays):
+    def background_spectrum(self, rays):
         """A chamber of one grey."""
         return torch.full((len(rays), len(WAVELENGTHS_NM)), 0.1)
 

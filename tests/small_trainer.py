@@ -18,6 +18,8 @@ def trainer(tiny_dataset, folder, device="cpu", **changes):
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.machine.device_type = device
     config.max_num_iterations, config.evaluate_stages = STEPS, False
+    if model.camera_optimizer.mode == "auto":  # which is off for the tiny dataset's markers
+        model.camera_optimizer.mode = "turntable"
     for key, value in changes.items():
         setattr(config, key, value)
     made = config.setup(local_rank=0, world_size=1)

@@ -1,4 +1,4 @@
-"""The base that no camera sees: the object's surface goes on to where it stands, and is flat there."""
+"""The unseen base: the seen surface is continued down to the plane that the object stands on, and closed there."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from scipy.ndimage import gaussian_filter1d
 from hsi_sc_nerf.errors import InputError
 
 SECTORS = 72
-# Share of a sector's points that lie below its edge: strays.
-_STRAYS = 0.005
-# The surface's slope at the edge is that of this much of it.
+# Fraction of a sector's points taken for outliers below its edge.
+_OUTLIERS = 0.005
+# Height of the strip above the edge whose mean slope is the slope at the edge.
 _STRIP_M = 0.003
-# A skirt that is flatter than this (radius to height) would reach far on little evidence.
+# Largest slope (radius over height) of the extrapolated surface: a flatter one would reach far on little evidence.
 _FLATTEST = 2.0
-# How far errors of the cloud and of the base's height may put the surface's edge below the base.
+# Errors of the cloud and of the base's height may place the edge this far below the base.
 _BELOW_BASE_M = 0.005
 
 
 @dataclass(frozen=True)
 class Base:
-    """Where the seen surface ends and what closes it, by sectors of azimuth about ``centre_m``.
+    """Edge of the seen surface and outline of the base, by sectors of azimuth about ``centre_m``.
 
     Attributes:
-        centre_m: x and y of the middle.
+        centre_m: x and y of the centre.
         height_m: z of the plane that the object stands on.
         edge_height_m: z at which the seen surface ends.
-        edge_radius_m: distance of that edge from the middle.
-        foot_radius_m: distance of the base's outline from the middle.
+        edge_radius_m: distance of that edge from the centre.
+        foot_radius_m: distance of the base's outline from the centre.
     """
 
     centre_m: Float[np.ndarray, "2"]
@@ -40,7 +40,7 @@ class Base:
     foot_radius_m: Float[np.ndarray, "sectors"]
 
     def points(self, spacing_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Points about ``spacing_m`` apart on the skirt (edge to outline) and the flat base, with outward normals."""
+        """Points ``spacing_m`` apart on the wall (edge to outline) and the flat base, with outward unit normals."""
         edge_m = float(self.edge_radius_m.max())
         around = max(SECTORS, int(np.ceil(2.0 * np.pi * edge_m / spacing_m)))
         azimuth = 2.0 * np.pi * np.arange(around) / around
@@ -48,12 +48,11 @@ class Base:
             self._at(values, azimuth) for values in (self.edge_height_m, self.edge_radius_m, self.foot_radius_m)
         )
         out = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-        # An edge a little below the base needs no wall.
         drop_m = np.maximum(edge_z - self.height_m, 0.0)
         length_m = np.hypot(edge_r - foot_r, drop_m)
         steps = int(np.ceil(length_m.max() / spacing_m))
-        share = (np.arange(steps) + 0.5)[:, None] / max(steps, 1)
-        radius, z = edge_r + share * (foot_r - edge_r), edge_z - share * drop_m
+        fraction = (np.arange(steps) + 0.5)[:, None] / max(steps, 1)
+        radius, z = edge_r + fraction * (foot_r - edge_r), edge_z - fraction * drop_m
         wall = np.concatenate([radius[..., None] * out, z[..., None]], axis=-1)
         wall_normals = np.concatenate([drop_m[:, None] * out, (foot_r - edge_r)[:, None]], axis=-1)
         wall_normals = np.broadcast_to(wall_normals, wall.shape)
@@ -77,7 +76,7 @@ class Base:
 
 
 def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], height_m: float) -> Base:
-    """Where an object that stands upright (z up) closes: its surface goes straight on, down to the base's plane.
+    """Extrapolate the surface of an upright object (z up) straight down to the base's plane.
 
     Args:
         points_m: the seen surface.
@@ -110,22 +109,22 @@ def find_base(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
 
 
 def lower_rim(points_m: Float[np.ndarray, "n 3"], width_m: float) -> Bool[np.ndarray, "n"]:
-    """Points less than ``width_m`` above where the surface of an object that stands upright ends.
+    """Points less than ``width_m`` above the lower edge of an upright object.
 
-    There, rays graze it and masks end: reconstructed, the last millimetres often hang down straight.
+    Rays graze the surface there and masks end, so that the last reconstructed millimetres often hang straight down.
     """
     z, sector = points_m[:, 2], _sectors(points_m[:, :2] - _centre(points_m))
     return z < _edges(z, sector)[sector] + width_m
 
 
 def lowest_edge_m(points_m: Float[np.ndarray, "n 3"]) -> float:
-    """z at which the surface of an object that stands upright ends at its lowest."""
+    """Lowest z of the lower edge of an upright object."""
     sector = _sectors(points_m[:, :2] - _centre(points_m))
     return float(_smooth_around(_edges(points_m[:, 2], sector)).min())
 
 
 def _centre(points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2"]:
-    """Middle of the lowest strip, x and y."""
+    """x and y of the centre of the lowest strip."""
     low = points_m[points_m[:, 2] < _edge(points_m[:, 2]) + _STRIP_M, :2]
     return (low.min(axis=0) + low.max(axis=0)) / 2.0
 
@@ -136,8 +135,8 @@ def _sectors(offset_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
 
 
 def _edge(z_m: Float[np.ndarray, "n"]) -> float:
-    """Height at which points end, strays below it left out."""
-    return float(np.quantile(z_m, _STRAYS))
+    """Height of the lowest points, without outliers."""
+    return float(np.quantile(z_m, _OUTLIERS))
 
 
 def _edges(z_m: Float[np.ndarray, "n"], sector: Int[np.ndarray, "n"]) -> Float[np.ndarray, "sectors"]:

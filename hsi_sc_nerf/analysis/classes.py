@@ -1,4 +1,4 @@
-"""Classes on the surface by spectral angle, and the connected regions that they form."""
+"""Classes on the surface: by spectral angle, by linear unmixing, and the connected regions that they form."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import nnls
+from trimesh.graph import connected_component_labels
 
-from hsi_sc_nerf.analysis.poisson import pieces
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
 
@@ -17,13 +18,13 @@ _CHUNK_SPECTRA = 1 << 12
 
 
 @dataclass(frozen=True)
-class Region:
+class ConnectedRegion:
     """A connected part of one class.
 
     Attributes:
         label: number of the class.
-        area_m2: on the surface.
-        centre_m: mean place, weighted by area.
+        area_m2: surface area.
+        centre_m: mean position, weighted by area, object frame.
     """
 
     label: int
@@ -34,12 +35,12 @@ class Region:
 def spectral_angles(
     spectra: Float[np.ndarray, "n bands"], references: Float[np.ndarray, "classes bands"]
 ) -> Float[np.ndarray, "n classes"]:
-    """Angle of each spectrum to each reference, radians (paper, Eq. SAM)."""
+    """Angle between each spectrum and each reference, radians in [0, pi] (paper, Eq. SAM)."""
     angles = np.empty((len(spectra), len(references)), np.float32)
-    wanted = torch.from_numpy(np.asarray(references, np.float32))
+    targets = torch.from_numpy(np.asarray(references, np.float32))
     for start in range(0, len(spectra), _CHUNK_SPECTRA):
         some = torch.from_numpy(np.asarray(spectra[start : start + _CHUNK_SPECTRA], np.float32))
-        for column, reference in enumerate(wanted):
+        for column, reference in enumerate(targets):
             angles[start : start + len(some), column] = spectral_angle(some, reference.expand_as(some)).numpy()
     return angles
 
@@ -47,9 +48,22 @@ def spectral_angles(
 def classify(
     spectra: Float[np.ndarray, "n bands"], references: Float[np.ndarray, "classes bands"], threshold_rad: float
 ) -> Int[np.ndarray, "n"]:
-    """The reference with the smallest spectral angle (Kruse et al. 1993), or -1 where it is over the threshold.
+    """Spectral angle mapper: the index of the reference with the smallest spectral angle (Kruse et al. 1993).
 
-    Angles do not depend on brightness: shade does not change a class.
+    The angle does not depend on brightness, so shade does not change a class.
+
+    Args:
+        spectra: reflectance.
+        references: reflectance of each class.
+        threshold_rad: largest angle of a class's spectra to its reference.
+
+    Returns:
+        Index of each spectrum's reference; -1 where every angle exceeds the threshold.
+
+    Example:
+        >>> references = np.array([[0.1, 0.5], [0.5, 0.1]])
+        >>> classify(np.array([[0.2, 0.9], [0.3, 0.3]]), references, threshold_rad=0.1)
+        array([ 0, -1])
     """
     angles = spectral_angles(spectra, references)
     nearest = angles.argmin(axis=1)
@@ -57,7 +71,7 @@ def classify(
 
 
 def vertex_areas_m2(mesh: Mesh) -> Float[np.ndarray, "v"]:
-    """Each vertex's share of the surface: a third of each of its triangles. They add up to the mesh's area."""
+    """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
     thirds = np.repeat(mesh.triangle_areas_m2() / 3.0, 3)
     return np.bincount(mesh.triangles.ravel(), thirds, minlength=len(mesh.vertices))
 
@@ -65,26 +79,52 @@ def vertex_areas_m2(mesh: Mesh) -> Float[np.ndarray, "v"]:
 def class_areas_m2(
     labels: Int[np.ndarray, "v"], areas_m2: Float[np.ndarray, "v"], seen: Bool[np.ndarray, "v"], classes: int
 ) -> Float[np.ndarray, "classes_and_none"]:
-    """Area of each class, and as the last entry of what was seen but is in none."""
-    places = np.where(labels == UNCLASSIFIED, classes, labels)
-    return np.bincount(places[seen], areas_m2[seen], minlength=classes + 1)
+    """Area of each class; the last entry is the seen area that is in no class."""
+    classes_of = np.where(labels == UNCLASSIFIED, classes, labels)
+    return np.bincount(classes_of[seen], areas_m2[seen], minlength=classes + 1)
 
 
 def connected_regions(
     mesh: Mesh, labels: Int[np.ndarray, "v"], areas_m2: Float[np.ndarray, "v"], smallest_m2: float
-) -> list[Region]:
-    """Connected regions of equal class with at least ``smallest_m2``, the largest first; unclassified is no class."""
-    a, b, c = labels[mesh.triangles].T
-    same_ab, same_bc, same_ca = a == b, b == c, c == a
-    t = mesh.triangles
-    edges = np.concatenate([t[same_ab][:, [0, 1, 1]], t[same_bc][:, [1, 2, 2]], t[same_ca][:, [2, 0, 0]]])
-    piece = pieces(edges, len(labels))
+) -> list[ConnectedRegion]:
+    """Connected regions of one class with an area of at least ``smallest_m2``, in descending order of area."""
+    edges = mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
+    piece = connected_component_labels(edges, node_count=len(labels))
     area = np.bincount(piece, areas_m2)
     centre = np.stack([np.bincount(piece, areas_m2 * x) for x in mesh.vertices.T], axis=-1)
     label = np.full(len(area), UNCLASSIFIED)
     label[piece] = labels
     listed = np.flatnonzero((label != UNCLASSIFIED) & (area >= smallest_m2))
     return [
-        Region(int(label[i]), float(area[i]), tuple((centre[i] / area[i]).tolist()))
+        ConnectedRegion(int(label[i]), float(area[i]), tuple((centre[i] / area[i]).tolist()))
         for i in listed[np.argsort(-area[listed])]
     ]
+
+
+def unmix(
+    spectra: Float[np.ndarray, "n bands"], endmembers: Float[np.ndarray, "endmembers bands"]
+) -> tuple[Float[np.ndarray, "n endmembers"], Float[np.ndarray, "n"]]:
+    """Linear spectral unmixing: the fraction of each endmember in each spectrum.
+
+    Non-negative least squares (Heinz and Chang, "Fully constrained least squares linear spectral mixture analysis",
+    2001). The fractions are scaled to add up to 1 afterwards, so that they do not depend on brightness.
+
+    Args:
+        spectra: reflectance.
+        endmembers: reflectance of the pure materials.
+
+    Returns:
+        Fractions in [0, 1], which add up to 1 (all 0 where a spectrum holds no endmember), and the spectral angle
+        between spectrum and mixture, radians (pi / 2 there).
+    """
+    wide = np.asarray(endmembers, float)
+    # Mixtures lie in the space that the endmembers span, where the problem has as many rows as there are endmembers.
+    axes, coordinates = np.linalg.qr(wide.T)
+    amounts = np.zeros((len(spectra), len(wide)))
+    for row, projected in zip(amounts, np.asarray(spectra, float) @ axes, strict=True):
+        row[:] = nnls(coordinates, projected)[0]
+    total = amounts.sum(axis=1, keepdims=True)
+    fractions = np.divide(amounts, total, out=np.zeros_like(amounts), where=total > 0.0)
+    measured, mixed = (torch.from_numpy(np.asarray(one, np.float32)) for one in (spectra, amounts @ wide))
+    return fractions, spectral_angle(measured, mixed).numpy()

@@ -16,7 +16,8 @@ from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import WHOLE, Traits
 from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
-from hsi_sc_nerf.plotting.result_pictures import _COLOURS, _STYLE, _figure, _save, _show
+from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 
@@ -61,15 +62,15 @@ class SideViews:
     def of(self, values: Float[np.ndarray, "v *channels"]) -> list[Float[np.ndarray, "h w *channels"]]:
         """Values at vertices as pictures, a side each, mixed linearly within triangles; NaN beside the object."""
         pictures = []
-        for hit, triangle, share in self.sides:
+        for hit, triangle, barycentric in self.sides:
             corners = values[self._mesh.triangles[triangle]]
-            mixed = np.einsum("hwc,hwc...->hw...", share, corners)
+            mixed = np.einsum("hwc,hwc...->hw...", barycentric, corners)
             mixed[~hit] = np.nan
             pictures.append(mixed)
         return pictures
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
     """The named composites in rows, the sides in columns; what was not seen is grey.
 
@@ -91,7 +92,7 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits:
     _draw_rows(path, rows)
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
     """The named indices as colour maps, in rows, the sides in columns; what was not seen is grey.
 
@@ -102,7 +103,7 @@ def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Tr
         values = index_values(INDICES[name], surface.spectra, surface.wavelengths_nm).astype(float)
         known = values[surface.seen & np.isfinite(values)]
         low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
-        coloured = colormaps["viridis"](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
+        coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
         coloured[~surface.seen | ~np.isfinite(values)] = _GREY
         expression = INDICES[name].expression.replace(" / (", " /\n(")
         rows[f"{name}\n{expression}"] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(coloured)]
@@ -116,33 +117,33 @@ def _draw_rows(
     first = next(iter(rows.values()))[0]
     width_in = 1.75
     row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
-    figure = _figure(width_in * len(SIDES_DEG) + 1.0, row_in * len(rows) + 0.35)
+    figure = new_figure(width_in * len(SIDES_DEG) + 1.0, row_in * len(rows) + 0.35)
     grid = figure.subplots(len(rows), len(SIDES_DEG), squeeze=False)
     for line, (label, pictures) in zip(grid, rows.items(), strict=True):
         for axes, picture in zip(line, pictures, strict=True):
-            _show(axes, picture)
+            show_image(axes, picture)
         line[0].set_ylabel(label)
     for axes, title in zip(grid[0], SIDES_DEG, strict=True):
         axes.set_title(title)
     for line, scale in zip(grid, scales, strict=False):
-        colours = ScalarMappable(Normalize(*scale), "viridis")
+        colours = ScalarMappable(Normalize(*scale), INDEX_COLOURS)
         figure.colorbar(colours, ax=line.tolist(), extend="both", fraction=0.04, aspect=18, pad=0.02)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_classes(
     path: Path, names: Sequence[str], labels: Int[np.ndarray, "v"], surface: SpectralMesh, views: SideViews
 ) -> None:
     """The classes on the surface, with their areas; white is in no class, grey was not seen."""
-    colours = np.array([to_rgb(_COLOURS[index % len(_COLOURS)]) for index in range(len(names))])
+    colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = _GREY
     pictures = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(painted)]
     height, width = pictures[0].shape[:2]
-    figure = _figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
+    figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
-        _show(axes, picture)
+        show_image(axes, picture)
         axes.set_title(title)
     areas_cm2 = 1e4 * class_areas_m2(labels, surface.areas_m2, surface.seen, len(names))
     patches = [
@@ -156,18 +157,18 @@ def draw_classes(
         Patch(color=str(_GREY), label="not seen"),
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
     """Mean spectrum of each region with a band of one standard deviation over its surface."""
-    figure = _figure(9.0, 4.0)
+    figure = new_figure(9.0, 4.0)
     axes = figure.subplots()
     order = np.argsort(wavelengths_nm)
     nm = wavelengths_nm[order]
     for index, region in enumerate(traits.spectra):
-        colour = "0.35" if index == 0 else _COLOURS[(index - 1) % len(_COLOURS)]
+        colour = "0.35" if index == 0 else COLOURS[(index - 1) % len(COLOURS)]
         mean, sd = region.mean[order], region.sd[order]
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
         label = f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)"
@@ -175,4 +176,4 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
     axes.margins(x=0.0)
     axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", ylim=(0, None))
     figure.legend(loc="outside right upper", fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)

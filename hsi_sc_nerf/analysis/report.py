@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, Traits
-from hsi_sc_nerf.benchmark.results import markdown_table
 from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.tables import markdown_table
 
 _SIZES = {
     "area_m2": ("surface area", "m²", 1.0),

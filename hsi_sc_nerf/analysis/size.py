@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
 from hsi_sc_nerf.meshes.mesh import Mesh
 
 SPREAD_DEPTH = 6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +15,6 @@ from hsi_sc_nerf.analysis.classes import vertex_areas_m2
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
-from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
 
@@ -42,7 +40,7 @@ class SpectralMesh:
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
-        """Each vertex's share of the surface."""
+        """Surface area of each vertex."""
         return vertex_areas_m2(self.mesh)
 
 
@@ -86,15 +84,6 @@ def with_spectra(
     return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen)
 
 
-def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Unit normal of each vertex: the mean of its triangles', weighted by area."""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
-    doubled = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    corner = mesh.triangles.ravel()
-    total = np.stack([np.bincount(corner, column, minlength=len(mesh.vertices)) for column in doubled.T], axis=-1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
 def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
     """Write the mesh as a spectral PLY whose points are the vertices, followed by the triangles.
 
@@ -105,26 +94,12 @@ def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndar
     """
     mesh = surface.mesh
     colours = to_8_bit(surface.spectra[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
-    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.triangles
-    with atomic_write(path) as (temporary,):
-        vertices = temporary.with_suffix(".vertices.ply")
-        try:
-            write_spectral_ply(
-                vertices,
-                mesh.vertices.astype(np.float32),
-                vertex_normals(mesh).astype(np.float32),
-                colours,
-                surface.spectra,
-                surface.wavelengths_nm,
-                {"seen": surface.seen.astype(np.float32), **extra},
-            )
-            with vertices.open("rb") as source, temporary.open("wb") as target:
-                while (line := source.readline()) != b"end_header\n":
-                    target.write(line)
-                target.write(f"element face {len(faces)}\nproperty list uchar int vertex_indices\n".encode())
-                target.write(line)
-                shutil.copyfileobj(source, target, 1 << 22)
-                target.write(faces.tobytes())
-        finally:
-            vertices.unlink(missing_ok=True)
+    cloud = SpectralCloud(
+        mesh.vertices.astype(np.float32),
+        mesh.vertex_normals().astype(np.float32),
+        colours,
+        surface.spectra,
+        surface.wavelengths_nm,
+        {"seen": surface.seen.astype(np.float32), **extra},
+    )
+    write_spectral_ply(path, cloud, mesh.triangles)

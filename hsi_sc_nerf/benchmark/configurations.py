@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 OURS = "hsi-sc-nerf"
 PAPER = "hsi-sc-nerf-paper"
 
-# name: (method, words as after `ns-train METHOD`). After `ours`: ours with one departure from the paper taken away,
-# then with one option that it does without.
+# name: (method, words as after `ns-train METHOD`). After `ours`: ours with one departure from the paper taken away.
 CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "paper": (PAPER, ""),
     "ours": (OURS, ""),
@@ -41,16 +40,12 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
         OURS,
         "--pipeline.model.match-resolution False --pipeline.model.max-res 2048 --pipeline.model.log2-hashmap-size 19",
     ),
-    "ours-foreground-only": (OURS, "--masked.foreground-share 1.0"),
-    "ours-no-rim": (OURS, "--masked.rim-share 0.0"),
-    "ours-whole-frames": (OURS, "--full-frame.foreground-share None"),
+    "ours-foreground-only": (OURS, "--masked.foreground-ray-fraction 1.0"),
+    "ours-no-boundary-rays": (OURS, "--masked.boundary-ray-fraction 0.0"),
+    "ours-whole-frames": (OURS, "--full-frame.foreground-ray-fraction None"),
     "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
     "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
-    "ours-measured-poses": (OURS, "--pipeline.model.camera-optimizer.mode off"),
-    "ours-learned-basis": (OURS, "--pipeline.model.learn-basis True"),
-    "ours-averaged-weights": (OURS, "--ema-decay 0.99"),
-    "ours-weighted-bands": (OURS, "--pipeline.model.weigh-bands True"),
-    "ours-charbonnier-loss": (OURS, "--pipeline.model.hsi-loss charbonnier"),
+    "ours-refined-poses": (OURS, "--pipeline.model.camera-optimizer.mode turntable"),
 }
 
 

@@ -6,19 +6,15 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from hsi_sc_nerf.benchmark.configurations import training_config
 from hsi_sc_nerf.benchmark.machine import peak_memory_mib
-from hsi_sc_nerf.benchmark.timing import (
-    Clock,
-    TrainingClock,
-    checkpoint_iterations,
-    mean_iteration_seconds,
-)
 from hsi_sc_nerf.files import write_json
 
 if TYPE_CHECKING:
@@ -27,8 +23,13 @@ if TYPE_CHECKING:
 
     from hsi_sc_nerf.models.staged_trainer import StagedTrainer
 
+Clock = Literal["wall", "cpu"]
+"""Wall time, or the processor's time over all threads of a process, which other work on a machine hardly changes."""
+
+# The first steps of a stage build caches and tables.
+_WARM_UP_STEPS = 2
 _REHEARSAL_ITERATIONS = 20
-_REHEARSAL_SHARE = 0.05
+_REHEARSAL_FRACTION = 0.05
 _RENDERING_SPEEDS = ("num_rays_per_sec", "fps")
 
 
@@ -44,7 +45,7 @@ class Job:
         iterations: length of the run; None: find out how many fit into ``train_seconds``, and train nothing.
         train_seconds: time to fill; None where ``iterations`` is given.
         clock: what ``train_seconds`` are of.
-        checkpoints: shares of the run at which it is evaluated, beside the stages' ends.
+        checkpoints: fractions of the run at which it is evaluated, beside the stages' ends.
         threads: CPU threads.
         held_out_views: how many held-out views are evaluated, evenly spread; None for all.
     """
@@ -86,6 +87,30 @@ class Checkpoint:
     peak_memory_mib: float
     gpu_memory_mib: float
     metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class BenchmarkRun:
+    """A configuration's finished run.
+
+    Attributes:
+        name: of the configuration.
+        method: nerfstudio method.
+        words: as after ``ns-train METHOD``, those that all configurations share included.
+        setup_seconds: wall time before the first step: reading the dataset, building the model.
+        checkpoints: in the order of iterations.
+    """
+
+    name: str
+    method: str
+    words: tuple[str, ...]
+    setup_seconds: float
+    checkpoints: tuple[Checkpoint, ...]
+
+    @property
+    def stage_ends(self) -> tuple[Checkpoint, ...]:
+        """The last checkpoint of each stage."""
+        return tuple(checkpoint for checkpoint in self.checkpoints if checkpoint.ends_stage)
 
 
 def build_trainer(config: Any, job: Job, iterations: int, output_dir: Path) -> StagedTrainer:
@@ -186,7 +211,7 @@ def rehearse(job: Job) -> dict[str, Any]:
     """
     assert job.train_seconds is not None
     seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS)
-    longer = int(_REHEARSAL_SHARE * job.train_seconds / seconds)
+    longer = int(_REHEARSAL_FRACTION * job.train_seconds / seconds)
     if longer > _REHEARSAL_ITERATIONS:
         seconds = _rehearsed_seconds(job, longer)
     return {"iterations": max(1, round(job.train_seconds / seconds)), "iteration_seconds": seconds}
@@ -209,6 +234,64 @@ def _rehearsed_seconds(job: Job, iterations: int) -> float:
     times = [clock()]
     trainer.train()
     return mean_iteration_seconds(times, [stage.end for stage in trainer.plan.stages])
+
+
+def checkpoint_iterations(fractions: Sequence[float], stage_ends: Sequence[int]) -> tuple[int, ...]:
+    """Numbers of done iterations at which a run is evaluated: these fractions of it, and the end of every stage.
+
+    Args:
+        fractions: of the whole run, in (0, 1].
+        stage_ends: iterations done at the end of each stage; the last is the run's length.
+    """
+    total = stage_ends[-1]
+    return tuple(sorted({*stage_ends, *(max(1, round(fraction * total)) for fraction in fractions)}))
+
+
+def mean_iteration_seconds(times: Sequence[float], stage_ends: Sequence[int]) -> float:
+    """Mean time of an iteration without the first two of each stage, each stage counting by its length.
+
+    Args:
+        times: the clock before the first iteration and after each, so one more than iterations, seconds.
+        stage_ends: iterations done at the end of each stage.
+    """
+    steps = [after - before for before, after in pairwise(times)]
+    spent = 0.0
+    for start, end in pairwise((0, *stage_ends)):
+        counted = steps[min(start + _WARM_UP_STEPS, end - 1) : end]
+        spent += (end - start) * sum(counted) / len(counted)
+    return spent / stage_ends[-1]
+
+
+class TrainingClock:
+    """Seconds of wall and of processor time since it was made, pauses left out.
+
+    Args:
+        wait: called before each reading, so that what a GPU has still to do is counted where it belongs.
+        wall: clock of wall time, seconds.
+        cpu: clock of this process's processor time over all threads, seconds.
+    """
+
+    def __init__(
+        self,
+        wait: Callable[[], object] = lambda: None,
+        wall: Callable[[], float] = time.perf_counter,
+        cpu: Callable[[], float] = time.process_time,
+    ) -> None:
+        self._wait, self._wall, self._cpu = wait, wall, cpu
+        self._wall_start, self._cpu_start = wall(), cpu()
+
+    def read(self) -> tuple[float, float]:
+        """Wall and processor seconds."""
+        self._wait()
+        return self._wall() - self._wall_start, self._cpu() - self._cpu_start
+
+    @contextmanager
+    def paused(self) -> Iterator[tuple[float, float]]:
+        """What is done within counts on neither clock; gives the readings before it."""
+        wall, cpu = self.read()
+        yield wall, cpu
+        self._wait()
+        self._wall_start, self._cpu_start = self._wall() - wall, self._cpu() - cpu
 
 
 def main(job_path: Path, result_path: Path) -> None:

@@ -1,52 +1,47 @@
-"""How the light falls off over the image, from the white tarp: a smooth surface that all bands share."""
+"""Flat field: falloff of the light over the image, from the white tarp, as one smooth surface for all bands."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.dark import dark_columns
-from hsi_sc_nerf.calibration.defects import Defects
-from hsi_sc_nerf.calibration.white_reference import WhiteReference
-from hsi_sc_nerf.calibration.white_steps import mean_over_columns
+from hsi_sc_nerf.calibration.detector import Defects, dark_columns
+from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS, WhiteReference, mean_over_columns
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, largest_component
 
+ORDER = 4
+"""Total order of the surface's polynomial."""
 EDGE_FRACTION = 32
-"""The tarp's outermost part, its shorter side over this, is left out: it is blurred, frayed or curls up."""
+"""The tarp's shorter side over this is left out along its edge, which may be blurred, frayed or curled."""
 REACH = 1.25
-"""The surface is followed beyond the tarp up to so many of its half widths from its middle, and level from there."""
+"""The surface is constant beyond this many half widths of the tarp from its middle."""
 VALUE_REACH = 0.5
-"""Beyond the tarp it rises and falls by no more than this share of its range on the tarp."""
+"""Beyond the tarp, the surface exceeds its range on the tarp by at most this fraction of it."""
 MAX_PIXELS = 20_000
-"""So many of the tarp's pixels, evenly spread, are enough for the 15 numbers of a surface of order 4."""
+"""Pixels of the tarp that are fitted, chosen at random; ample for the 15 coefficients of order 4."""
 
 
 def flat_field(
     tarp: Capture,
     white: WhiteReference,
     frame_shape: tuple[int, int],
-    config: CalibrationConfig,
     defects: Defects | None = None,
 ) -> Float[np.ndarray, "lines samples"]:
-    """Illumination of each pixel over that of the white spectrum.
+    """Illumination of each pixel relative to that of the white spectrum: positive, the same in all bands.
 
-    The same in all bands, and positive; on average 1 over the region that the white spectrum was taken from, but for
-    dirt and folds in it, which lower the spectrum and not the illumination. It is for frames taken with the camera,
-    and under lamps, that stand as they did for the tarp; reflectance over it is what a tarp before the whole image
-    would have given.
+    Its mean is 1 over the region of the white spectrum, except for dirt and folds there, which lower the spectrum but
+    not the illumination. Camera and lamps must not have moved between the tarp and the frames.
 
     Args:
         tarp: the capture of the white tarp.
-        white: its spectrum.
+        white: the tarp's white reference.
         frame_shape: lines and samples of the frames.
-        config: its ``flat_field_order`` and ``roi_brightness``.
-        defects: of the detector, found before.
+        defects: of the detector, if they are known.
 
     Raises:
-        InputError: the tarp's image has another size than the frames, or the tarp is too small in it to tell.
+        InputError: the tarp's image has another size than the frames, or the tarp is too small in it.
     """
     header = tarp.cube.header_path
     if tarp.cube.shape[:2] != frame_shape:
@@ -63,16 +58,16 @@ def flat_field(
     brightness = relative_brightness(counts, dark, np.nan_to_num(mean_over_columns(white.measured)), use)
     region = np.zeros(brightness.shape, bool)
     x0, y0, x1, y1 = white.roi
-    region[y0:y1, x0:x1] = brightness[y0:y1, x0:x1] > config.roi_brightness
+    region[y0:y1, x0:x1] = brightness[y0:y1, x0:x1] > TARP_BRIGHTNESS
     edge_px = 2 * max(1, min(y1 - y0, x1 - x0) // EDGE_FRACTION) + 1
     region = ~dilate(~largest_component(region), edge_px)
-    terms = (config.flat_field_order + 1) * (config.flat_field_order + 2) // 2
+    terms = (ORDER + 1) * (ORDER + 2) // 2
     if np.count_nonzero(region) < 10 * terms:
         raise InputError(
             f"{header}: the tarp is too small in its image to tell how the light falls off; leave out "
             "--calibration.flat-field."
         )
-    return fit_surface(brightness, region, config.flat_field_order).astype(np.float32)
+    return fit_surface(brightness, region, ORDER).astype(np.float32)
 
 
 def relative_brightness(
@@ -81,22 +76,21 @@ def relative_brightness(
     spectrum: Float[np.ndarray, "bands"],
     use: Bool[np.ndarray, "samples bands"],
 ) -> Float[np.ndarray, "lines samples"]:
-    """Counts above dark over the white spectrum, both summed over the bands of the elements in ``use``."""
+    """Counts above dark over the white spectrum, both summed over the elements in ``use``; 0 without any."""
     used = use.astype(np.float64)
     dark_sum, white_sum = (used * dark).sum(axis=1), used @ spectrum
     light = np.stack([np.einsum("xb,xb->x", np.asarray(line, np.float64), used) for line in counts])
-    # A sample without any element in use says nothing; its neighbours' surface serves it.
     return np.where(white_sum > 0.0, (light - dark_sum) / np.where(white_sum > 0.0, white_sum, 1.0), 0.0)
 
 
 def fit_surface(
     brightness: Float[np.ndarray, "lines samples"], region: Bool[np.ndarray, "lines samples"], order: int
 ) -> Float[np.ndarray, "lines samples"]:
-    """A polynomial of two variables, fitted to the region without its dirt and folds, over the whole image.
+    """A polynomial of two variables, fitted robustly to the region and evaluated over the whole image.
 
-    Least absolute deviations first, which dirt on less than half of the region does not move, then Tukey's biweight
-    (Huber & Ronchetti, "Robust Statistics", 2nd ed., section 7), which does not weigh it at all. Outside the region
-    it is held within ``REACH`` and ``VALUE_REACH``.
+    The fit minimises absolute deviations, which dirt and folds on less than half of the region do not affect, and
+    then Tukey's biweight, which gives them no weight (Huber & Ronchetti, "Robust Statistics", 2nd ed., section 7).
+    Outside the region the surface is limited by ``REACH`` and ``VALUE_REACH``.
     """
     lines, samples = brightness.shape
     y, x = np.nonzero(region)
@@ -120,13 +114,13 @@ def fit_surface(
 
 def _terms(y: Float[np.ndarray, "n"], x: Float[np.ndarray, "n"], order: int) -> Float[np.ndarray, "n terms"]:
     """Products of Legendre polynomials of y and x up to a total order."""
-    of_y, of_x = np.polynomial.legendre.legvander(y, order), np.polynomial.legendre.legvander(x, order)
+    in_y, in_x = np.polynomial.legendre.legvander(y, order), np.polynomial.legendre.legvander(x, order)
     pairs = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
-    return np.stack([of_y[:, i] * of_x[:, j] for i, j in pairs], axis=-1)
+    return np.stack([in_y[:, i] * in_x[:, j] for i, j in pairs], axis=-1)
 
 
 def _robust_fit(terms: Float[np.ndarray, "n terms"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "terms"]:
-    """Coefficients by least absolute deviations, then by Tukey's biweight, each by reweighted least squares."""
+    """Coefficients by least absolute deviations, then Tukey's biweight, by iteratively reweighted least squares."""
     weights = np.ones(len(values))
     scale = 0.0
     for step in range(30):

@@ -1,8 +1,8 @@
-"""The noise of a reading, measured on a session's own dark and white cubes.
+"""Noise of a reading, from the session's dark and white cubes, and the uncertainty of reflectance that follows.
 
-The variance of a reading is a line over its counts above dark, the photon transfer curve (Janesick, "Photon
-Transfer", SPIE 2007): ``variance = read_noise^2 + counts_per_electron * counts``. The dark cube gives the read noise,
-the white tarp the slope.
+The variance of a reading is linear in its counts above dark, the photon transfer curve (Janesick, "Photon Transfer",
+SPIE 2007): ``variance = read_noise^2 + counts_per_electron * counts``. The dark cube gives the read noise, the white
+the slope.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 from scipy import stats
 
+from hsi_sc_nerf.calibration.detector import dark_columns
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
+
 QUANTISATION_VARIANCE = 1.0 / 12.0
-"""Of a count that was rounded, counts^2."""
-MOST_TRIPLES = 64
-"""Groups of three neighbouring lines of the tarp that are read: more would not make the slope any better."""
-FEWEST_PIXELS = 100
-"""Of the tarp, below which the slope is not measured."""
-MOST_SATURATED = 0.01
-"""A band is left out of the slope if more than this share of its elements reached saturation on the tarp."""
+"""Variance of rounding to a whole count, counts^2."""
+MAX_TRIPLES = 64
+"""Triples of neighbouring lines of the white that are read; more do not improve the slope."""
+MIN_PIXELS = 100
+"""Fewest pixels of the white that the slope is measured on."""
+MAX_SATURATED = 0.01
+"""A band is not used for the slope if a larger fraction of its elements saturates on the white."""
 OUTLIER_PROBABILITY = 1e-4
-"""Pixels and elements that noise alone would make so rarely are dirt or defects, and are left out."""
+"""Pixels and elements that noise alone would make more rarely than this are dirt or defects, and are left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +33,11 @@ class NoiseModel:
     """Variance of one reading.
 
     Attributes:
-        read_noise: standard deviation of a reading without light, counts; its rounding is part of it.
-        counts_per_electron: variance that light adds a count above dark: the slope of the photon transfer curve, the
-            same for all elements of the detector.
-        read_noise_measured: False where the dark cube tells nothing and the read noise is that of rounding alone.
-        photon_noise_measured: False where the tarp tells nothing and the slope is 0.
+        read_noise: standard deviation of a reading without light, counts, including rounding.
+        counts_per_electron: slope of the photon transfer curve, the variance for each count above dark; the same for
+            all elements.
+        read_noise_measured: False if there is no usable dark cube and ``read_noise`` is that of rounding alone.
+        photon_noise_measured: False if the white is not usable and the slope is 0.
     """
 
     read_noise: Float[np.ndarray, "bands"]
@@ -43,7 +46,7 @@ class NoiseModel:
     photon_noise_measured: bool
 
     def variance(self, above_dark: Float[np.ndarray, "*shape bands"]) -> Float[np.ndarray, "*shape bands"]:
-        """Variance of readings, counts^2, from their counts above dark; negative counts (noise) count as 0."""
+        """Variance of readings, counts^2, from their counts above dark; negative counts are taken as 0."""
         return self.read_noise**2 + self.counts_per_electron * np.maximum(above_dark, 0.0)
 
 
@@ -55,24 +58,62 @@ def measure_noise(
     saturation_counts: float | None = None,
     dead: Bool[np.ndarray, "samples bands"] | None = None,
 ) -> NoiseModel:
-    """The noise of a session's readings.
+    """Measure the noise of a session's readings.
 
     Args:
-        white: counts of the white tarp; a memory map is read in part only.
-        region: where the image shows nothing but tarp, and all of it is data.
-        dark: counts without light that belong to it; without any, the dark level is taken for 0.
-        saturation_counts: counts from which a reading is saturated; None where nothing is.
-        dead: detector elements that do not follow the light.
+        white: counts of the white; of a memory map only some lines are read.
+        region: pixels that show only the white and have data in all bands.
+        dark: counts without light; without a dark cube, the dark level is taken as 0.
+        saturation_counts: counts from which a reading is saturated; None if nothing saturates.
+        dead: dead detector elements.
     """
     bands = white.shape[2]
     rounding = np.full(bands, np.sqrt(QUANTISATION_VARIANCE))
     measured = None if dark is None else read_noise(dark, None if dark.shape[1] != white.shape[1] else dead)
-    of_readings = rounding if measured is None else np.maximum(measured, rounding)
-    level = np.zeros((1, bands)) if dark is None else dark.mean(axis=0, dtype=np.float64)
-    if len(level) != white.shape[1]:
-        level = level.mean(axis=0, keepdims=True)
-    slope = photon_transfer_slope(white, region, level, of_readings, saturation_counts=saturation_counts, dead=dead)
-    return NoiseModel(of_readings, slope or 0.0, measured is not None, slope is not None)
+    deviation = rounding if measured is None else np.maximum(measured, rounding)
+    level = dark_columns(dark, *white.shape[1:])
+    slope = photon_transfer_slope(white, region, level, deviation, saturation_counts=saturation_counts, dead=dead)
+    return NoiseModel(deviation, slope or 0.0, measured is not None, slope is not None)
+
+
+def reflectance_uncertainty(
+    noise: NoiseModel,
+    white: Float[np.ndarray, "bands"],
+    *,
+    white_pixels: int,
+    smoothing_bands: Int[np.ndarray, "bands"],
+    frame_dark_readings: int,
+    white_dark_readings: int,
+    panel_reflectance: Float[np.ndarray, "bands"] | float = 1.0,
+    integration_ratio: float = 1.0,
+) -> ReflectanceUncertainty:
+    """Propagate the noise of readings, to first order, through ``R = P (S - D) / (W - D) * t_white / t_sample``.
+
+    The errors of a corrected lamp drift and of the panel's certificate are not included.
+
+    Args:
+        noise: of one reading.
+        white: counts of the white above dark, W - D.
+        white_pixels: pixels of the white that were averaged.
+        smoothing_bands: width of the moving average around each band; odd.
+        frame_dark_readings: dark readings averaged for each element of a frame; 0 if no dark was subtracted.
+        white_dark_readings: dark readings averaged for the white (lines times columns); 0 if none was subtracted.
+        panel_reflectance: P, in [0, 1].
+        integration_ratio: t_white / t_sample.
+    """
+    gain = panel_reflectance * integration_ratio / white
+    read_variance = noise.read_noise**2
+    of_white = noise.variance(white) / white_pixels
+    of_sample = read_variance.copy()
+    if frame_dark_readings:
+        of_sample += read_variance / frame_dark_readings
+    if white_dark_readings:
+        of_white += read_variance / white_dark_readings
+    return ReflectanceUncertainty(
+        constant=gain**2 * of_sample,
+        linear=gain * noise.counts_per_electron,
+        quadratic=_moving_average_variance(of_white, smoothing_bands) / white**2,
+    )
 
 
 def read_noise(
@@ -80,10 +121,10 @@ def read_noise(
 ) -> Float[np.ndarray, "bands"] | None:
     """Standard deviation of a reading without light in each band, counts.
 
-    Each element's variance is taken over the dark cube's lines; a band's is the mean over its elements without those
-    that are dead or whose variance is not that of the others (elements that flicker or hang).
+    Each element's variance is taken over the dark cube's lines, and a band's is the mean over its elements, without
+    dead ones and without those whose variance differs from the others' (flickering or stuck elements).
 
-    Returns None where the cube has a single line, or lines that are all the same.
+    Returns None if the cube has a single line or identical lines.
     """
     lines = len(dark)
     if lines < 2:
@@ -96,7 +137,7 @@ def read_noise(
     degrees = lines - 1
     middle = np.maximum(np.nanmedian(variance, axis=0), QUANTISATION_VARIANCE) / stats.chi2.median(degrees)
     low, high = (middle * stats.chi2.ppf(p, degrees) for p in (OUTLIER_PROBABILITY, 1.0 - OUTLIER_PROBABILITY))
-    # Below the rounding's own variance an element is quiet by chance of where its level lies between two counts.
+    # Below the variance of rounding, an element is quiet if its level happens to lie between two counts.
     usual = (variance <= high) & ((variance >= low) | (low <= QUANTISATION_VARIANCE))
     return np.sqrt(np.where(usual, variance, 0.0).sum(axis=0) / np.maximum(usual.sum(axis=0), 1))
 
@@ -110,51 +151,51 @@ def photon_transfer_slope(
     saturation_counts: float | None = None,
     dead: Bool[np.ndarray, "samples bands"] | None = None,
 ) -> float | None:
-    """Slope of the photon transfer curve, counts per electron, from the tarp.
+    """Slope of the photon transfer curve, counts per electron, from the white.
 
-    Second differences between three neighbouring lines cancel what is even or a gradient over the tarp; their
-    variance is 6 times a reading's. The part of a difference that has the white's own spectrum (a weave, a flickering
-    lamp) is taken off as well, in each pixel, and so are pixels that still differ from the rest (dirt, edges). The
-    bands, whose signals differ, then give the slope by weighted least squares through the read noise at no signal.
+    Second differences between three neighbouring lines cancel constants and gradients over the white; their variance
+    is 6 times that of a reading. In each pixel the difference's component along the white's spectrum (a weave, a
+    flickering lamp) is projected out, and pixels that are still outliers (dirt, edges) are left out. The slope is the
+    weighted least-squares fit over the bands, whose signals differ, with the read noise as intercept.
 
-    Returns None where the region is too small or nothing in it is lit and unsaturated.
+    Returns None if the region is too small or nothing in it is lit and unsaturated.
     """
     inside_all = region[:-2] & region[1:-1] & region[2:]
     centres = np.flatnonzero(inside_all.any(axis=1)) + 1
-    if len(centres) > MOST_TRIPLES:
-        centres = centres[np.linspace(0, len(centres) - 1, MOST_TRIPLES).round().astype(int)]
+    if len(centres) > MAX_TRIPLES:
+        centres = centres[np.linspace(0, len(centres) - 1, MAX_TRIPLES).round().astype(int)]
     inside = inside_all[centres - 1]
-    if inside.sum() < FEWEST_PIXELS:
+    if inside.sum() < MIN_PIXELS:
         return None
     difference, total, saturated = _second_differences(white, centres, inside, saturation_counts)
     columns = inside.any(axis=0)
     alive = np.broadcast_to(columns[:, None], saturated.shape) & (True if dead is None else ~dead)
     saturated &= alive
-    readable = alive & ~saturated & (saturated.sum(axis=0) <= MOST_SATURATED * alive.sum(axis=0))
+    readable = alive & ~saturated & (saturated.sum(axis=0) <= MAX_SATURATED * alive.sum(axis=0))
     signal = np.where(readable, total / np.maximum(inside.sum(axis=0), 1)[:, None] - dark, 0.0).clip(min=0.0)
-    of_pixel = signal.sum(axis=1, keepdims=True)
-    if not of_pixel.any():
+    pixel_signal = signal.sum(axis=1, keepdims=True)
+    if not pixel_signal.any():
         return None
-    share = signal / np.where(of_pixel > 0.0, of_pixel, 1.0)
+    fraction = signal / np.where(pixel_signal > 0.0, pixel_signal, 1.0)
     difference *= readable
-    difference -= difference.sum(axis=2, keepdims=True) * share.astype(np.float32)
+    difference -= difference.sum(axis=2, keepdims=True) * fraction.astype(np.float32)
     squared = np.square(difference, out=difference)
     squared /= 6.0
-    kept = inside & _no_outlier(squared, inside, readable)
-    # Expected squares: what the slope multiplies, and what the read noise leaves, after the projection.
+    kept = inside & _inliers(squared, inside, readable)
+    # Expected squares after the projection: per_slope * slope + of_read.
     read_variance = readable * read_noise**2
-    per_slope = signal * (1.0 - share)
-    of_read = read_variance * (1.0 - 2.0 * share) + share**2 * read_variance.sum(axis=1, keepdims=True)
+    per_slope = signal * (1.0 - fraction)
+    of_read = read_variance * (1.0 - 2.0 * fraction) + fraction**2 * read_variance.sum(axis=1, keepdims=True)
     readings = kept.sum(axis=0) @ readable.astype(float)
     used = readings > 0
     x, offset = ((kept.sum(axis=0) @ (part * readable))[used] / readings[used] for part in (per_slope, of_read))
     y = np.einsum("nsb,ns->b", squared, kept.astype(np.float32))[used] / readings[used]
     if not x.any():
-        # A single band has nothing left after the projection.
+        # The projection leaves nothing of a single band.
         return None
     slope = 0.0
     for _ in range(5):
-        # A variance is known to a share of itself, so the weights need the slope that they give.
+        # The error of a variance is proportional to it, so the weights depend on the slope.
         weight = readings[used] / np.maximum(offset + slope * x, QUANTISATION_VARIANCE) ** 2
         slope = max(0.0, float((weight * x * (y - offset)).sum() / (weight * x * x).sum()))
     return slope
@@ -168,15 +209,12 @@ def _second_differences(
 ) -> tuple[
     Float[np.ndarray, "triples samples bands"], Float[np.ndarray, "samples bands"], Bool[np.ndarray, "samples bands"]
 ]:
-    """Second differences about each centre, the sum of the centres' counts, and which elements saturate anywhere.
-
-    All three inside the region alone.
-    """
+    """Second differences about each centre, sum of the centres' counts, and saturated elements, inside the region."""
     difference = np.zeros((len(centres), *white.shape[1:]), np.float32)
     total = np.zeros(white.shape[1:])
     saturated = np.zeros(white.shape[1:], bool)
     for n, centre in enumerate(centres):
-        # Counts outside may be no numbers, which times 0 would still be none.
+        # Counts outside may be nan, which a product with 0 would keep.
         three = np.where(inside[n][:, None], white[centre - 1 : centre + 2], 0).astype(np.float32)
         difference[n] = three[0] - 2.0 * three[1] + three[2]
         total += three[1]
@@ -185,12 +223,12 @@ def _second_differences(
     return difference, total, saturated
 
 
-def _no_outlier(
+def _inliers(
     squared: Float[np.ndarray, "triples samples bands"],
     inside: Bool[np.ndarray, "triples samples"],
     readable: Bool[np.ndarray, "samples bands"],
 ) -> Bool[np.ndarray, "triples samples"]:
-    """Pixels whose squares, summed over the bands in units of their variance, are those of noise."""
+    """Pixels whose squares, summed over the bands in units of their variance, are distributed like noise."""
     pixels = squared[inside]
     counted = np.broadcast_to(readable, squared.shape)[inside]
     usual = np.maximum(np.median(pixels, axis=0) / stats.chi2.median(1), QUANTISATION_VARIANCE)
@@ -200,3 +238,12 @@ def _no_outlier(
     usual_pixel = np.zeros(inside.shape, bool)
     usual_pixel[inside] = score <= np.median(score) * limit
     return usual_pixel
+
+
+def _moving_average_variance(
+    variance: Float[np.ndarray, "bands"], width: Int[np.ndarray, "bands"]
+) -> Float[np.ndarray, "bands"]:
+    """Variance of a moving average of independent bands; the window of each band lies within the spectrum."""
+    cumulative = np.concatenate([[0.0], np.cumsum(variance)])
+    centre, reach = np.arange(len(variance)), width // 2
+    return (cumulative[centre + reach + 1] - cumulative[centre - reach]) / width**2

@@ -1,4 +1,4 @@
-"""The reflectance of a white that is not a perfect one, from its certificate as a CSV file."""
+"""Reflectance of a white panel, from its certificate as a CSV file."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 
 LARGEST_FRACTION = 1.5
-"""Reflectances are fractions if none is larger than this, and percent otherwise."""
+"""Reflectances are percent if any is larger than this, and fractions otherwise."""
 SHORTEST_NM = 100.0
-"""No imaging spectrometer measures below: smaller numbers are no nanometres."""
-_WANTED = "two columns, wavelength_nm and reflectance"
+"""No imaging spectrometer measures shorter wavelengths; smaller numbers are no nanometres."""
+_FORMAT = "two columns, wavelength_nm and reflectance"
 
 
 def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
-    """Reflectance of a panel at the band centres, linear between the lines of its CSV file.
+    """Reflectance of a panel at the band centres, by linear interpolation.
 
-    The file has a line a wavelength, in any order: the wavelength in nm and the reflectance, as a fraction or, if any
-    is above 1.5, in percent; between them a comma, a semicolon or a tab (with the latter two, decimals may have a
-    comma). A first line of names, empty lines and lines that begin with # are skipped.
-
-    The panel may end one band short of the bands; there its outermost value holds.
+    Each line of the file has a wavelength in nm and a reflectance, in any order of wavelengths; reflectances are
+    percent if any is above 1.5. The separator is a comma, semicolon or tab; with the latter two, decimal commas are
+    read. A header line, empty lines and lines that begin with # are skipped. The panel may end one band short of the
+    bands; its outermost value is used there.
 
     Raises:
-        InputError: no such file, a line that is not two numbers, values out of range, a wavelength twice, or a panel
-            that does not cover the bands.
+        InputError: there is no such file, a line is not two numbers, a value is out of range, a wavelength is given
+            twice, or the panel does not cover the bands.
+
+    Example:
+        >>> reflectance = read_panel(Path("panel.csv"), session.wavelengths_nm)  # (bands,), 0 to 1
     """
     path = Path(path)
     panel_nm, reflectance = _read(path)
@@ -37,8 +39,8 @@ def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[
     if len(twice):
         raise InputError(f"{path}: gives {panel_nm[twice[0]]:g} nm twice; keep one of these lines.")
     bands_nm = np.sort(wavelengths_nm)
-    below, above = (bands_nm[1] - bands_nm[0], bands_nm[-1] - bands_nm[-2]) if len(bands_nm) > 1 else (0.0, 0.0)
-    if panel_nm[0] > bands_nm[0] + below or panel_nm[-1] < bands_nm[-1] - above:
+    first_nm, last_nm = bands_nm[:2].max(), bands_nm[-2:].min()
+    if panel_nm[0] > first_nm or panel_nm[-1] < last_nm:
         raise InputError(
             f"{path}: gives the panel's reflectance from {panel_nm[0]:g} to {panel_nm[-1]:g} nm, but the bands lie "
             f"from {bands_nm[0]:g} to {bands_nm[-1]:g} nm; add the lines that are missing."
@@ -47,25 +49,25 @@ def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[
 
 
 def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "lines"]]:
-    """Wavelengths (nm) and reflectances (fractions) as the file lists them."""
+    """Wavelengths (nm) and reflectances (fractions) in the order of the file."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise InputError(f"{path}: the panel's reflectance cannot be read ({reason}); check the path.") from error
     rows = []
-    may_be_names = True
+    may_be_header = True
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         values = _numbers(line)
-        if values is None and not may_be_names:
-            raise InputError(f"{path}: line {number} ({line.strip()!r}) is not two numbers; write {_WANTED}.")
-        may_be_names = False
+        if values is None and not may_be_header:
+            raise InputError(f"{path}: line {number} ({line.strip()!r}) is not two numbers; write {_FORMAT}.")
+        may_be_header = False
         if values is not None:
             rows.append(values)
     if not rows:
-        raise InputError(f"{path}: holds no reflectance; write {_WANTED}.")
+        raise InputError(f"{path}: holds no reflectance; write {_FORMAT}.")
     panel_nm, reflectance = np.array(rows).T
     if not panel_nm.min() >= SHORTEST_NM:
         raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")

@@ -1,12 +1,12 @@
-"""Steps 6 and 7 of the paper's Algorithm 1, at the speed of the disk: raw counts to packed reflectance in one pass.
+"""Raw counts to packed reflectance: steps 6 and 7 of the paper's Algorithm 1, in one pass at the speed of the disk.
 
-A frame is worked on line by line, as ``(bands, samples)``, so that all of a line happens while the processor has it
-at hand. What a session does not have (no saturation level, no flat field, ...) is not computed.
+A frame is processed line by line, as ``(bands, samples)``, so that a line stays in the processor's cache. Tests and
+corrections that a session does not need (saturation, flat field, ...) are skipped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,37 +15,37 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.line_pictures import LinePictures, PictureBands, as_slice
-from hsi_sc_nerf.calibration.pixel_counts import Counter, Tally
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 
-# Lines that are stored at a time: an upright copy of single lines would write 400 bytes here and 400 there.
+# Lines that are stored at a time: rotating single lines would write 400 bytes to each of many places.
 _BLOCK_LINES = 8
-# What `cv2.transpose` moves in place of numbers of the same size.
-_MOVED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
+# Data types that `cv2.transpose` knows, by their size.
+_TRANSPOSED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
 _HALF = np.float32(0.5)
-_LEAST = np.finfo(np.float32).min
+# Added to the lines' values, so that truncation rounds them.
+_HALF_UNIT = np.float32(0.5 / REFLECTANCE_SCALE)
+_LOWEST = np.finfo(np.float32).min
 _Test = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameCalibration:
-    """What turns the counts of one capture into reflectance, in the file's own orientation and in all its bands.
+    """Calibration of one capture: ``reflectance = (counts - dark) * gain / flat``.
 
-    ``reflectance = (counts - dark) * gain / flat``. A column is a sample of the file, an element of the detector's
-    line; arrays with one column hold for all of them.
+    Arrays are in the file's orientation and have all of its bands. A column is a sample of the file; an array with
+    one column holds for all samples.
 
     Attributes:
         dark: counts without light.
-        gain: reflectance a count above dark: the panel's reflectance over the white's counts, times the ratio of the
-            integration times, over the lamps' drift.
-        bands: which of the file's bands are kept.
-        bounds: reflectance is clipped to these.
-        flat: illumination of each pixel over that of the white spectrum; None where it is taken for even.
-        saturation_counts: counts from which a reading is saturated; None where nothing is.
-        dead: detector elements that do not follow the light; None where all do.
-        ignore_value: counts that stand for "no data"; None where all counts are data.
-        quarter_turns: counter-clockwise turns by 90 degrees (``np.rot90``'s k) that set the file's image upright.
+        gain: reflectance per count above dark: the panel's reflectance over the white's counts, times the ratio of
+            the integration times, over the lamps' drift.
+        bands: the bands that are kept.
+        bounds: reflectance is clipped to this range.
+        flat: illumination of each pixel relative to that of the white spectrum; None for even light.
+        saturation_counts: counts from which a reading is saturated; None if nothing saturates.
+        dead: dead detector elements; None if there are none.
+        ignore_value: counts that stand for "no data"; None if there are none.
+        quarter_turns: counter-clockwise turns by 90 degrees (``np.rot90``'s k) that turn the image upright.
     """
 
     dark: Float[np.ndarray, "columns bands"]
@@ -60,32 +60,80 @@ class FrameCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class PackedReflectance:
-    """A frame's reflectance and what was seen on the way, in the orientation of the file.
-
-    In the pictures a dead element has the value of the pixel's nearest good band, a saturated one its clipped value
-    and what remains (no data, a pixel without any good band) the lower bound: nothing of `FLAGGED` is in them.
+class PictureBands:
+    """Indices of the kept bands that the pictures of a frame are made of.
 
     Attributes:
-        packed: reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none. Its memory lies upright:
-            ``np.rot90(packed, quarter_turns)`` is contiguous.
+        rgb: shown as red, green and blue.
+        gray: averaged for the detection of markers.
+        bin_width: neighbouring bands averaged into a bin; the last bin may have fewer.
+    """
+
+    rgb: Int[np.ndarray, "3"]
+    gray: Int[np.ndarray, "gray"]
+    bin_width: int
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCounts:
+    """Numbers of a frame's values that were clipped or flagged, by kept band.
+
+    Each value is counted once, by the first reason that applies: dead, no data, saturated, clipped. A value counts as
+    clipped if that changes it by at least half a packed unit.
+
+    Attributes:
+        clipped_low: raised to the lower bound.
+        clipped_high: lowered to the upper bound.
+        saturated: flagged because the reading is saturated.
+        dead: flagged because the detector element is dead.
+        no_data: flagged because the count is the ignore value or not finite.
+    """
+
+    clipped_low: Int[np.ndarray, "kept"]
+    clipped_high: Int[np.ndarray, "kept"]
+    saturated: Int[np.ndarray, "kept"]
+    dead: Int[np.ndarray, "kept"]
+    no_data: Int[np.ndarray, "kept"]
+
+    @property
+    def flagged(self) -> Int[np.ndarray, "kept"]:
+        """Values that are no measurements."""
+        return self.saturated + self.dead + self.no_data
+
+    @staticmethod
+    def total(of_frames: Iterable[PixelCounts]) -> PixelCounts:
+        """The sum over frames (at least one)."""
+        columns = zip(*(vars(counts).values() for counts in of_frames), strict=True)
+        return PixelCounts(*(np.sum(column, axis=0) for column in columns))
+
+
+@dataclass(frozen=True, eq=False)
+class PackedReflectance:
+    """A frame's packed reflectance and pictures of it, in the file's orientation.
+
+    In the pictures, a dead element has the value of the pixel's nearest good band, a saturated one its clipped value,
+    and no data, like a pixel without a good band, the lower bound.
+
+    Attributes:
+        packed: reflectance times ``REFLECTANCE_SCALE``, or ``FLAGGED``. ``np.rot90(packed, quarter_turns)`` is
+            contiguous in memory.
         flags: `PixelFlag`s.
-        tally: of clipped and flagged values.
+        pixel_counts: numbers of clipped and flagged values.
         rgb: reflectance in three bands.
-        gray: mean reflectance in the gray bands.
-        binned: mean reflectance in the bins.
+        gray: mean reflectance over the gray bands.
+        binned: mean reflectance in each bin of bands.
     """
 
     packed: UInt16[np.ndarray, "lines samples kept"]
     flags: UInt8[np.ndarray, "lines samples"]
-    tally: Tally
+    pixel_counts: PixelCounts
     rgb: Float[np.ndarray, "3 lines samples"]
     gray: Float[np.ndarray, "lines samples"]
     binned: Float[np.ndarray, "bins lines samples"]
 
 
 class Lines(Protocol):
-    """Raw counts, a line ``(samples, bands)`` at a time: an array, or a file that is read as it goes."""
+    """Raw counts, one line ``(samples, bands)`` at a time: an array, or `CubeLines`."""
 
     shape: tuple[int, int, int]
     dtype: np.dtype
@@ -99,23 +147,32 @@ def pack_counts(
     pictures: PictureBands,
     buffer: UInt16[np.ndarray, "values"] | None = None,
 ) -> PackedReflectance:
-    """Reflectance of a frame's raw counts, clipped, packed and flagged, and pictures of it.
+    """Calibrate, clip, pack and flag a frame's raw counts, and make pictures of it.
 
-    Fastest for the lines of a BIL file. The packed numbers lie in ``buffer``, if one is given, of at least as many
-    numbers: fresh memory takes a good part of the time.
+    Args:
+        counts: the raw counts; the lines of a BIL file are fastest.
+        calibration: of the frame.
+        pictures: bands of the pictures.
+        buffer: memory of at least lines x samples x kept values for the packed numbers, so that several frames can
+            share it; allocating takes a considerable part of the time.
 
     Raises:
-        ValueError: the calibration is not finite where it is needed, or the illumination not positive.
+        ValueError: the calibration is not finite for a live element, or the illumination is not positive.
+
+    Example:
+        >>> with CubeLines(calibration.cubes[0]) as lines:
+        ...     frame = pack_counts(lines, calibration.frames[0], pictures)
+        >>> reflectance, valid = unpack(frame.packed)
     """
     lines, samples, _ = counts.shape
     kept = len(calibration.bands)
-    file_bands = as_slice(calibration.bands)
+    file_bands = _as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
     any_dead = len(dead.at) > 0
     scale, offset = _line_constants(calibration, samples)
     per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
     tests = _tests_of_counts(calibration, counts.dtype)
-    # Bounds as packed numbers. Values have half a unit added, so that cutting off their decimals rounds them.
+    # Bounds as packed numbers; the values include half a unit, so that truncation rounds them.
     low, high = (round(float(np.clip(b * REFLECTANCE_SCALE, 0, FLAGGED - 1))) for b in calibration.bounds)
 
     turns = calibration.quarter_turns
@@ -125,16 +182,16 @@ def pack_counts(
     packed = np.rot90(buffer[: lines * samples * kept].reshape(*upright_shape, kept), -turns)
     flags = np.zeros((lines, samples), np.uint8)
     flags |= dead.pixel_flags
-    draw = LinePictures(pictures, kept, lines, samples)
-    counters = {name: Counter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
+    line_pictures = _LinePictures(pictures, kept, lines, samples)
+    counters = {name: _LineCounter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
 
     values = np.empty((kept, samples), np.float32)
     numbers = np.empty((kept, samples), np.uint16)
-    # What lies upright in the file is transposed to its place at once.
+    # Files that are upright are transposed directly into place.
     block = packed[:1] if turns == 0 else np.empty((_BLOCK_LINES, samples, kept), np.uint16)
     for line in range(lines):
         raw = _band_major(counts[line])
-        with np.errstate(over="ignore"):  # a double that no float32 holds is no count
+        with np.errstate(over="ignore"):  # doubles beyond float32 are no counts
             np.copyto(values, raw[file_bands], casting="unsafe")
         flagged = None
         for name, flag, test in tests:
@@ -142,7 +199,7 @@ def pack_counts(
             if not found.any():
                 continue
             if flag == PixelFlag.NO_DATA:
-                values[found] = _LEAST
+                values[found] = _LOWEST
             found.reshape(-1)[dead.at] = False
             if flagged is not None:
                 found &= ~flagged
@@ -155,14 +212,14 @@ def pack_counts(
         if per_flat is not None:
             values *= per_flat[line]
             values += _HALF
-        least, most, _, _ = cv2.minMaxLoc(values)
-        if least < low or most >= high + 1:
+        smallest, largest, _, _ = cv2.minMaxLoc(values)
+        if smallest < low or largest >= high + 1:
             for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
                 counters[name].add(clipped if flagged is None else clipped & ~flagged)
             np.clip(values, low + _HALF, high + _HALF, out=values)
         if any_dead:
             values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
-        draw.line(line, values)
+        line_pictures.add(line, values)
 
         np.copyto(numbers, values, casting="unsafe")
         if flagged is not None:
@@ -176,15 +233,15 @@ def pack_counts(
         elif in_block == len(block) - 1 or line == lines - 1:
             packed[line - in_block : line + 1] = block[: in_block + 1]
 
-    tally = Tally(
+    pixel_counts = PixelCounts(
         dead=dead.per_band * lines, **{name: counter.by_band(dead.at) for name, counter in counters.items()}
     )
-    return PackedReflectance(packed, flags, tally, draw.rgb, draw.gray, draw.binned)
+    return PackedReflectance(packed, flags, pixel_counts, line_pictures.rgb, line_pictures.gray, line_pictures.binned)
 
 
 @dataclass(frozen=True, eq=False)
 class _DeadElements:
-    """Dead elements of a line ``(kept, samples)``: where they are (flat), what takes their place, how many a band."""
+    """Dead elements of a line ``(kept, samples)``: flat indices, indices of their replacements, numbers by band."""
 
     at: Int[np.ndarray, "dead"]
     replaced_by: Int[np.ndarray, "dead"]
@@ -193,7 +250,7 @@ class _DeadElements:
 
     @staticmethod
     def of(calibration: FrameCalibration, samples: int) -> _DeadElements:
-        """The nearest good band of the same sample takes a dead element's place; without any good band, itself."""
+        """A dead element is replaced by the nearest good band of its sample, or by itself if there is none."""
         kept = len(calibration.bands)
         dead = np.zeros((kept, samples), bool) if calibration.dead is None else calibration.dead.T[calibration.bands]
         band, sample = np.nonzero(dead)
@@ -209,7 +266,7 @@ class _DeadElements:
 def _line_constants(
     calibration: FrameCalibration, samples: int
 ) -> tuple[Float[np.ndarray, "kept samples"], Float[np.ndarray, "kept samples"]]:
-    """``scale`` and ``offset`` that turn a line's counts into packed numbers (and a half, where there is no flat)."""
+    """``scale`` and ``offset`` that turn a line's counts into packed numbers (plus a half without a flat field)."""
     shape = (len(calibration.bands), samples)
     dark, gain = (
         np.broadcast_to(array.T[calibration.bands], shape) for array in (calibration.dark, calibration.gain)
@@ -232,7 +289,7 @@ def _reciprocal(flat: Float[np.ndarray, "lines samples"]) -> Float[np.ndarray, "
 
 
 def _tests_of_counts(calibration: FrameCalibration, dtype: np.dtype) -> list[tuple[str, PixelFlag, _Test]]:
-    """What this frame's counts (as float32) have to be tested for; the first that holds counts."""
+    """Tests of a frame's counts (as float32); the first that applies counts."""
     tests: list[tuple[str, PixelFlag, _Test]] = []
     if dtype.kind == "f":
         tests.append(("no_data", PixelFlag.NO_DATA, lambda values: ~np.isfinite(values)))
@@ -247,8 +304,79 @@ def _tests_of_counts(calibration: FrameCalibration, dtype: np.dtype) -> list[tup
 
 
 def _band_major(line: Num[np.ndarray, "samples bands"]) -> Num[np.ndarray, "bands samples"]:
-    """The line with neighbouring samples beside each other, as they are in BIL and BSQ files."""
+    """The line with contiguous samples, as in BIL and BSQ files."""
     if line.strides[1] != line.itemsize:
         return line.T
-    moved = cv2.transpose(np.ascontiguousarray(line).view(_MOVED_AS[line.itemsize]))
-    return moved.view(line.dtype)
+    transposed = cv2.transpose(np.ascontiguousarray(line).view(_TRANSPOSED_AS[line.itemsize]))
+    return transposed.view(line.dtype)
+
+
+class _LinePictures:
+    """Collects the pictures of a frame (`PackedReflectance`) line by line."""
+
+    def __init__(self, bands: PictureBands, kept: int, lines: int, samples: int) -> None:
+        whole_bins, rest = divmod(kept, bands.bin_width)
+        self.rgb = np.empty((3, lines, samples), np.float32)
+        self.gray = np.empty((lines, samples), np.float32)
+        # Contiguous by line, as it is written.
+        by_line = np.empty((lines, whole_bins + (rest > 0), samples), np.float32)
+        self.binned = by_line.swapaxes(0, 1)
+        self._rgb_bands = bands.rgb
+        self._gray_bands = _as_slice(bands.gray)
+        self._per_gray = np.float32(1.0 / (len(bands.gray) * REFLECTANCE_SCALE))
+        self._bin_shape = (whole_bins, bands.bin_width, samples)
+        self._in_whole_bins = kept - rest
+        self._sums = np.empty((len(self.binned), samples), np.float32)
+        widths = np.full((len(self.binned), 1), bands.bin_width)
+        widths[whole_bins:] = rest
+        self._per_width = (1.0 / (widths * REFLECTANCE_SCALE)).astype(np.float32)
+
+    def add(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
+        """Add a line, whose values are packed numbers plus a half."""
+        self.rgb[:, line] = values[self._rgb_bands] * np.float32(1.0 / REFLECTANCE_SCALE) - _HALF_UNIT
+        gray = self.gray[line]
+        np.add.reduce(values[self._gray_bands], axis=0, out=gray)
+        gray *= self._per_gray
+        gray -= _HALF_UNIT
+        whole_bins = self._bin_shape[0]
+        binnable = values[: self._in_whole_bins].reshape(self._bin_shape)
+        np.add.reduce(binnable, axis=1, out=self._sums[:whole_bins])
+        if len(self._sums) > whole_bins:
+            np.add.reduce(values[self._in_whole_bins :], axis=0, out=self._sums[-1])
+        self._sums *= self._per_width
+        np.subtract(self._sums, _HALF_UNIT, out=self.binned[:, line])
+
+
+class _LineCounter:
+    """Counts the lines in which each element is marked; 8-bit sums are flushed before they overflow."""
+
+    _MAX_LINES = 255
+
+    def __init__(self, bands: int, samples: int) -> None:
+        self._total = np.zeros((bands, samples), np.int64)
+        self._recent = np.zeros((bands, samples), np.uint8)
+        self._lines = 0
+
+    def add(self, marked: Bool[np.ndarray, "bands samples"]) -> None:
+        """Count one line."""
+        np.add(self._recent, marked.view(np.uint8), out=self._recent)
+        self._lines += 1
+        if self._lines == self._MAX_LINES:
+            self._flush()
+
+    def by_band(self, without: Int[np.ndarray, "elements"]) -> Int[np.ndarray, "bands"]:
+        """Sum over the samples, without some elements (flat indices)."""
+        self._flush()
+        self._total.reshape(-1)[without] = 0
+        return self._total.sum(axis=1)
+
+    def _flush(self) -> None:
+        self._total += self._recent
+        self._recent[:] = 0
+        self._lines = 0
+
+
+def _as_slice(indices: Int[np.ndarray, "count"]) -> slice | Int[np.ndarray, "count"]:
+    """Consecutive indices as a slice, which makes a view instead of a copy."""
+    consecutive = len(indices) > 0 and np.array_equal(indices, np.arange(indices[0], indices[0] + len(indices)))
+    return slice(int(indices[0]), int(indices[0]) + len(indices)) if consecutive else indices

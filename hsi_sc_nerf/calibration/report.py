@@ -1,4 +1,4 @@
-"""What the calibration found, for people (pictures, sentences) and for machines (``calibration.json``)."""
+"""What the calibration found: sentences, ``calibration.json``, and pictures for checking it."""
 
 from __future__ import annotations
 
@@ -8,23 +8,105 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
-from hsi_sc_nerf.calibration.lamp_drift import LampDrift, NotMeasurable
-from hsi_sc_nerf.calibration.pictures import lamp_drift_picture, uncertainty_picture
-from hsi_sc_nerf.calibration.pixel_counts import Tally
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.detector import fill_no_data
+from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
+from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
-from hsi_sc_nerf.calibration.white_reference import WhiteReference
+from hsi_sc_nerf.calibration.white_reference import White, WhiteReference, mean_over_columns, white_mask
+from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.processing.report import column_white_picture, white_reference_picture
+from hsi_sc_nerf.morphology import draw_outline
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
+from hsi_sc_nerf.plotting.figures import new_figure, save_figure
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
 
 REPORT_NAME = "calibration.json"
+PERCENTILE_STEP = 5.0
+"""The white's mask is also shown at a lower and a higher percentile, as in the paper (65, 70, 75)."""
+DRIFT_NM = (450.0, 600.0, 750.0, 900.0)
+REFLECTANCES = (0.1, 0.5, 0.9)
+SMALLEST_P = 1e-6
+
+
+def describe_calibration(session: Session, calibration: SessionCalibration) -> list[str]:
+    """Sentences on what was measured before any frame is calibrated."""
+    white = calibration.white
+    if white is None:
+        sentences = ["White: none needed, the instrument's finished reflectance is taken."]
+    elif calibration.source == "capture":
+        sentences = ["White: the WHITEREF cube of each capture."]
+    else:
+        where = f"the tarp in {session.white.name}" if session.white and calibration.source == "tarp" else "a target"
+        sentences = [f"White: {white.pixels} pixels of {where}."]
+    if calibration.defects is not None:
+        sentences.append(f"Detector: {calibration.defects.summary()}.")
+    return [*sentences, _describe_drift(calibration)]
+
+
+def describe_pixel_counts(pixel_counts: PixelCounts, values: int) -> str:
+    """One sentence on the fractions of ``values`` that were clipped and flagged."""
+    reasons = {
+        "clipped_low": "clipped at the lower bound",
+        "clipped_high": "clipped at the upper bound",
+        "saturated": "saturated",
+        "dead": "of dead detector elements",
+        "no_data": "without data",
+    }
+    percent = {name: 100.0 * int(getattr(pixel_counts, name).sum()) / values for name in reasons}
+    parts = [f"{percent[name]:.2g} % {reason}" for name, reason in reasons.items() if percent[name] > 0.0]
+    return f"Values: {', '.join(parts) if parts else 'none clipped or flagged'}."
+
+
+def write_calibration(
+    path: Path,
+    session: Session,
+    calibration: SessionCalibration,
+    pixel_counts: PixelCounts,
+    typical_uncertainty: Float[np.ndarray, "kept"] | None,
+) -> None:
+    """Write ``calibration.json``. Lists are by kept band if nothing else is said.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    wavelengths_nm, kept, white = session.wavelengths_nm, calibration.bands, calibration.white
+    defects, noise = calibration.defects, calibration.noise
+    content: dict[str, Any] = {
+        "white_source": calibration.source,
+        "white": None if white is None else {"pixels": white.pixels, "counts": white.mean_spectrum()[kept].tolist()},
+        "wavelengths_nm": wavelengths_nm[kept].tolist(),
+        "bad_bands_nm": np.delete(wavelengths_nm, kept).tolist(),
+        "saturation_counts": None if defects is None else defects.saturation_counts,
+        "dead_elements": 0 if defects is None else int(defects.dead.sum()),
+        "flat_field": calibration.frames[0].flat is not None,
+        "noise": None
+        if noise is None
+        else {
+            "read_noise_counts": noise.read_noise[kept].tolist(),
+            "read_noise_measured": noise.read_noise_measured,
+            "counts_per_electron": noise.counts_per_electron,
+            "photon_noise_measured": noise.photon_noise_measured,
+        },
+        "lamp_drift": _drift(session, calibration),
+        **{name: counts.tolist() for name, counts in vars(pixel_counts).items()},
+        "typical_uncertainty": None if typical_uncertainty is None else typical_uncertainty.tolist(),
+    }
+    if isinstance(white, WhiteReference):
+        content["white"] |= {"roi": list(white.roi), "percentile": paper.WHITE_PERCENTILE}
+    write_json(path, content)
 
 
 def draw_calibration(
     folder: Path, session: Session, calibration: SessionCalibration, rgb_nm: Sequence[float]
 ) -> None:
-    """Pictures of the white, the lamps' drift and the uncertainty, as far as there are any.
+    """Draw the white, the lamps' drift and the uncertainty of reflectance, if they were measured.
 
     Raises:
         InputError: the operating system refused to write.
@@ -32,33 +114,134 @@ def draw_calibration(
     wavelengths_nm = session.wavelengths_nm
     white = calibration.white
     if isinstance(white, WhiteReference):
-        shown = session.white if calibration.source == "tarp" else session.frames[0]
-        assert shown is not None
-        white_reference_picture(folder / "white_reference.png", shown.cube, white, rgb_nm)
+        capture = session.white if calibration.source == "tarp" else session.frames[0]
+        assert capture is not None
+        draw_white_reference(folder / "white_reference.png", capture.cube, white, rgb_nm)
     elif white is not None:
-        column_white_picture(folder / "white_reference.png", white, wavelengths_nm)
-    if isinstance(calibration.drift, LampDrift):
-        lamp_drift_picture(
+        draw_column_white(folder / "white_reference.png", white, wavelengths_nm)
+    if isinstance(calibration.drift, LampDriftEstimate):
+        draw_lamp_drift(
             folder / "lamp_drift.png", calibration.drift, wavelengths_nm, corrected=calibration.drift_corrected
         )
     if calibration.uncertainty is not None:
-        uncertainty_picture(folder / "uncertainty.png", calibration.uncertainty, wavelengths_nm[calibration.bands])
+        draw_uncertainty(folder / "uncertainty.png", calibration.uncertainty, wavelengths_nm[calibration.bands])
 
 
-def describe_calibration(session: Session, calibration: SessionCalibration) -> list[str]:
-    """What was found before any frame is calibrated, a sentence each."""
-    white = calibration.white
-    if white is None:
-        sentences = ["White: none needed, the instrument's finished reflectance is taken."]
-    elif calibration.source == "capture":
-        sentences = ["White: the WHITEREF cube of each capture."]
-    else:
-        assert isinstance(white, WhiteReference)
-        where = f"the tarp in {session.white.name}" if session.white and calibration.source == "tarp" else "a target"
-        sentences = [f"White: {white.pixels} pixels of {where}."]
-    if calibration.defects is not None:
-        sentences.append(f"Detector: {calibration.defects.tally()}.")
-    return [*sentences, _describe_drift(calibration)]
+def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: Sequence[float]) -> None:
+    """Draw the steps to the white reference (the paper's appendix).
+
+    These are the coarse region, the deviation map, the mask at three percentiles, and the spectrum before and after
+    smoothing.
+    """
+    x0, y0, x1, y1 = white.roi
+    bands = nearest_bands(cube.wavelengths_nm, rgb_nm)
+    counts = fill_no_data(cube.memmap()[..., bands], cube.ignore_value).astype(float)
+    image = to_8_bit(counts / np.maximum(np.percentile(counts, 95.0, axis=(0, 1)), 1e-9))
+    figure = new_figure(12.0, 12.0)
+    axes = figure.subplot_mosaic(
+        [["image", "deviation", "kept"], ["lower", "used", "higher"], ["spectrum"] * 3, ["smoothing"] * 3],
+        height_ratios=[4.0, 4.0, 3.0, 1.5],
+    )
+    axes["image"].imshow(image)
+    region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2)
+    axes["image"].add_patch(region)
+    axes["image"].set_title("White and its coarse region")
+    extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
+    top = np.percentile(white.deviation, 99.0)
+    shown = axes["deviation"].imshow(white.deviation, cmap="viridis", extent=extent, vmin=0.0, vmax=top)
+    figure.colorbar(shown, ax=axes["deviation"], extend="max", shrink=0.8)
+    axes["deviation"].set_title(f"Deviation D from the mean spectrum\n{_percentiles(white.deviation)}", fontsize=10)
+    kept = np.zeros(image.shape[:2], dtype=bool)
+    kept[y0:y1, x0:x1] = white.mask
+    axes["kept"].imshow(draw_outline(image, kept))
+    in_mask = white.deviation[white.mask]
+    axes["kept"].set_title(f"Region kept: {white.pixels} pixels\n{_percentiles(in_mask)}", fontsize=10)
+    for name, step in {"lower": -PERCENTILE_STEP, "used": 0.0, "higher": PERCENTILE_STEP}.items():
+        percentile = min(paper.WHITE_PERCENTILE + step, 100.0)
+        mask = white_mask(white.deviation, percentile=percentile, kernel_px=white.kernel_px)
+        inside = image[y0:y1, x0:x1]
+        axes[name].imshow(np.where(mask[..., None], inside, inside // 4), extent=extent)
+        mean = f"{white.deviation[mask].mean():.4f}" if mask.any() else "-"
+        axes[name].set_title(
+            f"{percentile:g}th percentile{' (used)' if step == 0.0 else ''}\n"
+            f"keeps {100.0 * mask.mean():.1f} % of the region, mean D {mean}",
+            fontsize=10,
+        )
+    _draw_spectrum(axes["spectrum"], white, cube.wavelengths_nm)
+    change = 100.0 * (white.spectrum[0] / white.measured[0] - 1.0)
+    axes["smoothing"].plot(cube.wavelengths_nm, change, color="tab:blue", linewidth=1)
+    axes["smoothing"].set(xlabel="wavelength (nm)", ylabel="change by\nsmoothing (%)")
+    axes["smoothing"].sharex(axes["spectrum"])
+    save_figure(figure, path)
+
+
+def draw_column_white(path: Path, white: White, wavelengths_nm: Float[np.ndarray, "bands"]) -> None:
+    """Draw the white of a capture: its counts by detector column and band, and their mean spectrum."""
+    figure = new_figure(11.0, 6.5)
+    by_column, spectrum = figure.subplots(2, 1)
+    edges = (0.5, len(wavelengths_nm) + 0.5, len(white.spectrum) - 0.5, -0.5)
+    shown = by_column.imshow(white.spectrum, aspect="auto", interpolation="nearest", extent=edges)
+    figure.colorbar(shown, ax=by_column, label="counts above dark")
+    by_column.set(xlabel="band", ylabel="sample", title="White by detector column (blank where an element is dead)")
+    _draw_spectrum(spectrum, white, wavelengths_nm)
+    spectrum.set_xlabel("wavelength (nm)")
+    save_figure(figure, path)
+
+
+def draw_lamp_drift(
+    path: Path, drift: LampDriftEstimate, wavelengths_nm: Float[np.ndarray, "bands"], *, corrected: bool
+) -> None:
+    """Draw the lamps' light by frame at some wavelengths, and by wavelength in the last frame."""
+    change, error, measured = (
+        100.0 * part for part in (drift.factor - 1.0, drift.standard_error, drift.measured - 1.0)
+    )
+    figure = new_figure(12.0, 4.5)
+    by_frame, by_band = figure.subplots(1, 2)
+    bands = list(dict.fromkeys(nearest_bands(wavelengths_nm, DRIFT_NM)))
+    for band, colour in zip(bands, colormaps["plasma"](np.linspace(0.0, 0.8, len(bands))), strict=True):
+        label = f"{wavelengths_nm[band]:.0f} nm"
+        two_sd = 2.0 * error[:, band]
+        by_frame.errorbar(
+            np.arange(len(change)), change[:, band], two_sd, color=colour, marker=".", capsize=2, label=label
+        )
+    by_frame.legend(title="with 2 standard errors")
+    by_frame.xaxis.set_major_locator(MaxNLocator(integer=True))
+    p_value = f"p = {drift.p_value:.1g}" if drift.p_value > SMALLEST_P else f"p < {SMALLEST_P:g}"
+    by_frame.set(xlabel="frame", ylabel="change since the first frame (%)")
+    by_frame.set_title(
+        f"Light of the lamps: {'corrected' if corrected else 'not corrected'} "
+        f"({'significant' if drift.significant else 'not significant'}, {p_value})"
+    )
+    by_band.plot(wavelengths_nm, measured[-1], ".", color="tab:gray", markersize=3, label="measured")
+    by_band.plot(wavelengths_nm, change[-1], color="tab:blue", label="smooth, with 2 standard errors")
+    low, high = change[-1] - 2.0 * error[-1], change[-1] + 2.0 * error[-1]
+    by_band.fill_between(wavelengths_nm, low, high, color="tab:blue", alpha=0.3, linewidth=0)
+    by_band.legend()
+    by_band.set(xlabel="wavelength (nm)", ylabel="change in the last frame (%)")
+    by_band.set_title(f"Measured on {100.0 * drift.static_fraction:.0f} % of the surveyed pixels, which are static")
+    for axes in (by_frame, by_band):
+        axes.axhline(0.0, color="0.6", linewidth=0.8)
+    save_figure(figure, path)
+
+
+def draw_uncertainty(
+    path: Path, uncertainty: ReflectanceUncertainty, wavelengths_nm: Float[np.ndarray, "bands"]
+) -> None:
+    """Draw the standard deviation of one pixel by wavelength at some reflectances, and the white's part of it."""
+    figure = new_figure(8.0, 4.5)
+    axes = figure.subplots()
+    colours = colormaps["viridis"](np.linspace(0.85, 0.0, len(REFLECTANCES)))
+    for reflectance, colour in zip(REFLECTANCES, colours, strict=True):
+        deviation = uncertainty.standard_deviation(np.full(len(wavelengths_nm), reflectance))
+        axes.plot(wavelengths_nm, deviation, color=colour, label=f"reflectance {reflectance:g}")
+    brightest = max(REFLECTANCES)
+    of_white = np.sqrt(uncertainty.quadratic) * brightest
+    axes.plot(wavelengths_nm, of_white, color="0.5", linestyle="--", label=f"the white's part at {brightest:g}")
+    axes.set(xlabel="wavelength (nm)", ylabel="standard deviation of one pixel's reflectance", yscale="log")
+    axes.set_title("Uncertainty of the reflectance")
+    axes.grid(color="0.9")
+    axes.legend()
+    save_figure(figure, path)
 
 
 def _describe_drift(calibration: SessionCalibration) -> str:
@@ -75,70 +258,6 @@ def _describe_drift(calibration: SessionCalibration) -> str:
     return f"Lamps: a drift of up to {largest:+.2f} % is not corrected, {why}."
 
 
-def describe_tally(tally: Tally, values: int) -> str:
-    """How much was clipped and flagged, of so many values; one sentence."""
-    shares = {
-        name: 100.0 * int(getattr(tally, name).sum()) / values
-        for name in ("clipped_low", "clipped_high", "saturated", "dead", "no_data")
-    }
-    texts = {
-        "clipped_low": "clipped at the lower bound",
-        "clipped_high": "clipped at the upper bound",
-        "saturated": "saturated",
-        "dead": "of dead detector elements",
-        "no_data": "without data",
-    }
-    told = [f"{share:.2g} % {texts[name]}" for name, share in shares.items() if share > 0.0]
-    return f"Values: {', '.join(told) if told else 'none clipped or flagged'}."
-
-
-def write_calibration(
-    path: Path,
-    session: Session,
-    calibration: SessionCalibration,
-    tally: Tally,
-    typical_uncertainty: Float[np.ndarray, "kept"] | None,
-) -> None:
-    """Write ``calibration.json``: everything above as numbers; lists are by kept band where not said otherwise.
-
-    Raises:
-        InputError: the operating system refused to write.
-    """
-    wavelengths_nm, kept, white = session.wavelengths_nm, calibration.bands, calibration.white
-    content: dict[str, Any] = {
-        "white_source": calibration.source,
-        "white": None if white is None else {"pixels": white.pixels, "counts": white.mean_spectrum()[kept].tolist()},
-        "wavelengths_nm": wavelengths_nm[kept].tolist(),
-        "bad_bands_nm": np.delete(wavelengths_nm, kept).tolist(),
-        "saturation_counts": None if calibration.defects is None else calibration.defects.saturation_counts,
-        "dead_elements": 0 if calibration.defects is None else int(calibration.defects.dead.sum()),
-        "flat_field": calibration.frames[0].flat is not None,
-        "noise": _noise(calibration),
-        "lamp_drift": _drift(session, calibration),
-        "clipped_low": tally.clipped_low.tolist(),
-        "clipped_high": tally.clipped_high.tolist(),
-        "saturated": tally.saturated.tolist(),
-        "dead": tally.dead.tolist(),
-        "no_data": tally.no_data.tolist(),
-        "typical_uncertainty": None if typical_uncertainty is None else typical_uncertainty.tolist(),
-    }
-    if isinstance(white, WhiteReference):
-        content["white"] |= {"roi": list(white.roi), "percentile": white.percentile}
-    write_json(path, content)
-
-
-def _noise(calibration: SessionCalibration) -> dict[str, Any] | None:
-    noise = calibration.noise
-    if noise is None:
-        return None
-    return {
-        "read_noise_counts": noise.read_noise[calibration.bands].tolist(),
-        "read_noise_measured": noise.read_noise_measured,
-        "counts_per_electron": noise.counts_per_electron,
-        "photon_noise_measured": noise.photon_noise_measured,
-    }
-
-
 def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:
     drift = calibration.drift
     if isinstance(drift, NotMeasurable):
@@ -149,7 +268,26 @@ def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:
         "corrected": calibration.drift_corrected,
         "significant": drift.significant,
         "p_value": drift.p_value,
-        "static_share": drift.static_share,
+        "static_fraction": drift.static_fraction,
         "factor": {frame.name: row.tolist() for frame, row in zip(session.frames, factor, strict=True)},
         "standard_error": {frame.name: row.tolist() for frame, row in zip(session.frames, error, strict=True)},
     }
+
+
+def _draw_spectrum(axes: Axes, white: White, wavelengths_nm: Float[np.ndarray, "bands"]) -> None:
+    """The mean white spectrum before and after smoothing, with its bad bands marked."""
+    for number in np.flatnonzero(white.bad_bands).tolist():
+        left, right = max(number - 1, 0), min(number + 1, len(wavelengths_nm) - 1)
+        middle = wavelengths_nm[number]
+        span = (middle + wavelengths_nm[left]) / 2.0, (middle + wavelengths_nm[right]) / 2.0
+        axes.axvspan(*span, color="tab:red", alpha=0.25, linewidth=0)
+    axes.plot(wavelengths_nm, mean_over_columns(white.measured), color="tab:gray", label="measured")
+    axes.plot(wavelengths_nm, white.mean_spectrum(), color="tab:blue", linewidth=1, label="smoothed")
+    bad = np.count_nonzero(white.bad_bands)
+    axes.set(ylabel="counts above dark", title=f"White spectrum{f', {bad} bad bands marked' if bad else ''}")
+    axes.legend()
+
+
+def _percentiles(deviation: Float[np.ndarray, "n"]) -> str:
+    middle, high = np.percentile(deviation, [50.0, 95.0])
+    return f"median {middle:.4f}, 95th percentile {high:.4f}\nlargest {deviation.max():.4f}"

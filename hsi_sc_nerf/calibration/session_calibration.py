@@ -1,62 +1,85 @@
-"""A session's calibration: its white, its detector's defects and noise, its lamps' drift; and each frame's part."""
+"""Calibration of a session: its white, the detector's defects and noise, the lamps' drift, and each frame's gain."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig, WhiteSource
-from hsi_sc_nerf.calibration.dark import dark_columns
-from hsi_sc_nerf.calibration.defects import Defects, Readings, find_defects
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.detector import Defects, Readings, dark_columns, fill_no_data, find_defects, no_data
 from hsi_sc_nerf.calibration.flat_field import flat_field
 from hsi_sc_nerf.calibration.lamp_drift import (
-    LampDrift,
+    CorrectDrift,
+    LampDriftEstimate,
     NotMeasurable,
     correction,
     measure_lamp_drift,
-    survey_count,
     survey_lines,
 )
-from hsi_sc_nerf.calibration.no_data import filled, no_data
-from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise
+from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
 from hsi_sc_nerf.calibration.panel import read_panel
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.calibration.white_reference import White, WhiteReference, tarp_roi
+from hsi_sc_nerf.calibration.white_reference import Roi, White, WhiteReference, tarp_roi
 from hsi_sc_nerf.calibration.white_source import (
-    exposure_over,
+    WhiteSource,
+    exposure_ratio,
+    measure_whites,
     white_cubes,
-    white_over_sample_time,
+    white_exposure_ratio,
     white_source,
-    whites_of_frames,
 )
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty, reflectance_uncertainty
+from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE, ReflectanceUncertainty
 
-FRAMES_TO_TELL_DEFECTS, LINES_TO_TELL_DEFECTS = 6, 4
-"""In so many frames, evenly spread, and lines of each, defects of the detector and saturation are looked for."""
+DEFECT_FRAMES, DEFECT_LINES = 6, 4
+"""Frames, evenly spread, and lines of each that are searched for defects and saturation."""
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """Settings of the white-reference calibration."""
+
+    white_source: Literal["auto"] | WhiteSource = "auto"
+    """Where the white is: in a capture of its own (tarp), in the WHITEREF cube of each capture (capture), or in every
+    frame at --calibration.roi (target). Product takes the instrument's own REFLECTANCE cubes and needs no white. Auto
+    takes the first of tarp, capture and product that the session has."""
+    roi: Roi | None = None
+    """Region of the white in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. By default, a
+    tarp is found by its brightness; a white target needs this."""
+    panel: Path | None = None
+    """CSV file with the white's own reflectance by wavelength (nm, and a fraction or percent). By default, the white
+    has reflectance 1 in all bands."""
+    bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
+    """Reflectance is clipped to this range."""
+    flat_field: bool = False
+    """Divide by the falloff of the light over the image, as the tarp shows it."""
+    lamp_drift: CorrectDrift = "auto"
+    """Divide by the lamps' drift over the session if it is significant (auto), whenever it can be measured (always),
+    or never. It is measured and reported in any case."""
 
 
 @dataclass(frozen=True, eq=False)
 class SessionCalibration:
-    """How each frame of a session becomes reflectance, and what was found on the way.
+    """How each frame of a session becomes reflectance, and what was measured for it.
 
     Attributes:
-        source: where the white is, or "product" where the instrument's finished reflectance is taken as it is.
+        source: where the white is.
         cubes: the cube that each frame is read from.
-        frames: how its numbers become reflectance.
-        bands: which of the files' bands are kept.
-        white: of the session, or of its first frame where each has its own; None for finished reflectance.
-        defects: of the detector; None for finished reflectance.
-        noise: of a reading; None for finished reflectance.
-        drift: of the lamps, or why it is not known.
-        drift_corrected: whether it is divided out.
-        uncertainty: of reflectance in the kept bands; None for finished reflectance.
+        frames: the calibration of each frame.
+        bands: the bands of the files that are kept.
+        white: of the session, or of the first frame if each has its own; None for "product".
+        defects: of the detector; None for "product".
+        noise: of a reading; None for "product".
+        drift: of the lamps, or why it is unknown.
+        drift_corrected: whether the frames are divided by it.
+        uncertainty: of reflectance in the kept bands; None for "product".
     """
 
     source: WhiteSource
@@ -66,17 +89,22 @@ class SessionCalibration:
     white: White | None
     defects: Defects | None
     noise: NoiseModel | None
-    drift: LampDrift | NotMeasurable
+    drift: LampDriftEstimate | NotMeasurable
     drift_corrected: bool
     uncertainty: ReflectanceUncertainty | None
 
 
 def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCalibration:
-    """Calibrate a session; of the frames only a few lines are read.
+    """Calibrate a session. Only a few lines of each frame are read.
 
     Raises:
-        InputError: bounds that cannot be kept, a source of white that the session does not have, or a white or a
-            panel that cannot be used.
+        InputError: the bounds are out of range, the session does not have the white that the settings name, or the
+            white or the panel cannot be used.
+
+    Example:
+        >>> session = open_session(Path("captures"))
+        >>> calibration = calibrate_session(session, CalibrationConfig())
+        >>> packed = pack_counts(calibration.cubes[0].memmap(), calibration.frames[0], pictures)
     """
     low, high = config.bounds
     if not 0.0 <= low < high <= LARGEST_REFLECTANCE:
@@ -84,12 +112,12 @@ def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCal
             f"--calibration.bounds {low:g} {high:g}: reflectance is kept from 0 to {LARGEST_REFLECTANCE:.4g}; give "
             "two ascending numbers within that."
         )
-    source = white_source(session, config)
-    return _finished(session, config) if source == "product" else _from_counts(session, source, config)
+    source = white_source(session, config.white_source, config.roi)
+    return _from_products(session, config) if source == "product" else _from_counts(session, source, config)
 
 
-def _finished(session: Session, config: CalibrationConfig) -> SessionCalibration:
-    """Finished reflectance is only scaled."""
+def _from_products(session: Session, config: CalibrationConfig) -> SessionCalibration:
+    """The instrument's own reflectance is only scaled."""
     cubes = tuple(frame.product for frame in session.frames if frame.product is not None)
     bands = _kept(session, ~np.logical_and.reduce([cube.good_bands for cube in cubes]))
     return SessionCalibration(
@@ -110,7 +138,7 @@ def _finished(session: Session, config: CalibrationConfig) -> SessionCalibration
         white=None,
         defects=None,
         noise=None,
-        drift=NotMeasurable("finished reflectance does not tell how noisy the readings were"),
+        drift=NotMeasurable("the noise of finished reflectance is unknown"),
         drift_corrected=False,
         uncertainty=None,
     )
@@ -122,16 +150,16 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     lines, samples, bands = first.shape
     darks = _dark_spectra(captures)
     defects = _defects(session, source, config)
-    whites = whites_of_frames(session, source, config, defects)
+    whites = measure_whites(session, source, config.roi, defects)
     panel = np.ones(bands)
     panel_path = config.panel or session.panel_reflectance_path
     if panel_path is not None:
         panel = read_panel(panel_path, first.wavelengths_nm)
     noise = _noise(session, source, whites[0], defects)
 
-    survey = survey_lines(lines, survey_count(lines, config.lamp_drift))
+    survey = survey_lines(lines)
     saturated = defects.saturation_counts
-    exposures = np.array([exposure_over(capture, captures[0]) for capture in captures])
+    exposures = np.array([exposure_ratio(capture, captures[0]) for capture in captures])
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
         cube = captures[frame].cube
@@ -147,12 +175,11 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
         [dark / exposure for dark, exposure in zip(darks, exposures, strict=True)],
         noise,
         first.wavelengths_nm,
-        config.lamp_drift,
         saturation_counts=None if saturated is None else saturated / exposures.max(),
         dead=defects.dead,
     )
-    # A white in every frame follows the lamps by itself.
-    drifted = correction(drift, config.lamp_drift) if source == "tarp" else None
+    # A white in every frame drifts with the lamps.
+    drift_factor = correction(drift, config.lamp_drift) if source == "tarp" else None
 
     bad_bands = defects.bad_bands | np.logical_or.reduce([white.bad_bands for white in whites])
     kept = _kept(session, bad_bands)
@@ -161,14 +188,14 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
         tarp, found = session.white, whites[0]
         assert tarp is not None
         assert isinstance(found, WhiteReference)
-        flat = flat_field(tarp, found, (lines, samples), config, defects)
+        flat = flat_field(tarp, found, (lines, samples), defects)
     frames = []
     for number, capture in enumerate(captures):
         white = whites[number % len(whites)]
-        gain = panel * white_over_sample_time(session, source, capture) / white.spectrum
-        if drifted is not None:
-            gain = gain / drifted[number]
-        # Where a column's own white says nothing, nothing can be calibrated.
+        gain = panel * white_exposure_ratio(session, source, capture) / white.spectrum
+        if drift_factor is not None:
+            gain = gain / drift_factor[number]
+        # A sample without a white of its own cannot be calibrated.
         dead = (defects.dead | np.isnan(white.spectrum)) & ~bad_bands
         frames.append(
             FrameCalibration(
@@ -192,7 +219,7 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
         defects=defects,
         noise=noise,
         drift=drift,
-        drift_corrected=drifted is not None,
+        drift_corrected=drift_factor is not None,
         uncertainty=_uncertainty(session, source, whites[0], noise, panel, kept),
     )
 
@@ -208,41 +235,38 @@ def _kept(session: Session, bad_bands: Bool[np.ndarray, "bands"]) -> Int[np.ndar
 
 
 def _dark_spectra(captures: Sequence[Capture]) -> list[Float[np.ndarray, "columns bands"]]:
-    """Of each capture; a dark cube that serves several is read once."""
+    """Dark counts of each capture; a dark cube of several captures is read once."""
     read: dict[Cube | None, Float[np.ndarray, "columns bands"]] = {}
     for capture in captures:
         if capture.dark not in read:
-            read[capture.dark] = _dark_spectrum(capture.dark, capture.cube)
+            counts = None if capture.dark is None else capture.dark.memmap()
+            read[capture.dark] = dark_columns(counts, *capture.cube.shape[1:])
     return [read[capture.dark] for capture in captures]
 
 
-def _dark_spectrum(dark: Cube | None, cube: Cube) -> Float[np.ndarray, "columns bands"]:
-    return dark_columns(None if dark is None else dark.memmap(), *cube.shape[1:])
-
-
 def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -> Defects:
-    """From the lines that cross the white, and a few of some frames."""
+    """Defects found on the lines that cross the white and on some lines of some frames."""
     captures = session.frames
     lines, samples, _ = captures[0].cube.shape
-    chosen = np.unique(np.linspace(0, len(captures) - 1, FRAMES_TO_TELL_DEFECTS).round().astype(int))
-    rows = np.unique(np.linspace(0, lines - 1, LINES_TO_TELL_DEFECTS + 2).round().astype(int)[1:-1])
-    of_frames = [_readings(captures[i].cube, captures[i].dark, rows) for i in chosen]
+    numbers = np.unique(np.linspace(0, len(captures) - 1, DEFECT_FRAMES).round().astype(int))
+    rows = np.unique(np.linspace(0, lines - 1, DEFECT_LINES + 2).round().astype(int)[1:-1])
+    of_frames = [_readings(captures[number].cube, captures[number].dark, rows) for number in numbers]
     good_bands = np.logical_and.reduce([capture.cube.good_bands for capture in captures])
     cube, dark = white_cubes(session, source)
     roi = None if source == "capture" else config.roi
     if source == "tarp" and roi is None:
         assert session.white is not None
-        # Once the dead elements are known, it is found again without them (`white_reference`).
-        roi = tarp_roi(session.white, config)
+        # `white_reference` finds the tarp again, without the dead elements.
+        roi = tarp_roi(session.white)
     inside = slice(None) if roi is None else slice(max(0, roi[1]), roi[3])
     white = _readings(cube, dark, np.arange(cube.shape[0])[inside])
     if white.counts.shape[1] != samples:
         white, of_frames = of_frames[0], of_frames[1:]
-    return find_defects(white, of_frames, good_bands=good_bands, min_light=config.min_light)
+    return find_defects(white, of_frames, good_bands=good_bands)
 
 
 def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> Readings:
-    counts = filled(np.asarray(cube.memmap()[rows]), cube.ignore_value)
+    counts = fill_no_data(np.asarray(cube.memmap()[rows]), cube.ignore_value)
     return Readings(counts, None if dark is None else dark.memmap())
 
 
@@ -278,7 +302,7 @@ def _uncertainty(
 ) -> ReflectanceUncertainty:
     capture, dark = session.frames[0], white_cubes(session, source)[1]
     spectrum = white.mean_spectrum()
-    # A bad band takes no part in its neighbours' average; any finite number serves in its place.
+    # Bad bands take no part in their neighbours' average, so any finite number will do.
     spectrum = np.interp(np.arange(len(spectrum)), kept, spectrum[kept])
     columns = np.ptp(white.roi[::2]) if isinstance(white, WhiteReference) else 1
     everywhere = reflectance_uncertainty(
@@ -289,6 +313,6 @@ def _uncertainty(
         frame_dark_readings=0 if capture.dark is None else capture.dark.shape[0],
         white_dark_readings=0 if dark is None else dark.shape[0] * int(columns),
         panel_reflectance=panel,
-        integration_ratio=white_over_sample_time(session, source, capture),
+        integration_ratio=white_exposure_ratio(session, source, capture),
     )
     return ReflectanceUncertainty(everywhere.constant[kept], everywhere.linear[kept], everywhere.quadratic[kept])

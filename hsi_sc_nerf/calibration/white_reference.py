@@ -1,10 +1,8 @@
-"""What reflectance 1 counts, from a white: steps 1 to 5 of the paper's Algorithm 1 (`white_steps`).
+"""The white reference: steps 1 to 5 of the paper's Algorithm 1, from the counts of a white to its spectrum.
 
-Three sources give the same kind of result: the session's white tarp (`white_reference`, the paper's), a white target
-inside every frame (`target_white`), and a white cube that belongs to one capture (`column_white`).
-
-The spatial steps (ROI, deviation, mask) use the counts as they are; dark counts, where there is a dark cube, are
-taken off the mean spectrum.
+`white_reference` finds the white in an image: the session's white tarp, or a white target inside every frame.
+`column_white` takes a white cube that belongs to one capture. The spatial steps use raw counts; dark counts are
+subtracted from the mean spectrum.
 """
 
 from __future__ import annotations
@@ -12,39 +10,40 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.dark import dark_columns
-from hsi_sc_nerf.calibration.defects import Defects, unlit_bands
-from hsi_sc_nerf.calibration.no_data import filled, no_data
-from hsi_sc_nerf.calibration.white_steps import (
-    ColumnSums,
-    column_sums,
-    deviation_map,
-    find_coarse_roi,
-    mean_over_columns,
-    mean_spectrum,
-    smooth_spectrum,
-    white_mask,
-)
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.detector import Defects, dark_columns, fill_no_data, no_data, unlit_bands
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.morphology import ellipse_close_open, largest_component
+
+Roi = tuple[int, int, int, int]
+"""A region of an image as its file holds it: x0, y0, x1, y1 in pixels, x1 and y1 excluded."""
+TARP_BRIGHTNESS = 0.5
+"""The tarp is the largest region brighter than this fraction of the image's 99th percentile."""
+MAX_DEVIATION = 0.5
+"""Largest mean deviation of a white's pixels from their mean spectrum (relative)."""
+MAX_SATURATED = 0.01
+"""A band is bad if a larger fraction of the white's readings is saturated."""
+SMOOTHING_MAX_NM = 15.0
+"""Largest span of the moving average. The paper's five bands span 12 nm; five broad bands would smooth the lamp's own
+spectrum away."""
 
 
 @dataclass(frozen=True, eq=False)
 class White:
-    """What a white counts above dark, in the file's own orientation. One column holds for all samples of a line.
+    """Counts of a white above dark, in the file's orientation. One column holds for all samples of a line.
 
     Attributes:
-        measured: mean counts of the white, dark counts taken off, before smoothing; nan where there is none, which is
-            in bad bands and, where the columns are the detector's, in its dead elements.
+        measured: mean counts above dark before smoothing; nan in bad bands and, with one column for each sample, in
+            dead elements.
         spectrum: the same after smoothing.
         dark: mean counts without light.
-        pixels: how many pixels were averaged for each column.
-        window_bands: how many bands smoothing averaged for each band; 0 in bad bands.
-        bad_bands: bands in which the white is not lit, saturated, or has no living detector element.
+        pixels: pixels averaged for each column.
+        window_bands: bands averaged by smoothing for each band; 0 in bad bands.
+        bad_bands: bands in which the white is unlit, saturated, or without a live detector element.
     """
 
     measured: Float[np.ndarray, "columns bands"]
@@ -61,85 +60,92 @@ class White:
 
 @dataclass(frozen=True, eq=False)
 class WhiteReference(White):
-    """A white that was found in an image, and how.
+    """A white that was found in an image.
 
     Attributes:
-        roi: x0, y0, x1, y1 of the coarse region, pixels.
+        roi: the coarse region.
         deviation: D(x, y) inside the coarse region (relative, not negative).
         mask: the refined region inside the coarse one.
-        percentile: of D that was kept.
         kernel_px: diameter of the ellipse that closed and opened the mask.
     """
 
-    roi: tuple[int, int, int, int]
+    roi: Roi
     deviation: Float[np.ndarray, "y x"]
     mask: Bool[np.ndarray, "y x"]
-    percentile: float
     kernel_px: int
 
 
-def white_reference(capture: Capture, config: CalibrationConfig, defects: Defects | None = None) -> WhiteReference:
-    """Steps 1 to 5 on the capture of the white tarp, whose spectrum is one for the whole image (one column).
+def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects | None = None) -> WhiteReference:
+    """Steps 1 to 5 on an image that shows the white; the spectrum has one column.
+
+    Args:
+        capture: the capture of the white tarp, or a frame with a white target.
+        roi: region of the white; None finds it by its brightness (step 1). Nothing outside of it is read.
+        defects: of the detector, if they are known.
 
     Raises:
-        InputError: a ROI outside the image, a tarp with no usable region, or a white that is not lit in half of the
-            bands.
-    """
-    return _white_in(capture, config.roi or tarp_roi(capture, config, defects), config, defects)
+        InputError: the region is not inside the image, no part of it is evenly bright, or the white is not lit in
+            half of the bands.
 
-
-def tarp_roi(
-    capture: Capture, config: CalibrationConfig, defects: Defects | None = None
-) -> tuple[int, int, int, int]:
-    """Step 1: where the tarp is in its image (x0, y0, x1, y1), by the brightness of what is neither dead nor no data.
-
-    Raises:
-        InputError: the image is dark.
+    Example:
+        >>> session = open_session(Path("captures"))
+        >>> white = white_reference(session.white)
+        >>> white.roi, white.pixels, white.spectrum.shape  # (1, bands)
     """
     cube = capture.cube
-    live = ~_dead(defects, *cube.shape[1:])
-    brightness = []
-    for line in cube.memmap():
-        missing = no_data(line, cube.ignore_value)
-        used = live if missing is None else live & ~missing
-        # A sample of which nothing is used is dark.
-        brightness.append(np.where(used, line, 0).sum(axis=-1, dtype=np.float64) / np.maximum(used.sum(axis=-1), 1))
-    roi = find_coarse_roi(np.stack(brightness), config.roi_brightness)
-    if roi is None:
+    lines, samples, bands = cube.shape
+    x0, y0, x1, y1 = roi = roi or tarp_roi(capture, defects)
+    if not (0 <= x0 < x1 <= samples and 0 <= y0 < y1 <= lines):
         raise InputError(
-            f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
+            f"{cube.header_path}: the given region x0 y0 x1 y1 = {tuple(roi)} is not inside its {samples} x {lines} "
+            "pixels; correct --calibration.roi."
         )
-    return roi
-
-
-def target_white(frame: Capture, config: CalibrationConfig, defects: Defects | None = None) -> WhiteReference:
-    """Steps 2 to 5 on the white target inside a frame, at ``config.roi``; only that region is read.
-
-    Raises:
-        InputError: no ROI given, or as `white_reference`.
-    """
-    if config.roi is None:
+    counts = np.ascontiguousarray(cube.memmap()[y0:y1, x0:x1], dtype=cube.dtype.newbyteorder("="))
+    dead = _dead(defects, samples, bands)[x0:x1]
+    deviation = deviation_map(fill_no_data(counts, cube.ignore_value), dead)
+    kernel_px = max(paper.WHITE_MORPHOLOGY_MIN_PX, min(counts.shape[:2]) // paper.WHITE_MORPHOLOGY_FRACTION)
+    mask = white_mask(deviation, percentile=paper.WHITE_PERCENTILE, kernel_px=kernel_px)
+    if not mask.any() or not deviation[mask].mean() <= MAX_DEVIATION:
         raise InputError(
-            f"{frame.cube.header_path}: where the white target is in the frames is not known; give its place with "
-            "--calibration.roi."
+            f"{cube.header_path}: the tarp has no usable region, because no part of it is evenly bright; take it "
+            "again or give its place with --calibration.roi."
         )
-    return _white_in(frame, config.roi, config, defects)
+    columns = column_sums(
+        counts,
+        mask,
+        ignore_value=cube.ignore_value,
+        saturation_counts=None if defects is None else defects.saturation_counts,
+    ).without(dead)
+    dark = dark_columns(None if capture.dark is None else capture.dark.read(), samples, bands)
+    measured = mean_spectrum(columns, dark if len(dark) == 1 else dark[x0:x1])[None]
+    bad_bands = _bad_bands(cube, measured, columns, defects)
+    measured = np.where(bad_bands, np.nan, measured)
+    spectrum, window_bands = smooth_spectrum(measured, cube.wavelengths_nm)
+    return WhiteReference(
+        measured,
+        spectrum,
+        dark,
+        pixels=int(mask.sum()),
+        window_bands=window_bands.max(axis=0),
+        bad_bands=bad_bands,
+        roi=(x0, y0, x1, y1),
+        deviation=deviation,
+        mask=mask,
+        kernel_px=kernel_px,
+    )
 
 
-def column_white(
-    white: Cube, dark: Cube | None, samples: int, config: CalibrationConfig, defects: Defects | None = None
-) -> White:
-    """The spectrum of a white cube (WHITEREF: a few lines of nothing but white), for each column of the detector.
+def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects | None = None) -> White:
+    """Steps 4 and 5 on a white cube (WHITEREF: lines of nothing but white), for each sample of the detector.
 
     Args:
         white: counts of the white.
         dark: counts without light that belong to it.
-        samples: of the frames. A white of another width cannot be matched column by column and gives one spectrum.
-        config: settings.
-        defects: of the detector, found before.
+        samples: of the frames. A white of another width cannot be matched by sample and gives one column.
+        defects: of the detector, if they are known.
 
     Raises:
-        InputError: a white that is not lit in half of the bands.
+        InputError: the white is not lit in half of the bands.
     """
     counts = white.read()
     width, bands = counts.shape[1:]
@@ -157,81 +163,163 @@ def column_white(
     else:
         measured, pixels = mean_spectrum(columns, dark_spectra)[None], len(counts) * width
         dark_spectra = dark_spectra.mean(axis=0, keepdims=True)
-    bad_bands = _bad_bands(white, measured, columns, config, defects)
+    bad_bands = _bad_bands(white, measured, columns, defects)
     measured = np.where(bad_bands | ~(measured > 0.0), np.nan, measured)
-    spectrum, window_bands = _smoothed(measured, white, config)
-    return White(measured, spectrum, dark_spectra, pixels, window_bands, bad_bands)
+    spectrum, window_bands = smooth_spectrum(measured, white.wavelengths_nm)
+    return White(measured, spectrum, dark_spectra, pixels, window_bands.max(axis=0), bad_bands)
 
 
-def _white_in(
-    capture: Capture, roi: tuple[int, int, int, int], config: CalibrationConfig, defects: Defects | None
-) -> WhiteReference:
-    """Steps 2 to 5 in a coarse region."""
+def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:
+    """Step 1: region of the tarp, by the mean counts of live elements with data.
+
+    Raises:
+        InputError: the image is dark.
+    """
     cube = capture.cube
-    lines, samples, bands = cube.shape
-    x0, y0, x1, y1 = roi
-    if not (0 <= x0 < x1 <= samples and 0 <= y0 < y1 <= lines):
+    live = ~_dead(defects, *cube.shape[1:])
+    brightness = []
+    for line in cube.memmap():
+        missing = no_data(line, cube.ignore_value)
+        used = live if missing is None else live & ~missing
+        # A sample without any usable reading is dark.
+        brightness.append(np.where(used, line, 0).sum(axis=-1, dtype=np.float64) / np.maximum(used.sum(axis=-1), 1))
+    roi = find_coarse_roi(np.stack(brightness))
+    if roi is None:
         raise InputError(
-            f"{cube.header_path}: the given region x0 y0 x1 y1 = {tuple(roi)} is not inside its {samples} x {lines} "
-            "pixels; correct --calibration.roi."
+            f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
         )
-    inside = np.ascontiguousarray(cube.memmap()[y0:y1, x0:x1], dtype=cube.dtype.newbyteorder("="))
-    dead = _dead(defects, samples, bands)[x0:x1]
-    deviation = deviation_map(filled(inside, cube.ignore_value), dead)
-    kernel_px = max(config.morphology_min_px, min(inside.shape[:2]) // config.morphology_fraction)
-    mask = white_mask(deviation, percentile=config.percentile, kernel_px=kernel_px)
-    if not mask.any() or not deviation[mask].mean() <= config.max_deviation:
-        raise InputError(
-            f"{cube.header_path}: the tarp has no usable region, because no part of it is evenly bright; take it "
-            "again or give its place with --calibration.roi."
-        )
-    columns = column_sums(
-        inside,
-        mask,
-        ignore_value=cube.ignore_value,
-        saturation_counts=None if defects is None else defects.saturation_counts,
-    ).without(dead)
-    dark = dark_columns(None if capture.dark is None else capture.dark.read(), samples, bands)
-    measured = mean_spectrum(columns, dark if len(dark) == 1 else dark[x0:x1])[None]
-    bad_bands = _bad_bands(cube, measured, columns, config, defects)
-    measured = np.where(bad_bands, np.nan, measured)
-    spectrum, window_bands = _smoothed(measured, cube, config)
-    return WhiteReference(
-        measured,
-        spectrum,
-        dark,
-        int(mask.sum()),
-        window_bands,
-        bad_bands,
-        roi=(x0, y0, x1, y1),
-        deviation=deviation,
-        mask=mask,
-        percentile=config.percentile,
-        kernel_px=kernel_px,
+    return roi
+
+
+def find_coarse_roi(brightness: Num[np.ndarray, "lines samples"]) -> Roi | None:
+    """Step 1: bounding box of the largest bright region; None if nothing is brighter than zero."""
+    reference = np.percentile(brightness, 99.0)
+    if not reference > 0.0:
+        return None
+    y, x = np.nonzero(largest_component(brightness >= TARP_BRIGHTNESS * reference))
+    return int(x.min()), int(y.min()), int(x.max()) + 1, int(y.max()) + 1
+
+
+def deviation_map(
+    white: Num[np.ndarray, "y x bands"], dead: Bool[np.ndarray, "x bands"] | None = None
+) -> Float[np.ndarray, "y x"]:
+    """Step 2: D(x, y), the mean over bands of |I - mu| / mu, with mu the mean spectrum of the region.
+
+    This is the mean of ratios, as printed (the released code divides means). Dead elements and bands without counts
+    are left out; without any counts D is infinite.
+    """
+    live = np.ones(white.shape[1:], bool) if dead is None else ~dead
+    with np.errstate(invalid="ignore"):
+        mean = white.sum(axis=0, dtype=np.float64).sum(axis=0, where=live) / (len(white) * live.sum(axis=0))
+    lit = mean > 0.0
+    number = live[:, lit].sum(axis=1)
+    if not number.all():
+        return np.full(white.shape[:2], np.inf)
+    # Line by line: the ratios of a whole tarp would take gigabytes.
+    return np.stack(
+        [np.abs(line[:, lit] / mean[lit] - 1.0).sum(axis=1, where=live[:, lit]) / number for line in white]
     )
 
 
+def white_mask(deviation: Float[np.ndarray, "y x"], *, percentile: float, kernel_px: int) -> Bool[np.ndarray, "y x"]:
+    """Step 3: pixels up to the percentile of D; closing, opening, the largest connected component."""
+    kept = deviation <= np.percentile(deviation, percentile)
+    return largest_component(ellipse_close_open(kept, close_px=kernel_px, open_px=kernel_px))
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnSums:
+    """Sums over the readings of each detector element inside a mask.
+
+    Attributes:
+        sums: of the counts.
+        numbers: how many readings were summed.
+        saturated: how many of them are saturated.
+    """
+
+    sums: Float[np.ndarray, "x bands"]
+    numbers: Int[np.ndarray, "x bands"]
+    saturated: Int[np.ndarray, "x bands"]
+
+    def without(self, dead: Bool[np.ndarray, "x bands"]) -> ColumnSums:
+        """The same without the readings of dead elements."""
+        return ColumnSums(*(np.where(dead, 0, array) for array in (self.sums, self.numbers, self.saturated)))
+
+
+def column_sums(
+    white: Num[np.ndarray, "y x bands"],
+    mask: Bool[np.ndarray, "y x"],
+    *,
+    ignore_value: float | None = None,
+    saturation_counts: float | None = None,
+) -> ColumnSums:
+    """Sum each column's counts inside the mask, without readings that are no data."""
+    sums = np.zeros(white.shape[1:])
+    numbers, saturated = np.zeros((2, *white.shape[1:]), np.int64)
+    for line, kept in zip(white, mask, strict=True):
+        missing = no_data(line, ignore_value)
+        valid = kept[:, None] if missing is None else kept[:, None] & ~missing
+        np.add(sums, line, out=sums, where=valid)
+        numbers += valid
+        if saturation_counts is not None:
+            saturated += valid & (line >= saturation_counts)
+    return ColumnSums(sums, numbers, saturated)
+
+
+def mean_spectrum(columns: ColumnSums, dark: Float[np.ndarray, "dark_columns bands"]) -> Float[np.ndarray, "bands"]:
+    """Step 4: mean of all readings above dark; nan in a band without any reading."""
+    with np.errstate(invalid="ignore"):
+        return (columns.sums - columns.numbers * dark).sum(axis=0) / columns.numbers.sum(axis=0)
+
+
+def smooth_spectrum(
+    spectrum: Float[np.ndarray, "*columns bands"],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    window: int = paper.WHITE_SMOOTHING_BANDS,
+    max_nm: float = SMOOTHING_MAX_NM,
+) -> tuple[Float[np.ndarray, "*columns bands"], Int[np.ndarray, "*columns bands"]]:
+    """Step 5: moving average over ``window`` bands (odd), and how many bands were averaged for each.
+
+    The window shrinks symmetrically towards the ends, and until its outermost bands are at most ``max_nm`` apart, so
+    that constant and linear spectra are unchanged in every band. A nan band stays nan and excludes its mirror image
+    from the window.
+    """
+    total = np.array(spectrum, dtype=np.float64)
+    averaged = np.isfinite(total).astype(np.int64)
+    for reach in range(1, (min(window, total.shape[-1]) - 1) // 2 + 1):
+        middle = slice(reach, total.shape[-1] - reach)
+        pair = spectrum[..., : -2 * reach] + spectrum[..., 2 * reach :]
+        span_nm = np.abs(wavelengths_nm[2 * reach :] - wavelengths_nm[: -2 * reach])
+        usable = np.isfinite(pair) & np.isfinite(total[..., middle]) & (span_nm <= max_nm)
+        total[..., middle] += np.where(usable, pair, 0.0)
+        averaged[..., middle] += 2 * usable
+    return total / np.maximum(averaged, 1), averaged
+
+
+def mean_over_columns(spectra: Float[np.ndarray, "columns bands"]) -> Float[np.ndarray, "bands"]:
+    """Mean over the columns that are not nan; nan if all are."""
+    known = np.isfinite(spectra)
+    with np.errstate(invalid="ignore"):
+        return np.where(known, spectra, 0.0).sum(axis=0) / known.sum(axis=0)
+
+
 def _dead(defects: Defects | None, samples: int, bands: int) -> Bool[np.ndarray, "samples bands"]:
-    """The dead elements; none where the defects are not known, or are those of another detector."""
+    """The dead elements; none if the defects are unknown or of another detector."""
     if defects is None or defects.dead.shape != (samples, bands):
         return np.zeros((samples, bands), bool)
     return defects.dead
 
 
 def _bad_bands(
-    cube: Cube,
-    measured: Float[np.ndarray, "columns bands"],
-    columns: ColumnSums,
-    config: CalibrationConfig,
-    defects: Defects | None,
+    cube: Cube, measured: Float[np.ndarray, "columns bands"], columns: ColumnSums, defects: Defects | None
 ) -> Bool[np.ndarray, "bands"]:
-    """Bands in which the white says nothing.
+    """Bands in which the white measures nothing.
 
     Raises:
-        InputError: half of the bands or more.
+        InputError: more than half of the bands are bad.
     """
-    bad = unlit_bands(measured, config.min_light)
-    bad |= columns.saturated.sum(axis=0) > config.max_saturated * columns.numbers.sum(axis=0)
+    bad = unlit_bands(measured)
+    bad |= columns.saturated.sum(axis=0) > MAX_SATURATED * columns.numbers.sum(axis=0)
     if defects is not None:
         bad |= defects.bad_bands
     if 2 * np.count_nonzero(bad) > len(bad):
@@ -241,13 +329,3 @@ def _bad_bands(
             "another integration time."
         )
     return bad
-
-
-def _smoothed(
-    measured: Float[np.ndarray, "columns bands"], cube: Cube, config: CalibrationConfig
-) -> tuple[Float[np.ndarray, "columns bands"], Int[np.ndarray, "bands"]]:
-    """Step 5 on each column; of the bands averaged, what is typical of the columns that have any."""
-    spectrum, averaged = smooth_spectrum(
-        measured, cube.wavelengths_nm, config.smoothing_bands, config.smoothing_max_nm
-    )
-    return spectrum, averaged.max(axis=0)

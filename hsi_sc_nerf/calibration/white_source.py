@@ -1,84 +1,89 @@
-"""Where a session's white is, and how it was exposed."""
+"""Where a session's white is: tarp, WHITEREF cubes, a target in the frames, or none for finished reflectance."""
 
 from __future__ import annotations
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig, WhiteSource
-from hsi_sc_nerf.calibration.defects import Defects
-from hsi_sc_nerf.calibration.white_reference import White, column_white, target_white, white_reference
+from typing import Literal
+
+from hsi_sc_nerf.calibration.detector import Defects
+from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, white_reference
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 
+WhiteSource = Literal["tarp", "capture", "target", "product"]
 
-def white_source(session: Session, config: CalibrationConfig) -> WhiteSource:
-    """The source of white that the settings ask for, or the first that the session has.
+
+def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: Roi | None) -> WhiteSource:
+    """The given source of white, or the first of tarp, capture and product that the session has.
 
     Raises:
-        InputError: the session does not have it.
+        InputError: the session does not have it, or it is a target and ``roi`` is None.
     """
-    present: dict[WhiteSource, bool] = {
+    available: dict[WhiteSource, bool] = {
         "tarp": session.white is not None and session.has_counts,
         "capture": session.has_own_whites,
-        "target": session.has_counts,
         "product": session.has_products,
+        "target": session.has_counts,
     }
-    if config.white_source == "auto":
-        # A target in the frames needs to be pointed at.
-        in_order: tuple[WhiteSource, ...] = ("tarp", "capture", "product")
-        return next(source for source in in_order if present[source])
-    if not present[config.white_source]:
-        lacks = {
+    if source == "auto":
+        # open_session refuses sessions without any of the first three.
+        return next(source for source, is_available in available.items() if is_available)
+    if not available[source]:
+        missing = {
             "tarp": "has no capture of a white tarp",
             "capture": "does not have a WHITEREF cube with every capture",
-            "target": "does not have raw counts of every frame",
             "product": "does not have a REFLECTANCE cube of every frame",
-        }[config.white_source]
-        raise InputError(f"{session.path}: {lacks}; choose another --calibration.white-source, or auto.")
-    return config.white_source
+            "target": "does not have raw counts of every frame",
+        }[source]
+        raise InputError(f"{session.path}: {missing}; choose another --calibration.white-source, or auto.")
+    if source == "target" and roi is None:
+        raise InputError(
+            f"{session.path}: where the white target is in the frames is not known; give its place with "
+            "--calibration.roi."
+        )
+    return source
 
 
-def whites_of_frames(
-    session: Session, source: WhiteSource, config: CalibrationConfig, defects: Defects
-) -> list[White]:
-    """One white for all frames, or one each.
+def measure_whites(session: Session, source: WhiteSource, roi: Roi | None, defects: Defects) -> list[White]:
+    """One white for all frames, or one for each.
 
     Raises:
         InputError: one of them cannot be used.
     """
     if source == "tarp":
         assert session.white is not None
-        return [white_reference(session.white, config, defects)]
+        return [white_reference(session.white, roi, defects)]
     if source == "target":
-        return [target_white(capture, config, defects) for capture in session.frames]
+        return [white_reference(capture, roi, defects) for capture in session.frames]
     samples = session.frames[0].cube.shape[1]
     return [
-        column_white(capture.white, capture.white_dark, samples, config, defects)
+        column_white(capture.white, capture.white_dark, samples, defects)
         for capture in session.frames
         if capture.white is not None
     ]
 
 
 def white_cubes(session: Session, source: WhiteSource) -> tuple[Cube, Cube | None]:
-    """The first white and its dark."""
-    shown = session.white if source == "tarp" else session.frames[0]
-    assert shown is not None
-    white, dark = (shown.white, shown.white_dark) if source == "capture" else (shown.cube, shown.dark)
+    """Counts and dark counts of the first white."""
+    capture = session.white if source == "tarp" else session.frames[0]
+    assert capture is not None
+    white, dark = (capture.white, capture.white_dark) if source == "capture" else (capture.cube, capture.dark)
     assert white is not None
     return white, dark
 
 
-def exposure_over(capture: Capture, other: Capture) -> float:
-    """Ratio of integration times; 1 where one of them is not told."""
+def exposure_ratio(capture: Capture, other: Capture) -> float:
+    """Ratio of two captures' integration times; 1 if one is unknown."""
     if capture.integration_time_ms is None or other.integration_time_ms is None:
         return 1.0
     return capture.integration_time_ms / other.integration_time_ms
 
 
-def white_over_sample_time(session: Session, source: WhiteSource, capture: Capture) -> float:
-    """Ratio of the white's integration time to the sample's; 1 where one of them is not told."""
+def white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture) -> float:
+    """Ratio of the white's integration time to the sample's; 1 if one is unknown."""
     if source == "tarp":
         assert session.white is not None
-        return exposure_over(session.white, capture)
+        return exposure_ratio(session.white, capture)
     if source == "target" or capture.white_integration_time_ms is None or capture.integration_time_ms is None:
         return 1.0
     return capture.white_integration_time_ms / capture.integration_time_ms

@@ -1,1 +1,1 @@
-"""What the instrument leaves on disk: ENVI cubes, captures, sessions."""
+"""Captures on disk: ENVI cubes, the folders and metadata of a SPECIM IQ, and sessions."""

@@ -1,7 +1,4 @@
-"""ENVI headers: parsed by SPy, mended where SPy refuses what a user expects to open, checked where SPy is silent.
-
-All that this package knows about the header format is here; the data file is ``envi.py``'s.
-"""
+"""ENVI headers: parsed by SPy, mended where SPy refuses valid files, and checked where SPy checks nothing."""
 
 from __future__ import annotations
 
@@ -39,9 +36,9 @@ _NM_PER_UNIT = {
     "millimetre": 1e6,
     "angstrom": 0.1,
 }
-# ENVI's other units, whose numbers would be taken for something else; without wavelengths at all, ENVI counts bands.
+# ENVI's units that are no lengths.
 _NO_LENGTHS = ("wavenumber", "ghz", "mhz", "index")
-# No imaging spectrometer measures below 100 nm or beyond 100 µm: smaller numbers without a unit are micrometres.
+# No imaging spectrometer measures below 100 nm or beyond 100 µm. Smaller numbers without a unit are micrometres.
 _SENSIBLE_NM = (100.0, 100_000.0)
 
 
@@ -50,7 +47,7 @@ class EnviHeader:
     """What a header says about its cube.
 
     Attributes:
-        path: the header file.
+        header_path: the header file.
         shape: (lines, samples, bands).
         interleave: "bil", "bip" or "bsq".
         dtype: the stored numbers, with their byte order.
@@ -58,13 +55,13 @@ class EnviHeader:
         wavelengths_nm: band centres; None where the header lists none.
         fwhm_nm: full width of each band at half its maximum; None where the header lists none.
         good_bands: which bands the bad-band list ``bbl`` keeps; all without such a list.
-        reflectance_scale: ``reflectance scale factor`` (1 where it has none).
-        ignore_value: ``data ignore value``: the number that stands for "no data".
+        reflectance_scale: ``reflectance scale factor``, the stored number of reflectance 1 (1 by default).
+        ignore_value: ``data ignore value``, the stored number that stands for "no data".
         integration_time_ms: Specim's ``tint``.
         fields: all fields as SPy parses them, after mending.
     """
 
-    path: Path
+    header_path: Path
     shape: tuple[int, int, int]
     interleave: str
     dtype: np.dtype
@@ -79,20 +76,19 @@ class EnviHeader:
 
     @property
     def data_bytes(self) -> int:
-        """Size of the data file: the offset and every number."""
+        """Size of the data file."""
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
 
 def read_header(path: Path) -> EnviHeader:
-    """Parse, mend and check a header; the data file is not looked at.
+    """Parse, mend and check a header; the data file is not read.
 
-    Mended: a missing ``byte order`` (ENVI's default, little endian) or ``header offset``, an upper-case interleave,
-    "envi" in other letters, a byte order mark or Latin-1 letters, comments that are indented, a comma after a list's
-    last number.
+    Mended are a missing ``byte order`` (little endian) or ``header offset``, upper-case interleaves, "envi" in lower
+    case, byte order marks, Latin-1 letters, indented comments, and a comma after a list's last number.
 
     Raises:
-        InputError: no such file, no ENVI header, a field that is missing or unreadable, a list with another count
-            than bands, or a feature that would give wrong pixels (complex numbers, frame offsets, compression,
+        InputError: there is no such file, it is no ENVI header, a field is missing or unreadable, a list does not
+            have one number a band, or the pixels would be read wrongly (complex numbers, frame offsets, compression,
             a spectral library).
     """
     fields = mended_fields(path)
@@ -111,7 +107,7 @@ def read_header(path: Path) -> EnviHeader:
     fwhm = _numbers(path, fields, "fwhm", shape[2])
     bad_band_list = _numbers(path, fields, "bbl", shape[2])
     return EnviHeader(
-        path=path,
+        header_path=path,
         shape=shape,
         interleave=fields["interleave"],
         dtype=dtype,
@@ -127,7 +123,7 @@ def read_header(path: Path) -> EnviHeader:
 
 
 def mended_fields(path: Path) -> dict[str, Any]:
-    """SPy's dictionary of the header, with what ENVI itself takes for granted filled in."""
+    """SPy's dictionary of the header, with ENVI's defaults filled in."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such ENVI header; check the path.")
     try:
@@ -139,14 +135,14 @@ def mended_fields(path: Path) -> dict[str, Any]:
     if missing:
         raise InputError(f"{path}: the header does not give {', '.join(missing)}; add it.")
     fields["interleave"] = str(fields["interleave"]).lower()
-    # Some writers set a comma behind the last number of a list, too.
+    # Some writers set a comma after a list's last number.
     return {
         key: value[:-1] if isinstance(value, list) and value[-1] == "" else value for key, value in fields.items()
     }
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    """SPy's dictionary of the header; what SPy stumbles over is put right in a copy that it reads instead."""
+    """SPy's dictionary of the header. A header that SPy cannot parse is corrected in a temporary copy."""
     with open(path, "rb") as file:
         start = file.read(64).removeprefix(codecs.BOM_UTF8).lstrip()
         if not start.upper().startswith(b"ENVI") or b"\0" in start:
@@ -154,7 +150,7 @@ def _parse(path: Path) -> dict[str, Any]:
         file.seek(0)
         content = file.read()
     if content.isascii() and content.startswith(b"ENVI") and not _INDENTED_COMMENT.search(content):
-        return _parse_plain(path)
+        return _parse_with_spy(path)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -163,10 +159,10 @@ def _parse(path: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "mended.hdr"
         copy.write_text("\n".join(["ENVI", *fields, ""]), errors="replace")  # in the encoding that SPy reads with
-        return _parse_plain(copy)
+        return _parse_with_spy(copy)
 
 
-def _parse_plain(path: Path) -> dict[str, Any]:
+def _parse_with_spy(path: Path) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # field names are case-insensitive; SPy warns that it lowers them
         return envi.read_envi_header(str(path))
@@ -175,7 +171,7 @@ def _parse_plain(path: Path) -> dict[str, Any]:
 def check_layout(
     path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int
 ) -> None:
-    """Refuse what would be read as wrong pixels."""
+    """Refuse headers whose pixels would be read wrongly."""
     if fields["interleave"] not in INTERLEAVES:
         raise InputError(f"{path}: interleave {fields['interleave']} is none of bil, bip, bsq; correct it.")
     if min(shape) < 1 or offset < 0:

@@ -1,7 +1,8 @@
-"""Which files belong to which capture, in a SPECIM IQ's folders and in a plain folder of ENVI pairs.
+"""The files of each capture, by their names alone: folders of a SPECIM IQ, or a plain folder of ENVI pairs.
 
-In both, ``DARKREF_NAME``, ``WHITEREF_NAME``, ``WHITEDARKREF_NAME`` and ``REFLECTANCE_NAME`` belong to the capture
-NAME; in a plain folder ``dark...`` is the dark cube of all. Only names are looked at here.
+A SPECIM IQ makes a folder for each capture: ``capture/`` holds the counts NAME, the dark DARKREF_NAME, a white
+WHITEREF_NAME and its dark WHITEDARKREF_NAME; ``results/`` the instrument's own REFLECTANCE_NAME; and
+``metadata/NAME.xml`` its settings. A plain folder uses the same names, and ``dark...`` is the dark cube of all.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _PREFIXES = (_DARK, _WHITE, _WHITE_DARK, _PRODUCT)
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """Headers of one capture's cubes, and its XML; at least ``counts`` or ``product`` is there.
+    """Headers of one capture's cubes, and its XML. ``counts`` or ``product`` is not None.
 
     Attributes:
         name: of the capture.
@@ -32,22 +33,22 @@ class CaptureFiles:
     """
 
     name: str
-    counts: Path | None
-    dark: Path | None
-    white: Path | None
-    white_dark: Path | None
-    product: Path | None
+    counts: Path | None = None
+    dark: Path | None = None
+    white: Path | None = None
+    white_dark: Path | None = None
+    product: Path | None = None
     metadata: Path | None = None
 
     @property
     def headers(self) -> list[Path]:
-        """All headers that are there."""
+        """All headers that exist."""
         cubes = (self.counts, self.dark, self.white, self.white_dark, self.product)
         return [header for header in cubes if header is not None]
 
 
 def holds_captures(path: Path) -> bool:
-    """Whether a folder looks like a session; nothing is read."""
+    """Whether a folder has captures, by its files' names."""
     return bool(_specim_iq_folders(path) or _headers_in(path))
 
 
@@ -67,7 +68,7 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
 
 
 def _headers_in(path: Path) -> dict[str, Path]:
-    """Headers of a folder by their names without the ending (``NAME.raw.hdr`` is NAME's), in natural order."""
+    """Headers of a folder by their names without ending (NAME for ``NAME.raw.hdr``), in natural order."""
     if not path.is_dir():
         return {}
     headers = [f for f in path.iterdir() if f.suffix.lower() == ".hdr" and not f.name.startswith(".")]
@@ -100,7 +101,7 @@ def _specim_iq_captures(path: Path) -> list[CaptureFiles]:
     captures = []
     for folder in _specim_iq_folders(path):
         in_capture, in_results = _headers_in(folder / "capture"), _headers_in(folder / "results")
-        # The instrument numbers its captures; a folder that was given a better name still holds files of the old one.
+        # A folder may have been renamed, while its files keep the name that the instrument gave.
         ids = [name for name in in_capture if not name.lower().startswith(_PREFIXES)]
         ids += [name[len(_PRODUCT) :] for name in in_results if _is_product(name)]
         capture_id = ids[0] if len(set(ids)) == 1 else folder.name
@@ -115,12 +116,12 @@ def _specim_iq_captures(path: Path) -> list[CaptureFiles]:
         captures.append(
             CaptureFiles(
                 folder.name,
-                own.get(""),
-                own.get(_DARK),
-                own.get(_WHITE),
-                own.get(_WHITE_DARK),
-                product or own.get(_PRODUCT),
-                metadata if metadata.is_file() else None,
+                counts=own.get(""),
+                dark=own.get(_DARK),
+                white=own.get(_WHITE),
+                white_dark=own.get(_WHITE_DARK),
+                product=product or own.get(_PRODUCT),
+                metadata=metadata if metadata.is_file() else None,
             )
         )
     return captures

@@ -1,6 +1,7 @@
-"""A capture session on disk: which cubes are frames, which is the white tarp, and what belongs to each frame.
+"""A capture session on disk: its frames, its white tarp, and the cubes of each capture.
 
-Two layouts (``capture_layout.py``): the SPECIM IQ's and a plain folder of ENVI pairs.
+``layout.py`` finds the files of a SPECIM IQ or of a plain folder of ENVI pairs; ``session_info.py`` reads
+``session.json``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.capture.envi import Cube, cube_of
+from hsi_sc_nerf.capture.envi import Cube, open_cube
 from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.capture.layout import CaptureFiles, find_captures, holds_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
@@ -26,16 +27,16 @@ _SAME_WAVELENGTH_NM = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One capture: its counts and what the instrument took or made with them.
+    """One capture: its counts and the references that belong to them.
 
     Attributes:
         name: of the folder or the file.
-        cube: the raw counts; of a capture without any (``has_counts`` is false) its finished reflectance.
-        dark: counts without light, exposed like ``cube``.
-        white: WHITEREF: counts of a white that belong to this capture.
-        white_dark: counts without light that belong to ``white``; the capture's own dark where that applies.
-        product: REFLECTANCE: reflectance as the instrument itself made it.
-        metadata: what the instrument's XML tells; None where there is none or nothing in it was needed.
+        cube: the raw counts, or ``product`` if there are none (``has_counts`` is False).
+        dark: counts without light, at the integration time of ``cube``.
+        white: WHITEREF, counts of a white.
+        white_dark: counts without light that belong to ``white``; the capture's own dark if that fits.
+        product: REFLECTANCE, the reflectance that the instrument computed.
+        metadata: content of the instrument's XML; None if there is none or nothing in it was needed.
     """
 
     name: str
@@ -48,24 +49,24 @@ class Capture:
 
     @property
     def has_counts(self) -> bool:
-        """Whether ``cube`` holds raw counts, not the finished reflectance."""
+        """Whether ``cube`` holds raw counts."""
         return self.cube is not self.product
 
     @property
     def cubes(self) -> tuple[Cube, ...]:
-        """All its cubes, each once."""
+        """All cubes of the capture, each once."""
         own = (self.cube, self.dark, self.white, self.white_dark, self.product)
         return tuple(dict.fromkeys(cube for cube in own if cube is not None))
 
     @property
     def integration_time_ms(self) -> float | None:
-        """How long ``cube`` was exposed, by its header or the metadata; None where neither tells."""
-        told = None if self.metadata is None else self.metadata.integration_time_ms
-        return self.cube.integration_time_ms or told
+        """Integration time of ``cube`` by its header or the metadata; None if neither gives it."""
+        in_metadata = None if self.metadata is None else self.metadata.integration_time_ms
+        return self.cube.integration_time_ms or in_metadata
 
     @property
     def white_integration_time_ms(self) -> float | None:
-        """How long ``white`` was exposed; None where that is not told, or there is no white."""
+        """Integration time of ``white``; None if it is not given or there is no white."""
         if self.white is None:
             return None
         in_same_frame = self.metadata is not None and self.metadata.white_mode == "simultaneous"
@@ -78,10 +79,10 @@ class Session:
 
     Attributes:
         path: its folder.
-        info: what ``session.json`` tells.
-        white: the capture of the white tarp; None in a session that has none.
+        info: content of ``session.json``.
+        white: the capture of the white tarp, if there is one.
         frames: the other captures, in natural order of their names.
-        image_rotation_deg: how far the files' images are turned from upright, counter-clockwise.
+        image_rotation_deg: rotation of the files' images from upright, counter-clockwise.
     """
 
     path: Path
@@ -92,7 +93,7 @@ class Session:
 
     @property
     def captures(self) -> tuple[Capture, ...]:
-        """The tarp, where there is one, and the frames."""
+        """The tarp, if there is one, and the frames."""
         return self.frames if self.white is None else (self.white, *self.frames)
 
     @property
@@ -117,7 +118,7 @@ class Session:
 
     @property
     def quarter_turns(self) -> int:
-        """``np.rot90``'s k that sets a file's image upright: 0 to 3."""
+        """``np.rot90``'s k that turns a file's image upright: 0 to 3."""
         return -self.image_rotation_deg // 90 % 4
 
     @property
@@ -137,7 +138,7 @@ class Session:
 
 
 def is_session(path: Path) -> bool:
-    """Whether ``path`` is a folder that holds captures (nothing is read or checked)."""
+    """Whether ``path`` is a folder that holds captures, by its files' names."""
     path = Path(path)
     return path.is_dir() and holds_captures(path)
 
@@ -146,9 +147,14 @@ def open_session(path: Path) -> Session:
     """Find the captures of a session, open their cubes and check that they belong together.
 
     Raises:
-        InputError: no such folder, no frames, a single frame, nothing to calibrate with (no white reference, no white
-            in every frame, no finished reflectance of every frame), a cube that cannot be opened, frames that differ
-            in shape or bands, or a ``session.json`` that cannot be used.
+        InputError: no such folder; fewer than two frames; no white reference for every frame and no finished
+            reflectance of every frame; a cube that cannot be opened; frames that differ in shape or bands; or a
+            ``session.json`` that cannot be used.
+
+    Example:
+        >>> session = open_session(Path("captures"))
+        >>> len(session.frames), session.wavelengths_nm[[0, -1]]
+        >>> counts = session.frames[0].cube.memmap()  # (lines, samples, bands)
     """
     path = Path(path)
     if not path.is_dir():
@@ -171,7 +177,7 @@ def open_session(path: Path) -> Session:
     cubes = _open_cubes(
         [header for files in (*frames, *([tarp] if tarp else [])) for header in files.headers], info, path
     )
-    # One frame's metadata tell how the images of all of them lie.
+    # The images of all frames are rotated as the first frame's metadata say.
     first = _capture(frames[0], cubes, needs_instrument=info.image_rotation_deg is None)
     session = Session(
         path=path,
@@ -189,7 +195,7 @@ def open_session(path: Path) -> Session:
 
 
 def _check_whites(path: Path, info: SessionInfo, tarp: CaptureFiles | None, frames: list[CaptureFiles]) -> None:
-    """Something must turn every frame into reflectance: the tarp, a white of its own, or the instrument."""
+    """Require a way to reflectance for every frame: the tarp, its own white, or the instrument's product."""
     if all(files.product for files in frames) or all(files.counts and files.white for files in frames):
         return
     if tarp is None:
@@ -207,27 +213,27 @@ def _check_whites(path: Path, info: SessionInfo, tarp: CaptureFiles | None, fram
 
 
 def _open_cubes(headers: Iterable[Path], info: SessionInfo, root: Path) -> dict[Path, Cube]:
-    """Open cubes, each header once; what lists no wavelengths takes session.json's or those of another cube."""
+    """Open cubes. A header without wavelengths takes those of session.json or of another cube with as many bands."""
     read = {path: read_header(path) for path in headers}
     listed = None if info.band_centres is None else read_band_centres(root / info.band_centres)
-    of_others: dict[int, Float[np.ndarray, "bands"]] = {}
+    by_band_count: dict[int, Float[np.ndarray, "bands"]] = {}
     for header in read.values():
         if header.wavelengths_nm is not None:
-            of_others.setdefault(header.shape[2], header.wavelengths_nm)
+            by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
     return {
-        path: cube_of(header, of_others.get(header.shape[2]) if listed is None else listed)
+        path: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
         for path, header in read.items()
     }
 
 
 def _capture(files: CaptureFiles, cubes: dict[Path, Cube], needs_instrument: bool = False) -> Capture:
-    """A capture of opened cubes; its XML is read only where something in it is needed."""
+    """A capture of opened cubes. Its XML is read only if it is needed."""
     counts, dark, white, white_dark, product = (
         None if header is None else cubes[header]
         for header in (files.counts, files.dark, files.white, files.white_dark, files.product)
     )
     cube = product if counts is None else counts
-    assert cube is not None  # find_captures finds no others
+    assert cube is not None  # guaranteed by find_captures
     needs_metadata = needs_instrument or white is not None or (counts and counts.integration_time_ms is None)
     capture = Capture(
         name=files.name,

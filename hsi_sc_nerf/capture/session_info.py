@@ -1,4 +1,4 @@
-"""``session.json``: what a user tells about a session, because the instrument cannot."""
+"""``session.json``: what the user states about a session."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class SessionInfo:
 
     Attributes:
         object: what is on the turntable.
-        nominal_step_deg: the turntable's step between frames, degrees, positive.
-        direction: the turntable's turn seen from above, counter-clockwise or clockwise.
+        nominal_step_deg: the turntable's step between frames, positive.
+        direction: the turntable's direction seen from above, counter-clockwise or clockwise.
         marker_dictionary: OpenCV's name, for example ``DICT_5X5_50``.
-        marker_side_m: side of a marker's black square, metres.
+        marker_side_m: side of a marker's black square.
         container_diameter_m: of the upright cylinder that the object stands on.
-        container_height_m: of its lid above the disc.
-        frame_angles_deg: the turntable's angle in each frame, degrees, for a table that makes uneven, known steps.
-        camera_distance_m: of the camera from the turntable's axis; gives the scale where no marker does.
+        container_height_m: of the cylinder's lid above the disc.
+        frame_angles_deg: the turntable's angle in each frame, for uneven, known steps.
+        camera_distance_m: of the camera from the turntable's axis; sets the scale of a session without markers.
         white_reference: name of the capture of the white tarp.
-        band_centres: a CSV beside ``session.json`` with the band centres in nm, for cubes whose headers list none.
+        band_centres: a CSV beside ``session.json`` with the band centres in nm, for headers that list none.
         panel_reflectance: a CSV beside ``session.json`` with the white's own reflectance by wavelength.
-        image_rotation_deg: how far the files' images are turned from upright, counter-clockwise: 0, 90, 180 or 270.
-            None leaves it to the instrument's metadata.
+        image_rotation_deg: rotation of the files' images from upright, counter-clockwise: 0, 90, 180 or 270. None
+            takes it from the instrument's metadata.
     """
 
     object: str | None = None
@@ -54,10 +54,10 @@ class SessionInfo:
 
 
 def read_session_info(path: Path) -> SessionInfo:
-    """Read ``session.json``; without one, everything is unknown.
+    """Read ``session.json``; if there is none, every value is unknown.
 
     Raises:
-        InputError: no JSON object, an unknown key, a value of the wrong kind, or a file that is not beside it.
+        InputError: no JSON object, an unknown key, a value of the wrong kind, or a named file that is missing.
     """
     if not path.is_file():
         return SessionInfo()
@@ -84,10 +84,10 @@ def read_session_info(path: Path) -> SessionInfo:
 
 
 def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
-    """Band centres in nm: the first column of a CSV with a line of names.
+    """Band centres in nm from the first column of a CSV with a header line.
 
     Raises:
-        InputError: the file cannot be read, holds no numbers, or numbers that are no wavelengths in nm.
+        InputError: the file cannot be read, or its numbers are no wavelengths in nm.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")[1:]
@@ -104,21 +104,21 @@ def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
 def _check_value(path: Path, key: str, value: Any) -> None:
     is_number = _is_finite_number(value)
     if key == "direction":
-        valid, wanted = value in ("ccw", "cw"), "ccw or cw (seen from above)"
+        valid, expected = value in ("ccw", "cw"), "ccw or cw (seen from above)"
     elif key in _FILES:
         valid = isinstance(value, str) and (path.parent / value).is_file()
-        wanted = f"the name of a CSV file beside {path.name}"
+        expected = f"the name of a CSV file beside {path.name}"
     elif key in _TEXTS:
-        valid, wanted = isinstance(value, str) and value != "", "a text"
+        valid, expected = isinstance(value, str) and value != "", "a text"
     elif key == "frame_angles_deg":
         valid = isinstance(value, list) and all(_is_finite_number(angle) for angle in value)
-        wanted = "a list with one number a frame"
+        expected = "a list with one number a frame"
     elif key == "image_rotation_deg":
-        valid, wanted = is_number and value in (0, 90, 180, 270), "0, 90, 180 or 270 degrees"
+        valid, expected = is_number and value in (0, 90, 180, 270), "0, 90, 180 or 270 degrees"
     else:
-        valid, wanted = is_number and value > 0.0, "a positive number"
+        valid, expected = is_number and value > 0.0, "a positive number"
     if not valid:
-        raise InputError(f"{path}: {key} is {value!r}, but must be {wanted}; correct it.")
+        raise InputError(f"{path}: {key} is {value!r}, but must be {expected}; correct it.")
 
 
 def _is_finite_number(value: Any) -> bool:

@@ -1,8 +1,4 @@
-"""What a SPECIM IQ leaves on disk: its metadata, and which of its dark cubes belongs to its white.
-
-A capture is a folder: ``capture/`` holds the counts NAME, the shutter's DARKREF_NAME, a white WHITEREF_NAME and its
-WHITEDARKREF_NAME; ``results/`` the instrument's own REFLECTANCE_NAME; ``metadata/NAME.xml`` its settings.
-"""
+"""What is particular to a SPECIM IQ: its metadata, how its images lie, and which dark belongs to its white."""
 
 from __future__ import annotations
 
@@ -15,21 +11,21 @@ from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.errors import InputError
 
 IMAGE_ROTATION_DEG = 90
-"""The slit stands upright and scans sideways: counts and REFLECTANCE lie turned by this, counter-clockwise."""
-# Fields that no other camera's metadata have, spelt as ``_plain`` leaves them: WR_mode and datacube_angle.
-_FIELDS_OF_ITS_OWN = ("wrmode", "datacubeangle")
+"""The slit is upright and scans sideways: the files' images are turned by this, counter-clockwise."""
+# Fields of no other camera's metadata, normalised: WR_mode and datacube_angle.
+_SPECIM_IQ_FIELDS = ("wrmode", "datacubeangle")
 
 
 @dataclass(frozen=True)
 class SpecimMetadata:
-    """What ``metadata/NAME.xml`` tells.
+    """The content of ``metadata/NAME.xml``.
 
     Attributes:
         path: the file.
-        integration_time_ms: of the capture; None where it is not given.
-        white_mode: "custom": the white was taken at another time, with an integration time and a dark of its own;
-            "simultaneous": it was seen in the capture's own frame; None where it is not given.
-        is_specim_iq: whether a real SPECIM IQ wrote it (``image_rotation_deg`` rests on this).
+        integration_time_ms: of the capture; None if it is not given.
+        white_mode: "custom": the white was taken at another time, with its own integration time and dark;
+            "simultaneous": it was taken in the capture's own frame; None if it is not given.
+        is_specim_iq: whether a real SPECIM IQ wrote the file.
     """
 
     path: Path
@@ -39,16 +35,14 @@ class SpecimMetadata:
 
 
 def read_metadata(path: Path) -> SpecimMetadata:
-    """Read a capture's XML: ``<key field="integration_time">10</key>`` and the like, in any namespace.
+    """Read a capture's XML: ``<key field="integration_time">10</key>`` and similar, in any namespace.
 
-    A field's name may be an attribute ``field`` or ``name`` or the element's own, in any letters, with blanks,
-    hyphens or underscores.
-
-    A real instrument is known by its name anywhere in the file or by the fields ``WR_mode`` and ``datacube_angle``,
-    which no other camera has; a file that says "simulated" is none.
+    A field's name is the attribute ``field`` or ``name`` or the element's tag; case, blanks, hyphens and underscores
+    are ignored. A real SPECIM IQ is recognised by its name anywhere in the file or by the fields ``WR_mode`` and
+    ``datacube_angle``, unless the file says "simulated".
 
     Raises:
-        InputError: no XML, or an integration time that is not a positive number.
+        InputError: the file is no XML, or the integration time is not a positive number.
     """
     try:
         root = ElementTree.parse(path).getroot()
@@ -60,45 +54,44 @@ def read_metadata(path: Path) -> SpecimMetadata:
         text = (element.text or "").strip()
         name = element.get("field") or element.get("name") or str(element.tag).rpartition("}")[2]
         if text:
-            values.setdefault(_plain(name), text)
+            values.setdefault(_normalised(name), text)
         words += [text, *element.attrib.values()]
-    everything = _plain(" ".join(words))
-    named = "specimiq" in everything or any(field in values for field in _FIELDS_OF_ITS_OWN)
+    text = _normalised(" ".join(words))
+    is_named = "specimiq" in text or any(field in values for field in _SPECIM_IQ_FIELDS)
     return SpecimMetadata(
         path=path,
         integration_time_ms=_integration_time_ms(path, values.get("integrationtime") or values.get("tint")),
-        white_mode=_plain(values["wrmode"]) if "wrmode" in values else None,
-        is_specim_iq=named and "simulated" not in everything,
+        white_mode=_normalised(values["wrmode"]) if "wrmode" in values else None,
+        is_specim_iq=is_named and "simulated" not in text,
     )
 
 
 def image_rotation_deg(metadata: SpecimMetadata | None, cube: Cube) -> int:
-    """How far a file's image is turned from upright: 90 where a real SPECIM IQ took it, else 0.
+    """Rotation of a file's image from upright, counter-clockwise: 90 if a real SPECIM IQ took it, else 0.
 
-    The sign is in the metadata (``read_metadata``) or, where that has none, in the header's ``sensor type`` or
-    ``description``.
+    The camera is recognised by its metadata (`read_metadata`) or by the header's ``sensor type`` or ``description``.
     """
     if metadata is not None and metadata.is_specim_iq:
         return IMAGE_ROTATION_DEG
-    told = _plain(" ".join(str(cube.header.get(key, "")) for key in ("sensor type", "description")))
-    return IMAGE_ROTATION_DEG if "specimiq" in told and "simulated" not in told else 0
+    camera = _normalised(" ".join(str(cube.fields.get(key, "")) for key in ("sensor type", "description")))
+    return IMAGE_ROTATION_DEG if "specimiq" in camera and "simulated" not in camera else 0
 
 
 def dark_of_white(
     white_mode: str | None, dark: Cube | None, white_dark: Cube | None, same_exposure: bool
 ) -> Cube | None:
-    """The dark cube that belongs to a capture's white.
+    """The dark cube of a capture's white.
 
-    In "simultaneous" mode it is the capture's own. Else it is WHITEDARKREF; without one, the capture's own where the
-    white was exposed as long (``same_exposure``), and none where it was not.
+    In "simultaneous" mode this is the capture's own dark. Otherwise it is WHITEDARKREF or, without one, the capture's
+    own dark if white and capture have the same integration time (``same_exposure``).
     """
     if white_mode == "simultaneous":
         return dark
     return white_dark or (dark if same_exposure else None)
 
 
-def _plain(text: str) -> str:
-    """Lower-case letters and digits alone, so that spellings of a name agree."""
+def _normalised(text: str) -> str:
+    """Lower-case letters and digits of a text, so that spellings of a name agree."""
     return re.sub(r"[^a-z0-9]", "", text.lower())
 
 

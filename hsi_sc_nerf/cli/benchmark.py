@@ -26,16 +26,7 @@ from hsi_sc_nerf.benchmark.configurations import (
     training_config,
 )
 from hsi_sc_nerf.benchmark.machine import available_cores, describe_machine
-from hsi_sc_nerf.benchmark.results import (
-    TABLE_WIDTH,
-    TrainedRun,
-    screen_table,
-    write_csv,
-    write_page,
-    write_results,
-)
-from hsi_sc_nerf.benchmark.run import Checkpoint, Job
-from hsi_sc_nerf.benchmark.timing import Clock
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock, Job
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.errors import InputError
@@ -71,7 +62,7 @@ class BenchmarkCommand:
     iterations: int | None = None
     """The same number of iterations for each configuration instead of the same time."""
     checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
-    """Shares of a run at which held-out views are evaluated; the end of each stage always is."""
+    """Fractions of a run at which held-out views are evaluated; the end of each stage always is."""
     held_out_views: int | None = None
     """Evaluate this many of the held-out views, evenly spread, instead of all."""
     threads: int | None = None
@@ -84,15 +75,17 @@ class BenchmarkCommand:
             InputError: a name, a word, a number or the data cannot be used, or a run failed.
         """
         chosen = [*map(named_configuration, self.configurations), *map(own_configuration, self.sets)]
+        from hsi_sc_nerf.benchmark.results import TABLE_WIDTH, results_table
+
         runs = train_all(chosen, self)
         console = Console()
         # Broken numbers cannot be read: rather let the terminal wrap.
         console.width = max(console.width, TABLE_WIDTH)
-        console.print(screen_table(runs))
+        console.print(results_table(runs))
         console.print(f"Everything, and the picture: {escape(str(self.output_dir / 'benchmark.md'))}", soft_wrap=True)
 
 
-def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[TrainedRun]:
+def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand) -> list[BenchmarkRun]:
     """Train the configurations that are not finished and write the results of all after each.
 
     Raises:
@@ -131,10 +124,10 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     return _runs(jobs, contents)
 
 
-def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[TrainedRun]:
+def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[BenchmarkRun]:
     """Those that are finished."""
     return [
-        TrainedRun(
+        BenchmarkRun(
             name,
             job.method,
             job.words,
@@ -165,8 +158,8 @@ def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -
     for option, value in given.items():
         if value is not None and value <= 0:
             raise InputError(f"{option} is {value}; it must be more than 0.")
-    if not all(0 < share <= 1 for share in command.checkpoints):
-        raise InputError(f"--checkpoints are shares of a run, more than 0 and at most 1, not {command.checkpoints}.")
+    if not all(0 < fraction <= 1 for fraction in command.checkpoints):
+        raise InputError(f"--checkpoints are fractions of a run, above 0 and at most 1, not {command.checkpoints}.")
     for configuration in configurations:
         training_config(configuration.method, (*split_words(command.common), *configuration.words))
 
@@ -237,20 +230,20 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
     return content if wanted.items() <= content.items() else None
 
 
-def _write(runs: Sequence[TrainedRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
-    from hsi_sc_nerf.benchmark.plot import draw_accuracy_and_time
+def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:
+    from hsi_sc_nerf.benchmark import results
 
     settings = {
         "data": command.data.name,
         "length": f"{command.iterations} iterations"
         if command.iterations
         else f"{command.train_seconds:g} s ({command.clock})",
-        "checkpoints": ", ".join(f"{share:g}" for share in command.checkpoints),
+        "checkpoints": ", ".join(f"{fraction:g}" for fraction in command.checkpoints),
         "held-out views": command.held_out_views or "all",
         "threads": command.threads or available_cores(),
     }
     out = command.output_dir / "benchmark"
-    write_csv(out.with_suffix(".csv"), runs)
-    write_results(out.with_suffix(".json"), runs, settings, machine)
-    write_page(out.with_suffix(".md"), runs, settings, machine)
-    draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)
+    results.write_csv(out.with_suffix(".csv"), runs)
+    results.write_results(out.with_suffix(".json"), runs, settings, machine)
+    results.write_page(out.with_suffix(".md"), runs, settings, machine)
+    results.draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)

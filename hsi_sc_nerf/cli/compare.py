@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
 
-from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
+from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare, read_reference
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,15 @@ class CompareCommand:
         def shown(items: Sequence[Any], doing: str) -> Iterable[Any]:
             return track(items, doing, console=console, transient=True)
 
-        comparison = compare(self.cloud, self.reference, self.config, shown)
-        # matplotlib takes its time
+        # Slow to import.
         from hsi_sc_nerf.evaluation.comparison_report import screen_tables, write_comparison
+        from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
 
+        if self.reference.is_dir():
+            reference = true_reference(self.reference, self.config, shown)
+        else:
+            reference = read_reference(self.reference, self.config)
+        comparison = compare(self.cloud, reference, self.config, shown)
         write_comparison(self.output_dir, comparison, self.cloud.name, self.reference.name)
         Console().print(*screen_tables(comparison))
         page = escape(str(self.output_dir / "comparison.md"))

@@ -13,11 +13,12 @@ from hsi_sc_nerf.export.options import CloudOptions
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write the point cloud of a trained run: a spectrum a point, in metres, evenly spread over the object.
+    """Write the spectral point cloud of a trained run, in metres, evenly spread over the object.
 
-    Each point also says how opaque the model is there (opacity), how obliquely it is seen (incidence_deg), how many
-    training frames see it (views), how much their measurements of it differ (spectral_std) and in which share of them
-    it is saturated or not measured (saturated). `ns-export pointcloud` writes the same with the options that it has.
+    Each point has a spectrum, the opacity of its ray (opacity), the ray's angle of incidence (incidence_deg), the
+    number of training frames that see it (views), the standard deviation of their measurements (spectral_std), and
+    the fraction of them that are saturated or without data (saturated). `ns-export pointcloud` writes the same cloud,
+    with its own options.
     """
 
     load_config: Path
@@ -25,7 +26,7 @@ class ExportCommand:
     output_dir: Path
     """Folder to write point_cloud.ply (.las, .nc, .zarr) to."""
     options: Annotated[CloudOptions, tyro.conf.arg(name="")] = field(default_factory=CloudOptions)
-    """What to write."""
+    """Options of the cloud."""
 
     def main(self) -> None:
         """Run the command.

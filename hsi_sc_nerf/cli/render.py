@@ -16,10 +16,10 @@ from hsi_sc_nerf.errors import InputError
 
 @dataclass(frozen=True)
 class RenderCommand:
-    """Render what a trained run holds: views as ENVI cubes of reflectance, and videos of composites and indices.
+    """Render views of a trained run as ENVI cubes of reflectance, and videos of composites and indices.
 
-    Beside each cube NAME lies NAME_valid, a map that is 1 where the pixel shows something that turns and 0 where it
-    shows the chamber behind it; held-out and training frames get a picture of measured, rendered and error, too.
+    Beside each cube NAME, NAME_valid is a map that is 1 on the object and all that turns with it, and 0 on the
+    background. Held-out and training frames also get a picture of measured and rendered frame and their difference.
     """
 
     load_config: Path
@@ -27,21 +27,21 @@ class RenderCommand:
     output_dir: Path
     """Folder to write to."""
     views: Literal["held-out", "training", "orbit"] = "held-out"
-    """What to render. held-out: the frames that training did not see. training: those that it saw. orbit: one turn
-    before the session's camera."""
+    """Views to render. held-out: frames not used in training. training: frames used in training. orbit: one turn of
+    the object before the session's camera."""
     camera_path: Path | None = None
-    """Cameras to render instead: a path that nerfstudio's viewer exported (JSON)."""
+    """Render these cameras instead: a path that nerfstudio's viewer exported (JSON)."""
     orbit_views: int = 60
-    """Views in the turn of an orbit."""
+    """Number of views of an orbit."""
     orbit_size: float = 1.0
-    """Size of an orbit's images, as a factor on the camera's; 2 is twice as many pixels each way."""
+    """Factor on the size of an orbit's images; 2 doubles the pixels in each direction."""
     cubes: Literal["float32", "uint16", "none"] = "float32"
-    """Numbers in the cubes. float32: reflectance. uint16: half as large, reflectance times the scale factor that the
-    header tells. none: no cubes."""
+    """Type of the numbers in the cubes. float32: reflectance. uint16: reflectance times the header's scale factor, in
+    half the space. none: no cubes."""
     video: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Video (MP4) of a composite or an index by name, such as CIR or NDVI; may be given several times."""
+    """Name of a composite or an index to make a video (MP4) of, such as CIR or NDVI; may be given several times."""
     frames_per_second: int = 15
-    """Speed of videos."""
+    """Frame rate of the videos."""
 
     def main(self) -> None:
         """Run the command.
@@ -56,16 +56,15 @@ class RenderCommand:
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
         from hsi_sc_nerf.progress import progress_bar
+        from hsi_sc_nerf.rendering.comparison import compare, write_report
         from hsi_sc_nerf.rendering.cubes import render_view, write_view
-        from hsi_sc_nerf.rendering.pictures import find_look
-        from hsi_sc_nerf.rendering.report import compare, write_report
-        from hsi_sc_nerf.rendering.video import open_video
+        from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
         from hsi_sc_nerf.rendering.views import views_of_frames, views_of_orbit, views_of_path
         from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
         run = open_run(self.load_config)
-        found = [find_look(name, run.dataset.wavelengths_nm) for name in self.video]
-        looks = list({look.name: look for look in found}.values())  # a name may be given twice
+        found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]
+        shown = list({item.name: item for item in found}.values())  # a name may be given twice
         if self.camera_path is not None:
             views = views_of_path(self.camera_path)
         elif self.views == "orbit":
@@ -74,11 +73,11 @@ class RenderCommand:
             views = views_of_frames(run, self.views)
 
         rows: list[dict[str, Any]] = []
-        files = [self.output_dir / f"{views.kind}-{look.name.replace(' ', '-')}.mp4" for look in looks]
+        files = [self.output_dir / f"{views.kind}-{item.name.replace(' ', '-')}.mp4" for item in shown]
         with ExitStack() as stack:
-            growing = stack.enter_context(atomic_write(*files)) if files else []
-            videos = [stack.enter_context(open_video(path, self.frames_per_second)) for path in growing]
-            with progress_bar("rendering", "views", len(views)) as done:
+            temporary = stack.enter_context(atomic_write(*files)) if files else []
+            videos = [stack.enter_context(open_video(path, self.frames_per_second)) for path in temporary]
+            with progress_bar("rendering", "views", len(views)) as update:
                 for i, (name, camera) in enumerate(views):
                     rendered = render_view(run.model, camera)
                     if self.cubes != "none":
@@ -86,9 +85,9 @@ class RenderCommand:
                     rows.append({"view": name, "valid": float(rendered.valid.float().mean())})
                     if views.measured is not None:
                         rows[-1] |= compare(self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands)
-                    for look, add in zip(looks, videos, strict=True):
-                        add(to_8_bit(look.paint(rendered).numpy()))
-                    done(i + 1)
-        legends = {path.name: look.legend for path, look in zip(files, looks, strict=True)}
+                    for item, add_frame in zip(shown, videos, strict=True):
+                        add_frame(to_8_bit(item.colours(rendered).numpy()))
+                    update(i + 1)
+        legends = {path.name: item.legend for path, item in zip(files, shown, strict=True)}
         write_report(self.output_dir / "render", rows, legends)
         Console().print(f"{len(views)} views: {escape(str(self.output_dir / 'render.md'))}")

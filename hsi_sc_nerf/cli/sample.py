@@ -1,4 +1,4 @@
-"""``hsi-sc-nerf sample``: spectra for the points of somebody else's cloud or mesh."""
+"""``hsi-sc-nerf sample``: add spectra to the points of any cloud or mesh."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _EXTRA = ("sampled_views", "sampled_std")
 
 @dataclass(frozen=True)
 class SampleCommand:
-    """Add the spectra that a trained run holds to the points of any PLY file, a scanner's cloud or a mesh.
+    """Add spectra of a trained run to the points of any PLY file, such as a scanner's cloud or a mesh.
 
-    The file has to lie in the object's frame: origin where the turntable's axis meets the disc, z up along the axis.
-    Everything that is in the file stays as it is. Each point gets its reflectance in every band, the number of
-    training views that it is the mean of (sampled_views), and their spread (sampled_std).
+    The points must be in the object frame: origin where the turntable's axis meets the disc, z up along the axis.
+    All content of the file is kept. Each point gets its reflectance in every band, averaged over training views, the
+    number of these views (sampled_views) and the standard deviation over them (sampled_std).
     """
 
     points: tyro.conf.Positional[Path]
@@ -30,14 +30,13 @@ class SampleCommand:
     load_config: Path
     """The config.yml of a trained run."""
     output: Path | None = None
-    """File to write. By default NAME-spectral.ply beside the points."""
+    """File to write. By default NAME-spectral.ply in the folder of the points."""
     unit: Literal["m", "mm"] = "m"
-    """Unit of the coordinates in the file; they are written as they were."""
-    reach_mm: float = 3.0
-    """How far a point may lie from the surface that the run has found, in millimetres; one further away gets no
-    spectrum."""
+    """Unit of the coordinates in the file; they are written in the same unit."""
+    max_distance_mm: float = 3.0
+    """Largest distance of a point from the run's surface, in millimetres; points further away get no spectrum."""
     views: int = 4
-    """Training views that are averaged at each point, those from straight ahead first. More take longer."""
+    """Training views to average at each point, the most frontal first. More take longer."""
 
     def main(self) -> None:
         """Run the command.
@@ -46,8 +45,8 @@ class SampleCommand:
             InputError: the points or the run cannot be used, no point lies on the object, or the result cannot be
                 written.
         """
-        if self.reach_mm <= 0.0 or self.views < 1:
-            raise InputError("--reach-mm has to be greater than 0 and --views at least 1; correct them.")
+        if self.max_distance_mm <= 0.0 or self.views < 1:
+            raise InputError("--max-distance-mm has to be greater than 0 and --views at least 1; correct them.")
         from hsi_sc_nerf.export.sampled_ply import SpectralColumns, read_points
 
         given = read_points(self.points)
@@ -60,26 +59,26 @@ class SampleCommand:
 
         run = open_run(self.load_config)
         columns = SpectralColumns(given, run.dataset.wavelengths_nm, _EXTRA)
-        without = 0
+        no_spectrum = 0
         points_m = given.positions() * _METRES[self.unit]
-        parts = sample_points(run, points_m, normals, self.reach_mm / 1e3, self.views)
-        with progress_bar("sampling", "points", len(given)) as done:
+        parts = sample_points(run, points_m, normals, self.max_distance_mm / 1e3, self.views)
+        with progress_bar("sampling", "points", len(given)) as update:
             for rows, outward, found in parts:
                 extra = dict(zip(_EXTRA, (found.views, found.spectral_std), strict=True))
                 columns.fill(rows, outward, found.spectra, run.model.rgb_bands, extra)
-                without += int((found.views == 0).sum())
-                done(rows.stop)
-        if without == len(given):
+                no_spectrum += int((found.views == 0).sum())
+                update(rows.stop)
+        if no_spectrum == len(given):
             raise InputError(
                 f"{self.points}: none of its points lies on the object; give them in the object's frame (origin on "
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
         columns.write(output)
         console = Console()
-        if without:
+        if no_spectrum:
             console.print(
-                f"[yellow]{without:,} of {len(given):,} points have no spectrum (NaN): no training camera that faces "
-                f"them sees a surface within {self.reach_mm:g} mm of them."
+                f"[yellow]{no_spectrum:,} of {len(given):,} points have no spectrum (NaN): no training camera that "
+                f"faces them sees a surface within {self.max_distance_mm:g} mm of them."
             )
         bands = len(run.dataset.wavelengths_nm)
-        console.print(f"{escape(str(output))}: {len(given) - without:,} points with spectra of {bands} bands.")
+        console.print(f"{escape(str(output))}: {len(given) - no_spectrum:,} points with spectra of {bands} bands.")

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.analysis.poisson import MeshConfig
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 
@@ -65,17 +65,16 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
+        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.poisson import closed_mesh
-        from hsi_sc_nerf.analysis.regions import picked_region, read_regions
         from hsi_sc_nerf.analysis.size import size_of, size_spread
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
-        from hsi_sc_nerf.analysis.traits import analyse, classified
+        from hsi_sc_nerf.analysis.traits import analyse, classified, read_regions, region_of_interest
         from hsi_sc_nerf.export.ply import read_spectral_ply
         from hsi_sc_nerf.progress import progress_bar
 
         self._check()
-        picked = [picked_region(*words) for words in self.roi]
+        picked = [region_of_interest(*words) for words in self.roi]
         picked += read_regions(self.roi_file) if self.roi_file else []
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
@@ -127,7 +126,7 @@ class TraitsCommand:
     ) -> None:
         """Pictures, the mesh and tables; the page, which names them, comes last."""
         from hsi_sc_nerf.analysis import pictures, report
-        from hsi_sc_nerf.analysis.poisson import open_edges
+        from hsi_sc_nerf.analysis.closed_mesh import open_edges
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
 
         views = pictures.SideViews(surface.mesh)

@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE, ReflectanceUncertainty
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 MIN_SPECTRA = 64
 """Fewer spectra determine neither noise nor rank."""

@@ -1,4 +1,4 @@
-"""A reconstruction against a reference: read, bring into one frame, measure the distances both ways."""
+"""A reconstruction against a reference: brought into one frame, with the distances measured both ways."""
 
 from __future__ import annotations
 
@@ -13,31 +13,25 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.closest_points import robust_radius
-from hsi_sc_nerf.evaluation.registration import (
-    Registration,
-    align_by_features,
-    refine,
-)
-from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.evaluation.surface_files import read_surface
-from hsi_sc_nerf.evaluation.threshold_curves import (
-    Shape,
+from hsi_sc_nerf.evaluation.registration import Registration, align_by_features, refine, robust_radius
+from hsi_sc_nerf.evaluation.spatial import (
+    Surface,
     ThresholdCurves,
     best_threshold_m,
+    sample_surface,
     threshold_curves,
 )
-from hsi_sc_nerf.geometry.similarity import Similarity
+from hsi_sc_nerf.evaluation.surface_files import read_surface
 
 Alignment = Literal["features", "icp", "none"]
-DistanceKind = Literal["surface", "points"]
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
+"""Wraps what takes long, with a description of it, to show a progress bar."""
 
 METRES = {"m": 1.0, "mm": 0.001}
 THRESHOLDS = 201
 FEWEST_POINTS = 100
 LARGEST_RATIO = 10.0
-"""Of two sizes, beyond which the units are wrong rather than the reconstruction."""
+"""If one of the two is larger than this times the other, their units differ."""
 
 
 @dataclass(frozen=True)
@@ -45,47 +39,62 @@ class CompareConfig:
     """How a cloud is compared with a reference."""
 
     align: Alignment | None = None
-    """How the cloud is brought into the reference's frame: features finds the way from any attitude and then refines
-    it by ICP, icp only refines (the two must lie almost right already), none leaves the cloud where it is. Without
-    this option: none for a simulated session, whose truth is in the cloud's own frame, and features for a file."""
+    """How the cloud is brought into the reference's frame: "features" aligns any attitude and refines it by ICP,
+    "icp" only refines (the two must already lie almost right), "none" leaves the cloud where it is. Default: "none"
+    for a simulated session, whose true surface is in the cloud's frame, and "features" for a file."""
     with_scale: bool = False
-    """Let the alignment change the cloud's size, too, for a reference (or a cloud) that is not to scale."""
+    """Let the alignment also change the cloud's size, for a reference (or a cloud) that is not to scale."""
     accept_symmetric: bool = False
-    """With features: go on where the shape is (nearly) symmetric and fits equally well in several attitudes, and take
-    one of them. Scores hold for each of them, but a place on the cloud need not be that place on the object."""
+    """With features: if the shape is (nearly) symmetric and fits equally well in several attitudes, take one of them.
+    The scores hold for each, but a point on the cloud need not be that point on the object."""
     reference_unit: Literal["m", "mm"] = "m"
     """Unit of length of the reference file."""
-    distances: DistanceKind = "surface"
-    """To what distances are measured where a mesh is given: surface is the nearest place on its triangles, points the
-    nearest of the points sampled on it (the paper's formulas). For a cloud they always are to its nearest point."""
     threshold_m: float = paper.F_SCORE_THRESHOLD_M
-    """Distance within which a point counts as right, in metres; 0.002 is the paper's."""
+    """Distance within which a point is correct, in metres; 0.002 is the paper's."""
     largest_threshold_m: float = 5 * paper.F_SCORE_THRESHOLD_M
-    """Where the curves end, in metres."""
+    """Largest threshold of the curves, in metres."""
     points: int = 100_000
-    """How many points are sampled on a mesh, evenly over its area."""
+    """Number of points sampled on a mesh, evenly over its area."""
     whole_reference: bool = False
-    """With a simulated session: count also those parts of the true surface that no view sees, such as the base."""
+    """With a simulated session: recall also counts the parts of the true surface that no view sees, such as the
+    base."""
     seed: int = 0
-    """Of everything random: the same seed gives the same figures."""
+    """Random seed: the same seed gives the same figures."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a cloud is compared with.
+
+    Attributes:
+        name: for messages.
+        surface: metres.
+        seen: which of the surface's points recall counts; None for all.
+        align: how a cloud is aligned with it where the settings do not say.
+    """
+
+    name: str
+    surface: Surface
+    seen: Bool[np.ndarray, "n"] | None = None
+    align: Alignment = "features"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was measured; all in the reference's frame, in metres."""
+    """Result of a comparison, in metres and in the reference's frame."""
 
     config: CompareConfig
     alignment: Alignment
     registration: Registration | None
-    cloud: Shape
+    cloud: Surface
     """Aligned."""
-    reference: Shape
+    reference: Surface
     to_reference_m: Float[np.ndarray, "n"]
     """Distance of each of the cloud's points to the reference."""
     to_cloud_m: Float[np.ndarray, "m"]
     """Distance of each of the reference's points to the cloud."""
-    seen_share: float | None
-    """Share of the reference's surface that some view sees and that recall counts; None if nothing was left out."""
+    seen_fraction: float | None
+    """Fraction of the reference's surface that some view sees and that recall counts; None if recall counts all."""
 
     @cached_property
     def curves(self) -> ThresholdCurves:
@@ -99,60 +108,80 @@ class Comparison:
         return best_threshold_m(self.curves)
 
 
-def plainly(items: Sequence[Any], _doing: str) -> Iterable[Any]:
+def without_progress(items: Sequence[Any], _description: str) -> Iterable[Any]:
     """The `Track` that shows nothing."""
     return items
 
 
 def compare(
-    cloud_path: Path, reference_path: Path, config: CompareConfig | None = None, track: Track = plainly
+    cloud_path: Path, reference: Reference, config: CompareConfig | None = None, track: Track = without_progress
 ) -> Comparison:
-    """Compare a cloud or mesh with a reference: a mesh, a cloud, or the true mesh of a simulated session.
+    """Compare a cloud or mesh with a reference.
 
-    Recall counts the parts of a simulated object's surface that some view sees (unless ``whole_reference``);
-    precision is measured against all of it.
+    Precision is measured against the whole reference; recall counts the points that ``reference.seen`` names.
 
     Args:
         cloud_path: PLY cloud, or PLY, OBJ or STL mesh, in metres.
-        reference_path: Likewise, in ``reference_unit``; or the folder of a simulated session.
-        config: Settings.
-        track: Wraps what takes long, with what is being done, for a progress bar.
+        reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.scores.visible_surface.true_reference` of a
+            simulated session.
+        config: settings.
+        track: shows progress.
 
     Raises:
         InputError: a file or a setting cannot be used, the sizes do not fit together, or the shape is symmetric, so
-            that features do not say how it lies.
+            that features do not determine its attitude.
+
+    Example:
+        >>> found = compare(Path("point_cloud.ply"), read_reference(Path("scan.stl"), CompareConfig()))
+        >>> score_at(found.to_reference_m, found.to_cloud_m, threshold_m=0.002).f_score
+        96.2
     """
     config = config or CompareConfig()
-    is_session = Path(reference_path).is_dir()
-    alignment: Alignment = config.align or ("none" if is_session else "features")
+    alignment = config.align or reference.align
     _check(config, alignment)
-    reference, seen = (
-        _true_surface(Path(reference_path), config, track)
-        if is_session
-        else (_shape(Path(reference_path), config, METRES[config.reference_unit]), None)
-    )
-    cloud = _shape(Path(cloud_path), config, 1.0)
-    _check_sizes(cloud_path, cloud, reference_path, reference, alignment, config)
-    registration = _registered(cloud_path, cloud, reference_path, reference, alignment, config, track)
+    cloud = surface_of(Path(cloud_path), config)
+    _check_sizes(str(cloud_path), cloud, reference, alignment, config)
+    registration = _register(str(cloud_path), cloud, reference, alignment, config, track)
     if registration is not None:
-        cloud = _moved(cloud, registration.transform)
-    seen_points_m = reference.points_m if seen is None else reference.points_m[seen]
-    counted = Shape(seen_points_m, reference.vertices_m, reference.triangles)
-    # Distances to points are to all of the reference's points, seen or not, as they are to all of its surface.
-    forth, back = (
-        _measured(shape, config.distances).distances_m(points)
-        for shape, points in ((reference, cloud.points_m), (cloud, seen_points_m))
-    )
+        vertices = None if cloud.vertices_m is None else registration.transform(cloud.vertices_m)
+        cloud = Surface(registration.transform(cloud.points_m), vertices, cloud.triangles)
+    surface, seen = reference.surface, reference.seen
+    counted = surface if seen is None else Surface(surface.points_m[seen], surface.vertices_m, surface.triangles)
     return Comparison(
         config=config,
         alignment=alignment,
         registration=registration,
         cloud=cloud,
         reference=counted,
-        to_reference_m=forth,
-        to_cloud_m=back,
-        seen_share=None if seen is None else float(seen.mean()),
+        to_reference_m=surface.distances_m(cloud.points_m),
+        to_cloud_m=cloud.distances_m(counted.points_m),
+        seen_fraction=None if seen is None else float(seen.mean()),
     )
+
+
+def read_reference(path: Path, config: CompareConfig) -> Reference:
+    """A cloud or mesh in ``config.reference_unit`` as the reference of a comparison.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    return Reference(str(path), surface_of(path, config, METRES[config.reference_unit]))
+
+
+def surface_of(path: Path, config: CompareConfig, unit_m: float = 1.0) -> Surface:
+    """The points of a cloud, or a mesh with ``config.points`` points on it, in metres.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    vertices, triangles = read_surface(path)
+    vertices = vertices * unit_m
+    if not len(triangles):
+        return Surface(vertices)
+    try:
+        return Surface(sample_surface(vertices, triangles, config.points, config.seed), vertices, triangles)
+    except ValueError as error:
+        raise InputError(f"{path}: its triangles have no area; export the mesh again.") from error
 
 
 def _check(config: CompareConfig, alignment: Alignment) -> None:
@@ -171,62 +200,19 @@ def _check(config: CompareConfig, alignment: Alignment) -> None:
         )
 
 
-def _shape(path: Path, config: CompareConfig, unit_m: float) -> Shape:
-    vertices, triangles = read_surface(path)
-    vertices = vertices * unit_m
-    if not len(triangles):
-        return Shape(vertices)
-    try:
-        return Shape(sample_surface(vertices, triangles, config.points, config.seed), vertices, triangles)
-    except ValueError as error:
-        raise InputError(f"{path}: its triangles have no area; export the mesh again.") from error
-
-
-def _true_surface(
-    session_dir: Path, config: CompareConfig, track: Track
-) -> tuple[Shape, Bool[np.ndarray, "n"] | None]:
-    """The true mesh of a simulated session, and which of its points some view sees; None if all are to count."""
-    from hsi_sc_nerf.simulate.scores.visible_surface import seen_points
-    from hsi_sc_nerf.simulate.truth import load_truth
-
-    if config.reference_unit != "m":
-        raise InputError(f"{session_dir}: a simulated session's truth is in metres; leave out --reference-unit.")
-    truth = load_truth(session_dir)
-    shape = _shape(truth.mesh_path, config, 1.0)
-    if config.whole_reference:
-        return shape, None
-    assert shape.vertices_m is not None
-    assert shape.triangles is not None
-    seen = seen_points(
-        truth,
-        shape.points_m,
-        shape.vertices_m,
-        shape.triangles,
-        lambda captures: track(captures, "What the views see"),
-    )
-    if not seen.any():
-        raise InputError(f"{session_dir}: no view shows the object; simulate the session again.")
-    return shape, seen
-
-
 def _check_sizes(
-    cloud_path: Path,
-    cloud: Shape,
-    reference_path: Path,
-    reference: Shape,
-    alignment: Alignment,
-    config: CompareConfig,
+    cloud_name: str, cloud: Surface, reference: Reference, alignment: Alignment, config: CompareConfig
 ) -> None:
-    for path, shape in ((cloud_path, cloud), (reference_path, reference)):
-        if alignment != "none" and (len(shape.points_m) < FEWEST_POINTS or robust_radius(shape.points_m) == 0):
+    for name, surface in ((cloud_name, cloud), (reference.name, reference.surface)):
+        if alignment != "none" and (len(surface.points_m) < FEWEST_POINTS or robust_radius(surface.points_m) == 0):
             raise InputError(
-                f"{path}: has {len(shape.points_m)} points, too few to align by; take a denser one or --align none."
+                f"{name}: has {len(surface.points_m)} points, too few to align by; take a denser one or --align none."
             )
-    ratio = robust_radius(reference.points_m) / max(robust_radius(cloud.points_m), 1e-12)
-    # What is scaled by features may be of any size.
+    ratio = robust_radius(reference.surface.points_m) / max(robust_radius(cloud.points_m), 1e-12)
+    # An alignment by features with a scale takes any size.
     if not (config.with_scale and alignment == "features") and not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         larger, smaller, times = (
-            (reference_path, cloud_path, ratio) if ratio > 1.0 else (cloud_path, reference_path, 1.0 / ratio)
+            (reference.name, cloud_name, ratio) if ratio > 1.0 else (cloud_name, reference.name, 1.0 / ratio)
         )
         raise InputError(
             f"{larger}: is {times:.3g} times as large as {smaller}; the cloud has to be in metres, the reference in "
@@ -234,40 +220,27 @@ def _check_sizes(
         )
 
 
-def _registered(
-    cloud_path: Path,
-    cloud: Shape,
-    reference_path: Path,
-    reference: Shape,
+def _register(
+    cloud_name: str,
+    cloud: Surface,
+    reference: Reference,
     alignment: Alignment,
     config: CompareConfig,
     track: Track,
 ) -> Registration | None:
     if alignment == "none":
         return None
+    clouds = cloud.points_m, reference.surface.points_m
     if alignment == "icp":
-        return refine(cloud.points_m, reference.points_m, with_scale=config.with_scale, seed=config.seed)
+        return refine(*clouds, with_scale=config.with_scale, seed=config.seed)
     found = align_by_features(
-        cloud.points_m,
-        reference.points_m,
-        config.with_scale,
-        config.seed,
-        lambda starts: track(starts, "Trying other attitudes"),
+        *clouds, config.with_scale, config.seed, lambda starts: track(starts, "Trying other attitudes")
     )
     if found.rival is not None and not config.accept_symmetric:
         raise InputError(
-            f"{cloud_path}: features do not say how it lies in {reference_path}, because turned by "
+            f"{cloud_name}: features do not determine its attitude in {reference.name}, because turned by "
             f"{found.rival.turn_deg:.0f} degrees it fits as well (RMS {1000 * found.rival.rms_m:.2f} mm against "
             f"{1000 * found.rival.taken_rms_m:.2f} mm); bring the two together by hand and use --align icp, or take "
             "either attitude with --accept-symmetric."
         )
     return found
-
-
-def _moved(shape: Shape, transform: Similarity) -> Shape:
-    vertices = None if shape.vertices_m is None else transform(shape.vertices_m)
-    return Shape(transform(shape.points_m), vertices, shape.triangles)
-
-
-def _measured(shape: Shape, kind: DistanceKind) -> Shape:
-    return shape if kind == "surface" else Shape(shape.points_m)

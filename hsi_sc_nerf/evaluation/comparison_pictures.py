@@ -12,10 +12,10 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
-from hsi_sc_nerf.evaluation.threshold_curves import ThresholdCurves
-from hsi_sc_nerf.plotting.result_pictures import _COLOURS, _STYLE, _figure, _save
+from hsi_sc_nerf.evaluation.spatial import ThresholdCurves
+from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure
 
-_COLOUR_MAP = "viridis"
 _DRAWN_POINTS = 60_000
 # Title, direction of y across and of x towards the viewer; z is up.
 _SIDES = (("seen from +x", 1), ("seen from −x", -1))
@@ -29,10 +29,10 @@ def colour_limit_m(*distances_m: Float[np.ndarray, "n"]) -> float:
 
 def distance_colours(distances_m: Float[np.ndarray, "n"], limit_m: float) -> UInt8[np.ndarray, "n 3"]:
     """Dark blue at 0 to yellow at the limit and beyond (viridis)."""
-    return colormaps[_COLOUR_MAP](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
+    return colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], chosen: tuple[float, float]) -> None:
     """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
 
@@ -42,11 +42,11 @@ def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], 
         knee: Threshold (metres) and F-score (percent) of the curve's knee.
         chosen: Of the threshold that was asked for, which may lie beyond the curves.
     """
-    figure = _figure(6.0, 3.4)
+    figure = new_figure(6.0, 3.4)
     axes = figure.subplots()
     millimetres = 1000 * curves.thresholds_m
     drawn = {"precision": curves.precision, "recall": curves.recall, "F-score": curves.f_score}
-    for (name, values), colour in zip(drawn.items(), _COLOURS, strict=False):
+    for (name, values), colour in zip(drawn.items(), COLOURS, strict=False):
         axes.plot(millimetres, values, color=colour, linewidth=2.2 if name == "F-score" else 1.3, label=name)
     for (place_m, score), name, line in ((knee, "knee", "--"), (chosen, "chosen", ":")):
         label = f"{name}: {1000 * place_m:.2f} mm, F-score {score:.1f} %"
@@ -58,10 +58,10 @@ def draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], 
         ylim=(0, 102),
     )
     axes.legend(loc="lower right")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_distances(
     path: Path, shapes: Sequence[tuple[str, Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]], limit_m: float
 ) -> None:
@@ -76,7 +76,7 @@ def draw_distances(
     width, height = 1000 * (high[1] - low[1]), 1000 * (high[2] - low[2])
     inch_per_mm = _PANEL_IN / max(width, height)
     panels = len(shapes) * len(_SIDES)
-    figure = _figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 0.9)
+    figure = new_figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 0.9)
     rows = figure.subplots(1, panels, squeeze=False, sharey=True)[0]
     for index, (axes, (title, points, distances)) in enumerate(
         zip(rows, (shape for shape in shapes for _ in _SIDES), strict=True)
@@ -102,7 +102,7 @@ def draw_distances(
         )
     rows[0].set_ylabel("z (mm)")
     figure.colorbar(drawn, ax=rows.tolist(), label="distance (mm)", extend="max", fraction=0.05, pad=0.01)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _extent(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[np.ndarray, np.ndarray]:
@@ -118,5 +118,5 @@ def _scatter(
     axes.set_axisbelow(True)
     across, up = places.T
     return axes.scatter(
-        across, up, c=distances, s=size, cmap=_COLOUR_MAP, vmin=0, vmax=limit, linewidths=0, rasterized=True
+        across, up, c=distances, s=size, cmap=INDEX_COLOURS, vmin=0, vmax=limit, linewidths=0, rasterized=True
     )

@@ -12,7 +12,6 @@ from plyfile import PlyData, PlyElement
 from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
-from hsi_sc_nerf.benchmark.results import markdown_table
 from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.comparison_pictures import (
     colour_limit_m,
@@ -20,8 +19,9 @@ from hsi_sc_nerf.evaluation.comparison_pictures import (
     draw_curves,
     draw_distances,
 )
-from hsi_sc_nerf.evaluation.threshold_curves import distance_statistics, score_at, threshold_for_m
+from hsi_sc_nerf.evaluation.spatial import distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.tables import markdown_table, screen_table
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _DISTANCE_TITLES = ["distance, mm", "mean", "median", "RMS", "95th percentile", "largest"]
@@ -33,18 +33,18 @@ def score_rows(comparison: Comparison) -> list[list[str]]:
     chosen_m = comparison.config.threshold_m
     chosen = " (the paper's)" if chosen_m == paper.F_SCORE_THRESHOLD_M else " (chosen)"
     rows = []
-    for threshold_m, told in ((chosen_m, chosen), (comparison.best_threshold_m, " (knee)")):
+    for threshold_m, label in ((chosen_m, chosen), (comparison.best_threshold_m, " (knee)")):
         score = score_at(comparison.to_reference_m, comparison.to_cloud_m, threshold_m)
         figures = (f"{percent:.2f}" for percent in (score.precision, score.recall, score.f_score))
-        rows.append([f"{1000 * threshold_m:.2f}{told}", *figures])
+        rows.append([f"{1000 * threshold_m:.2f}{label}", *figures])
     return rows
 
 
 def distance_rows(comparison: Comparison) -> list[list[str]]:
     """Statistics of the distances, both ways."""
     return [
-        [told, *(f"{1000 * value:.3f}" for value in asdict(distance_statistics(distances)).values())]
-        for told, distances in (
+        [label, *(f"{1000 * value:.3f}" for value in asdict(distance_statistics(distances)).values())]
+        for label, distances in (
             ("cloud to reference", comparison.to_reference_m),
             ("reference to cloud", comparison.to_cloud_m),
         )
@@ -53,16 +53,10 @@ def distance_rows(comparison: Comparison) -> list[list[str]]:
 
 def screen_tables(comparison: Comparison) -> list[Table]:
     """The tables for a terminal."""
-    tables = []
-    for titles, rows in (
-        (_SCORE_TITLES, score_rows(comparison)),
-        (_DISTANCE_TITLES, distance_rows(comparison)),
-    ):
-        shown = Table(*titles)
-        for row in rows:
-            shown.add_row(*row)
-        tables.append(shown)
-    return tables
+    return [
+        screen_table(_SCORE_TITLES, score_rows(comparison)),
+        screen_table(_DISTANCE_TITLES, distance_rows(comparison)),
+    ]
 
 
 def summary(comparison: Comparison) -> dict[str, Any]:
@@ -83,7 +77,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "cloud_to_reference": {"points": len(forth), **asdict(distance_statistics(forth))},
         "reference_to_cloud": {"points": len(back), **asdict(distance_statistics(back))},
         "alignment": _alignment(comparison),
-        "seen_share_of_reference": comparison.seen_share,
+        "seen_fraction_of_reference": comparison.seen_fraction,
         "settings": asdict(comparison.config),
         "curves": curves,
         "version": __version__,
@@ -93,16 +87,16 @@ def summary(comparison: Comparison) -> dict[str, Any]:
 def _alignment(comparison: Comparison) -> dict[str, Any]:
     registration = comparison.registration
     if registration is None:
-        return {"way": comparison.alignment}
+        return {"method": comparison.alignment}
     matched = comparison.to_reference_m[comparison.to_reference_m <= registration.within_m]
     return {
-        "way": comparison.alignment,
+        "method": comparison.alignment,
         "cloud_to_reference": registration.transform.matrix().tolist(),
         "turn_deg": registration.transform.turn_deg(),
         "scale": registration.transform.scale,
         "rival": None if registration.rival is None else asdict(registration.rival),
         "within_m": registration.within_m,
-        "matched_share": len(matched) / len(comparison.to_reference_m),
+        "matched_fraction": len(matched) / len(comparison.to_reference_m),
         "matched_rms_m": distance_statistics(matched).rms_m if len(matched) else None,
     }
 
@@ -163,7 +157,7 @@ from 0 to {1000 * comparison.config.largest_threshold_m:g} mm.
 
 {markdown_table(_DISTANCE_TITLES, distance_rows(comparison))}
 
-{_told_alignment(figures["alignment"])} {_told_distances(comparison)}{_told_seen(comparison)}
+{_alignment_sentences(figures["alignment"])} {_distances_sentence(comparison)}{_seen_sentence(comparison)}
 
 ![Precision, recall and F-score over the distance threshold](curves.png)
 
@@ -174,10 +168,10 @@ Colours end at {1000 * limit_m:.2f} mm. `distances.ply` is the cloud in the refe
 """
 
 
-def _told_alignment(alignment: dict[str, Any]) -> str:
-    if alignment["way"] == "none":
+def _alignment_sentences(alignment: dict[str, Any]) -> str:
+    if alignment["method"] == "none":
         return "The cloud was compared where it lies, without alignment."
-    ways = {"features": "features, then ICP", "icp": "ICP"}
+    methods = {"features": "features, then ICP", "icp": "ICP"}
     rms = "none" if alignment["matched_rms_m"] is None else f"{1000 * alignment['matched_rms_m']:.3f} mm"
     rival = alignment["rival"]
     ambiguous = (
@@ -188,26 +182,25 @@ def _told_alignment(alignment: dict[str, Any]) -> str:
         "not be that place on the reference."
     )
     return (
-        f"The cloud was aligned by {ways[alignment['way']]}: turned by {alignment['turn_deg']:.2f} degrees, scaled "
-        f"by {alignment['scale']:.5f}. RMS after ICP: {rms}, of the {100 * alignment['matched_share']:.1f} % of its "
-        f"points within {1000 * alignment['within_m']:.2f} mm.{ambiguous}"
+        f"The cloud was aligned by {methods[alignment['method']]}: turned by {alignment['turn_deg']:.2f} degrees, "
+        f"scaled by {alignment['scale']:.5f}. RMS after ICP: {rms}, of the "
+        f"{100 * alignment['matched_fraction']:.1f} % of its points within {1000 * alignment['within_m']:.2f} mm."
+        f"{ambiguous}"
     )
 
 
-def _told_distances(comparison: Comparison) -> str:
-    told = []
-    for name, shape in (("the reference", comparison.reference), ("the cloud", comparison.cloud)):
-        if shape.triangles is not None and comparison.config.distances == "surface":
-            told.append(f"to {name}'s surface (triangles)")
-        else:
-            told.append(f"to the nearest of {name}'s points")
-    return f"Distances are {told[0]} and {told[1]}."
+def _distances_sentence(comparison: Comparison) -> str:
+    targets = [
+        f"to the nearest of {name}'s points" if surface.triangles is None else f"to {name}'s surface (triangles)"
+        for name, surface in (("the reference", comparison.reference), ("the cloud", comparison.cloud))
+    ]
+    return f"Distances are {targets[0]} and {targets[1]}."
 
 
-def _told_seen(comparison: Comparison) -> str:
-    if comparison.seen_share is None:
+def _seen_sentence(comparison: Comparison) -> str:
+    if comparison.seen_fraction is None:
         return ""
     return (
-        f" Recall counts the {100 * comparison.seen_share:.1f} % of the true surface that some view sees; distances "
-        "of the cloud are to all of it."
+        f" Recall counts the {100 * comparison.seen_fraction:.1f} % of the true surface that some view sees; "
+        "distances of the cloud are to all of it."
     )

@@ -29,10 +29,15 @@ def precision_recall_f_score(
 ) -> SpatialScore:
     """Point-to-point precision, recall and F-score of a reconstruction against a reference, in the same frame.
 
-    Precision is the share of reconstructed points within ``threshold_m`` (included) of a reference point, recall the
-    share of reference points within it of a reconstructed one; the F-score is 2 P R / (P + R), and 0 where both are.
-    Distances to points overstate distances to the surface by up to the spacing: sample the reference densely.
-    An empty cloud scores 0.
+    Precision is the fraction of reconstructed points within ``threshold_m`` (included) of a reference point, recall
+    the fraction of reference points within it of a reconstructed point. The F-score is 2 P R / (P + R), or 0 if both
+    are 0. An empty cloud scores 0. Sample the reference densely: distances to points exceed distances to the surface
+    by up to the points' spacing.
+
+    Example:
+        >>> reference_m = np.random.default_rng(0).random((1000, 3))
+        >>> precision_recall_f_score(reference_m + [0.001, 0.0, 0.0], reference_m).f_score
+        100.0
     """
     return _score(*_hits(reconstructed_m, reference_m, threshold_m))
 
@@ -46,8 +51,8 @@ def f_score_with_spread(
 ) -> tuple[SpatialScore, float]:
     """`precision_recall_f_score`, and the standard deviation of the F-score (percent) over bootstrap resamples.
 
-    The points of both clouds are drawn again with replacement (Efron 1979): the spread says how much of the score
-    is the luck of which points were sampled, not how well the surface is known.
+    The points of both clouds are resampled with replacement (Efron 1979). The spread measures the effect of sampling
+    points only, not how well the surface is known.
     """
     precise, recalled = _hits(reconstructed_m, reference_m, threshold_m)
     rng = np.random.default_rng(seed)
@@ -89,9 +94,8 @@ def sample_surface(
 ) -> Float[np.ndarray, "{count} 3"]:
     """Points spread evenly over a triangle mesh's area.
 
-    Stratified: the mesh's area is cut into ``count`` equal shares in the order of the triangles, and each share gets
-    one point, so that every triangle gets its share to within one point. Uniform within a triangle (Osada et al.
-    2002, "Shape Distributions", section 3.2).
+    Stratified: the area is divided into ``count`` equal parts in the order of the triangles, and each part gets one
+    point. Uniform within a triangle (Osada et al. 2002, "Shape Distributions", section 3.2).
 
     Raises:
         ValueError: the mesh has no area.
@@ -102,8 +106,8 @@ def sample_surface(
     if not len(reach) or reach[-1] <= 0:
         raise ValueError("sample_surface: the mesh has no area")
     random = np.random.default_rng(seed)
-    shares = (np.arange(count) + random.random(count)) * (reach[-1] / count)
-    chosen = np.searchsorted(reach, shares, side="right").clip(max=len(reach) - 1)
+    positions = (np.arange(count) + random.random(count)) * (reach[-1] / count)
+    chosen = np.searchsorted(reach, positions, side="right").clip(max=len(reach) - 1)
     root, along = np.sqrt(random.random(count))[:, None], random.random(count)[:, None]
     return corners[chosen, 0] + root * ((1 - along) * edges[chosen, 0] + along * edges[chosen, 1])
 
@@ -116,3 +120,110 @@ def distance_to_surface(
     centre_m = np.mean(vertices_m, axis=0)
     scene = ray_scene(vertices_m - centre_m, triangles)
     return scene.compute_distance(np.asarray(points_m - centre_m, np.float32)).numpy()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points, and the surface they were sampled from where there is one; metres."""
+
+    points_m: Float[np.ndarray, "n 3"]
+    vertices_m: Float[np.ndarray, "v 3"] | None = None
+    triangles: Int[np.ndarray, "t 3"] | None = None
+
+    def distances_m(self, points_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k"]:
+        """Distance of each given point to the surface, or to the nearest point where there is none."""
+        if self.vertices_m is None or self.triangles is None:
+            return cKDTree(self.points_m).query(points_m, workers=-1)[0]
+        return distance_to_surface(points_m, self.vertices_m, self.triangles).astype(float)
+
+
+@dataclass(frozen=True)
+class ThresholdCurves:
+    """Precision, recall and F-score, each in percent, at each threshold."""
+
+    thresholds_m: Float[np.ndarray, "t"]
+    precision: Float[np.ndarray, "t"]
+    recall: Float[np.ndarray, "t"]
+    f_score: Float[np.ndarray, "t"]
+
+
+@dataclass(frozen=True)
+class DistanceStatistics:
+    """Of unsigned distances, in metres."""
+
+    mean_m: float
+    median_m: float
+    rms_m: float
+    percentile_95_m: float
+    largest_m: float
+
+
+def threshold_curves(
+    to_reference_m: Float[np.ndarray, "n"], to_cloud_m: Float[np.ndarray, "m"], thresholds_m: Float[np.ndarray, "t"]
+) -> ThresholdCurves:
+    """Precision and recall: the fractions of distances within each threshold, the threshold itself included.
+
+    Args:
+        to_reference_m: Distance of each point of the cloud to the reference, for the precision.
+        to_cloud_m: Distance of each point of the reference to the cloud, for the recall.
+        thresholds_m: In any order.
+
+    Raises:
+        ValueError: one side has no points.
+    """
+    if not len(to_reference_m) or not len(to_cloud_m):
+        raise ValueError("threshold_curves: the cloud and the reference need one point each at least")
+    precision, recall = (
+        100.0 * np.searchsorted(np.sort(distances), thresholds_m, side="right") / len(distances)
+        for distances in (to_reference_m, to_cloud_m)
+    )
+    return ThresholdCurves(np.asarray(thresholds_m, float), precision, recall, f_score(precision, recall))
+
+
+def score_at(
+    to_reference_m: Float[np.ndarray, "n"], to_cloud_m: Float[np.ndarray, "m"], threshold_m: float
+) -> SpatialScore:
+    """The curves' values at one threshold."""
+    curves = threshold_curves(to_reference_m, to_cloud_m, np.array([threshold_m]))
+    return SpatialScore(float(curves.precision[0]), float(curves.recall[0]), float(curves.f_score[0]))
+
+
+def best_threshold_m(curves: ThresholdCurves) -> float:
+    """The knee of the F-score's curve, beyond which a larger threshold gains little.
+
+    The knee is the threshold at which the curve lies furthest above the straight line between its ends, both axes
+    scaled to [0, 1] (Satopaa et al. 2011, "Finding a 'Kneedle' in a Haystack"). It depends on the largest threshold.
+    A curve that does not rise has its knee at the first threshold. The paper does not say how it found its optimum.
+    """
+    rise = curves.f_score[-1] - curves.f_score[0]
+    if rise <= 0:
+        return float(curves.thresholds_m[0])
+    fraction = (curves.thresholds_m - curves.thresholds_m[0]) / (curves.thresholds_m[-1] - curves.thresholds_m[0])
+    return float(curves.thresholds_m[np.argmax((curves.f_score - curves.f_score[0]) / rise - fraction)])
+
+
+def threshold_for_m(
+    to_reference_m: Float[np.ndarray, "n"], to_cloud_m: Float[np.ndarray, "m"], percent: float
+) -> float:
+    """The smallest threshold at which the F-score reaches ``percent``.
+
+    Args:
+        to_reference_m: Distance of each point of the cloud to the reference.
+        to_cloud_m: Distance of each point of the reference to the cloud.
+        percent: In (0, 100].
+    """
+    candidates = np.sort(np.concatenate([to_reference_m, to_cloud_m]))
+    curves = threshold_curves(to_reference_m, to_cloud_m, candidates)
+    # Rounding must not keep 100 % from being reached.
+    return float(candidates[int(np.argmax(curves.f_score >= percent - 1e-9))])
+
+
+def distance_statistics(distances_m: Float[np.ndarray, "n"]) -> DistanceStatistics:
+    """Mean, median, RMS, 95th percentile and largest of unsigned distances."""
+    return DistanceStatistics(
+        mean_m=float(np.mean(distances_m)),
+        median_m=float(np.median(distances_m)),
+        rms_m=float(np.sqrt(np.mean(np.square(distances_m)))),
+        percentile_95_m=float(np.percentile(distances_m, 95)),
+        largest_m=float(np.max(distances_m)),
+    )

@@ -20,10 +20,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.validity import cleared, count_bands, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, safe_log10, safe_sqrt, select_pixels, spectral_angle
 
 # The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
@@ -33,13 +32,13 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 SSIM_WINDOW_PX = 11
 SSIM_WINDOW_SIGMA_PX = 1.5
-
 # Values of one image in a block: 8 MiB a temporary in float64, of which there are some dozens.
 _BLOCK_VALUES = 1 << 20
-
 Image = Float[Tensor, "h w bands"]
 Mask = Bool[Tensor, "h w"]
 Valid = Bool[Tensor, "h w bands"]
+MIN_BANDS_OF_AN_ANGLE = 2
+"""A spectrum of a single band is a length: it has no direction that could differ."""
 
 
 def _blocks(
@@ -283,3 +282,28 @@ def spectral_metrics(
         "psnr": psnr,
     }
     return {name: metric(predicted, target, mask, valid).item() for name, metric in metrics.items()}
+
+
+def cleared(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """``values``, 0 where they are not valid: what stood there, NaN included, touches neither values nor gradients.
+
+    Raises:
+        ValueError: ``valid`` is not boolean or of another shape.
+    """
+    if valid.dtype != torch.bool or valid.shape != values.shape:
+        raise ValueError(
+            f"the validity of values of shape {tuple(values.shape)} is boolean with that shape, not {valid.dtype} "
+            f"with shape {tuple(valid.shape)}"
+        )
+    return torch.where(valid, values, 0.0)
+
+
+def count_bands(valid: Bool[Tensor, "*pixels bands"]) -> Int[Tensor, "*pixels"]:
+    """How many bands of each pixel are valid."""
+    # torch makes integers of this kind of all that it adds up: 64-bit ones of a whole image are half a gigabyte.
+    return valid.sum(-1, dtype=torch.int16)
+
+
+def has_angle(valid: Bool[Tensor, "*pixels bands"]) -> Bool[Tensor, "*pixels"]:
+    """Pixels with bands enough to tell a spectral angle from."""
+    return count_bands(valid) >= MIN_BANDS_OF_AN_ANGLE

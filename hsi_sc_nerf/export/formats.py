@@ -1,64 +1,209 @@
-"""The kinds of file that clouds are written as."""
+"""Write spectral point clouds as PLY, LAS, NetCDF or Zarr.
+
+LAS 1.4 holds each band as a dimension of extra bytes (ASPRS LAS 1.4 R15, "Extra Bytes"). NetCDF-4 and Zarr are tables
+that xarray opens, with the dimensions ``point`` and ``wavelength`` (nm): ``reflectance`` (point, wavelength), and per
+point ``x y z`` (metres, object frame), ``nx ny nz``, ``red green blue`` and the extra columns. They are written
+without xarray, which needs the whole table at once.
+"""
 
 from __future__ import annotations
 
+import importlib
+import os
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from types import ModuleType
+from typing import Any, Literal
 
-from hsi_sc_nerf.export.cloud import CloudStream
-from hsi_sc_nerf.export.las import require_room, write_las_stream
-from hsi_sc_nerf.export.optional import require
-from hsi_sc_nerf.export.ply import write_ply_stream
-from hsi_sc_nerf.export.tables import require_replaceable, write_netcdf_stream, write_zarr_stream
+import numpy as np
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
+from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
-_WRITERS: dict[CloudFormat, tuple[str, Callable[[Path, CloudStream], None]]] = {
-    "ply": (".ply", write_ply_stream),
-    "las": (".las", write_las_stream),
-    "netcdf": (".nc", write_netcdf_stream),
-    "zarr": (".zarr", write_zarr_stream),
-}
-_PACKAGES: dict[CloudFormat, tuple[str, str]] = {
-    "las": ("laspy", "a LAS file"),
-    "netcdf": ("h5netcdf", "a NetCDF file"),
-    "zarr": ("zarr", "a Zarr folder"),
-}
+_SUFFIXES: dict[CloudFormat, str] = {"ply": ".ply", "las": ".las", "netcdf": ".nc", "zarr": ".zarr"}
+_PACKAGES: dict[CloudFormat, str] = {"las": "laspy", "netcdf": "h5netcdf", "zarr": "zarr"}
 
+LAS_STEP_M = 1e-6
+"""LAS stores positions as whole steps."""
+LAS_MAX_DIMENSIONS = 341
+"""A dimension of extra bytes is described by 192 bytes, and all descriptions share one record of at most 65535."""
+_LAS_POINT_FORMAT = 7
+"""With colours."""
+_LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals
+_COLOURS = ("red", "green", "blue")
+_EIGHT_TO_SIXTEEN_BITS = 257
 
-def require_format(path_without_suffix: Path, file_format: CloudFormat, num_bands: int, num_extra: int) -> None:
-    """Refuse what `write_cloud` could not write, before anything is computed.
-
-    Args:
-        path_without_suffix: as `write_cloud` takes it.
-        file_format: likewise.
-        num_bands: of the cloud.
-        num_extra: extra columns of the cloud.
-
-    Raises:
-        InputError: a package is missing, the file has no room for so many bands, or something else is in its place.
-    """
-    if file_format in _PACKAGES:
-        require(*_PACKAGES[file_format])
-    path = _with_suffix(path_without_suffix, file_format)
-    if file_format == "las":
-        require_room(path, num_bands, num_extra)
-    elif file_format == "zarr":
-        require_replaceable(path)
+_TABLE_ATTRIBUTES = {"title": "spectral point cloud", "frame": "object: z along the turntable's axis, up; metres"}
+_WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band"}
 
 
 def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: CloudFormat) -> Path:
     """Write a cloud, whole or not at all, and return its path (``.ply``, ``.las``, ``.nc``, ``.zarr``).
 
     Raises:
-        InputError: a package is missing, or the file cannot be written.
-        ValueError: the pieces do not fit together.
+        InputError: a package is missing, the format has no room for so many bands, or the file cannot be written.
+        ValueError: the chunks do not fit together.
+
+    Example:
+        >>> write_cloud(Path("out/point_cloud"), stream(read_spectral_ply("point_cloud.ply")), "netcdf")
+        PosixPath('out/point_cloud.nc')
     """
-    path = _with_suffix(path_without_suffix, file_format)
-    _, write = _WRITERS[file_format]
-    write(path, cloud)
+    path = require_format(path_without_suffix, file_format, len(cloud.wavelengths_nm), len(cloud.extra_names))
+    writers: dict[CloudFormat, Callable[[Path, CloudStream], None]] = {
+        "ply": write_spectral_ply,
+        "las": _write_las,
+        "netcdf": _write_netcdf,
+        "zarr": _write_zarr,
+    }
+    writers[file_format](path, cloud)
     return path
 
 
-def _with_suffix(path: Path, file_format: CloudFormat) -> Path:
-    return path.with_name(path.name + _WRITERS[file_format][0])
+def require_format(path_without_suffix: Path, file_format: CloudFormat, num_bands: int, num_extra: int) -> Path:
+    """Refuse what `write_cloud` could not write, before anything is computed.
+
+    Args:
+        path_without_suffix: path of the file without its suffix.
+        file_format: format of the file.
+        num_bands: bands of the cloud.
+        num_extra: extra columns of the cloud.
+
+    Returns:
+        The path with its suffix.
+
+    Raises:
+        InputError: a package is missing, the format has no room for so many bands, or the Zarr folder would replace
+            something else.
+    """
+    path = path_without_suffix.with_name(path_without_suffix.name + _SUFFIXES[file_format])
+    if file_format in _PACKAGES:
+        _import(file_format)
+    room = LAS_MAX_DIMENSIONS - len(_LAS_NORMALS) - num_extra
+    if file_format == "las" and num_bands > room:
+        raise InputError(
+            f"{path}: LAS has room for {room} bands and the cloud has {num_bands}; choose some with --bands, or "
+            "export as PLY."
+        )
+    if file_format == "zarr" and path.exists() and not (path / "zarr.json").is_file():
+        raise InputError(f"{path}: is no Zarr folder and will not be replaced by one; choose another output folder.")
+    return path
+
+
+def _import(file_format: CloudFormat) -> ModuleType:
+    package = _PACKAGES[file_format]
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"the format {file_format} needs the package {package}, which is not installed; run "
+            "`pip install 'hsi-sc-nerf[formats]'`, or export as PLY."
+        ) from error
+
+
+def _write_las(path: Path, cloud: CloudStream) -> None:
+    """Write a LAS file: positions in steps of a micrometre, 16-bit colours, all else as float dimensions."""
+    laspy = _import("las")
+    bands = [name.removeprefix("scalar_") for name in band_property_names(cloud.wavelengths_nm)]
+    names = [*_LAS_NORMALS, *bands, *cloud.extra_names]
+    header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
+    header.scales = np.full(3, LAS_STEP_M)
+    header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
+    with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:
+        for _, chunk in cloud.placed():
+            record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
+            record.x, record.y, record.z = np.asarray(chunk.points, np.float64).T
+            for name, channel in zip(_COLOURS, chunk.colours.T, strict=True):
+                record[name] = channel.astype(np.uint16) * _EIGHT_TO_SIXTEEN_BITS
+            columns = [*chunk.normals.T, *chunk.spectra.T, *chunk.extra.values()]
+            for name, values in zip(names, columns, strict=True):
+                record[name] = values
+            writer.write_points(record)
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """A variable of a table with one row a point."""
+
+    name: str
+    rows_of: Callable[[SpectralCloud], np.ndarray]
+    dtype: str = "<f4"
+    dimensions: tuple[str, ...] = ("point",)
+    attributes: dict[str, str] = field(default_factory=dict)
+
+
+def _variables(cloud: CloudStream) -> list[_Variable]:
+    def column(name: str, axis: int) -> Callable[[SpectralCloud], np.ndarray]:
+        return lambda chunk: getattr(chunk, name)[:, axis]
+
+    def extra(name: str) -> Callable[[SpectralCloud], np.ndarray]:
+        return lambda chunk: chunk.extra[name]
+
+    reflectance = {"units": "1", "long_name": "reflectance", "coordinates": "x y z"}
+    return [
+        _Variable("reflectance", lambda chunk: chunk.spectra, "<f4", ("point", "wavelength"), reflectance),
+        *(_Variable(axis, column("points", i), attributes={"units": "m"}) for i, axis in enumerate("xyz")),
+        *(_Variable(f"n{axis}", column("normals", i), attributes={"units": "1"}) for i, axis in enumerate("xyz")),
+        *(_Variable(name, column("colours", i), "u1") for i, name in enumerate(_COLOURS)),
+        *(_Variable(name, extra(name)) for name in cloud.extra_names),
+    ]
+
+
+def _write_netcdf(path: Path, cloud: CloudStream) -> None:
+    h5netcdf = _import("netcdf")
+    variables = _variables(cloud)
+    with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
+        file.attrs.update(_TABLE_ATTRIBUTES)
+        file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
+        wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
+        wavelength.attrs.update(_WAVELENGTH_ATTRIBUTES)
+        for variable in variables:
+            created = file.create_variable(variable.name, variable.dimensions, variable.dtype)
+            created.attrs.update(variable.attributes)
+        for rows, chunk in cloud.placed():
+            for variable in variables:
+                file.variables[variable.name][rows] = variable.rows_of(chunk)
+
+
+def _write_zarr(path: Path, cloud: CloudStream) -> None:
+    """Write a Zarr folder (format 3); an existing one is replaced."""
+    zarr = _import("zarr")
+    sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
+    chunk_sizes = sizes | {"point": max(1, min(CHUNK_POINTS, cloud.count))}
+    variables = _variables(cloud)
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
+        group.attrs.update(_TABLE_ATTRIBUTES)
+
+        def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: dict[str, str]) -> Any:
+            return group.create_array(
+                name,
+                shape=tuple(sizes[dimension] for dimension in dimensions),
+                chunks=tuple(chunk_sizes[dimension] for dimension in dimensions),
+                dtype=dtype,
+                dimension_names=dimensions,
+                attributes=attributes,
+            )
+
+        create("wavelength", "<f8", ("wavelength",), _WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
+        arrays = [create(v.name, v.dtype, v.dimensions, v.attributes) for v in variables]
+        for rows, chunk in cloud.placed():
+            for variable, array in zip(variables, arrays, strict=True):
+                array[rows] = variable.rows_of(chunk)
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder."
+        ) from error
+    finally:
+        with suppress(FileNotFoundError):
+            shutil.rmtree(temporary)

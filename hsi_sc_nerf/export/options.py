@@ -1,55 +1,62 @@
-"""What can be chosen when a cloud is exported, by `ns-export pointcloud` and by `hsi-sc-nerf export` alike."""
+"""Options of the cloud export, shared by `ns-export pointcloud` and `hsi-sc-nerf export`."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from jaxtyping import Float, Int
+
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.formats import CloudFormat
+from hsi_sc_nerf.spectra.bands import require_bands
 
 Vector = tuple[float, float, float]
+_RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
 class CloudOptions:
-    """How a cloud is made. Names and defaults that `ns-export pointcloud` has too are its own."""
+    """How a cloud is made. Options that `ns-export pointcloud` has too keep its names and defaults."""
 
     num_points: int = 1_000_000
-    """Number of points, spread evenly over the surface. Removing outliers leaves a few less."""
+    """Number of points, spread evenly over the surface. Removing outliers leaves slightly fewer."""
     bands: tuple[str, ...] = ()
-    """Bands to keep: wavelengths in nm, such as 670, or ranges, such as 600-700. All without this option."""
+    """Bands to keep: wavelengths in nm, such as 670, or ranges, such as 600-700. By default all."""
     format: CloudFormat = "ply"
-    """Kind of file. ply: opens in CloudCompare, MeshLab, Open3D. las: for GIS and laser scanning software. netcdf and
+    """File format. ply: opens in CloudCompare, MeshLab, Open3D. las: for GIS and laser scanning software. netcdf and
     zarr: tables that xarray opens, with wavelength as a coordinate."""
     roi_box: tuple[float, float, float, float, float, float] | None = None
-    """Keep what lies in a box: smallest x, y, z, then largest x, y, z, metres in the object's frame (z along the
+    """Keep the points in a box: smallest x, y, z, then largest x, y, z, metres in the object frame (z along the
     turntable's axis, 0 on the disc)."""
     roi_cylinder: tuple[float, float, float, float, float] | None = None
-    """Keep what lies in an upright cylinder: x and y of its axis, radius, lowest and highest z, metres."""
+    """Keep the points in an upright cylinder: x and y of its axis, radius, lowest and highest z, metres."""
     roi_masks: Path | None = None
-    """Keep what you painted: a folder of pictures named as the dataset's masks, for one or more frames, white where
-    the region is. A point stays that lies in white in every such frame that sees it, and is seen in one."""
+    """Keep the points in painted regions: a folder of pictures named as the dataset's masks, for one or more frames,
+    white in the region. A point is kept if it is white in every such frame that sees it, and at least one sees it."""
     keep_turntable: bool = False
-    """Keep the container and the turntable, which are cut away otherwise."""
+    """Keep the container and the turntable, which are cut away by default."""
     remove_outliers: bool = True
     """Remove points that lie unusually far from their neighbours."""
     std_ratio: float = 10.0
     """How many standard deviations above the average distance make an outlier."""
     reorient_normals: bool = True
-    """Turn the normals to the side that cameras look at."""
+    """Turn the normals towards the camera."""
     normal_method: Literal["open3d", "model_output"] = "model_output"
-    """Where normals come from: the slope of the model's density, or a plane through neighbouring points (open3d)."""
+    """Normals from neighbouring points (open3d), or from the model."""
     normal_output_name: str = "normals"
-    """Which of the model's normals: normals is the slope of the density, which every model has; pred_normals only a
-    model trained to predict them."""
+    """Which of the model's normals: normals is the density gradient; pred_normals exists only in a model trained to
+    predict normals."""
     depth_output_name: str = "depth"
-    """Which of the model's depths the surface is sought around: depth (the median) or expected_depth."""
+    """Which of the model's depths the surface is searched around: depth (the median) or expected_depth."""
     rgb_output_name: str = "rgb"
-    """Which of the model's outputs is shown as red, green, blue: rgb is the pseudo-RGB of the spectra."""
+    """Which of the model's outputs gives the colours: rgb is the pseudo-RGB of the spectra."""
     obb_center: Vector | None = None
-    """Centre of an oriented box to crop to, in nerfstudio's scene units; it takes all three of these options."""
+    """Centre of an oriented box to crop to, in nerfstudio's scene units; needs all three obb options."""
     obb_rotation: Vector | None = None
     """Rotation of that box: roll, pitch, yaw in radians."""
     obb_scale: Vector | None = None
@@ -58,8 +65,8 @@ class CloudOptions:
     """Rays rendered at a time; fewer need less memory."""
 
     def __post_init__(self) -> None:
-        crop = (self.obb_center, self.obb_rotation, self.obb_scale)
-        if any(part is None for part in crop) and any(part is not None for part in crop):
+        oriented_box = (self.obb_center, self.obb_rotation, self.obb_scale)
+        if any(part is None for part in oriented_box) and any(part is not None for part in oriented_box):
             raise InputError("--obb-center, --obb-rotation and --obb-scale belong together; give all three or none.")
         if self.num_points < 1 or self.num_rays_per_batch < 1:
             raise InputError("--num-points and --num-rays-per-batch must be at least 1.")
@@ -75,10 +82,48 @@ class CloudOptions:
 
     @classmethod
     def from_nerfstudio(cls, options: Any) -> CloudOptions:
-        """The same choices as nerfstudio's `ExportPointCloud` holds; what it does not know keeps its default.
+        """The options of nerfstudio's `ExportPointCloud`; all others keep their defaults.
 
         Raises:
-            InputError: they contradict each other.
+            InputError: options contradict each other.
         """
         shared = (field.name for field in fields(cls) if hasattr(options, field.name))
         return cls(**{name: getattr(options, name) for name in shared})
+
+
+def select_bands(wavelengths_nm: Float[np.ndarray, "bands"], words: Sequence[str]) -> Int[np.ndarray, "selected"]:
+    """Indices, ascending, of the bands that ``--bands`` names; all bands without a word.
+
+    Args:
+        wavelengths_nm: band centres.
+        words: wavelengths in nm (``"670"``: the nearest band) and ranges (``"600-700"``: every band in it).
+
+    Raises:
+        InputError: a word is neither, or there is no such band.
+
+    Example:
+        >>> select_bands(np.array([500.0, 600.0, 650.0, 700.0]), ["600-660", "700"])
+        array([1, 2, 3])
+    """
+    if not words:
+        return np.arange(len(wavelengths_nm))
+    selected: set[int] = set()
+    for word in words:
+        if match := _RANGE.fullmatch(word):
+            low, high = float(match[1]), float(match[2])
+            inside = np.flatnonzero((wavelengths_nm >= low) & (wavelengths_nm <= high))
+            if len(inside) == 0:
+                raise InputError(
+                    f"--bands {word}: the bands go from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm and "
+                    "none lies in this range; give another one, the smaller wavelength first."
+                )
+            selected.update(inside.tolist())
+        else:
+            try:
+                wavelength_nm = float(word)
+            except ValueError as error:
+                raise InputError(
+                    f"--bands {word}: is neither a wavelength in nm, such as 670, nor a range, such as 600-700."
+                ) from error
+            selected.update(require_bands(wavelengths_nm, [wavelength_nm], f"--bands {word}").tolist())
+    return np.array(sorted(selected))

@@ -1,4 +1,4 @@
-"""Anybody's PLY file, a cloud or a mesh, with spectra added to its points; all else in it is kept."""
+"""Add spectra to the points of any PLY file, a cloud or a mesh; everything else in it is kept."""
 
 from __future__ import annotations
 
@@ -6,27 +6,29 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import estimate_normals
 from hsi_sc_nerf.export.ply import band_property_names
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.meshes.mesh import ply_triangles
+from hsi_sc_nerf.meshes.mesh import Mesh, ply_triangles
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
-_BLANK = 64
-"""Grey of points without a spectrum, where the file has no colours of its own."""
+_NO_SPECTRUM_GREY = 64
+"""Colour of points without a spectrum, if the file has no colours of its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlyPoints:
-    """A PLY file that has points.
+    """A PLY file with points.
 
     Attributes:
         path: the file.
-        content: all of it.
+        content: all of its elements.
     """
 
     path: Path
@@ -36,27 +38,23 @@ class PlyPoints:
         return self.content["vertex"].count
 
     def positions(self) -> Float[np.ndarray, "n 3"]:
-        """Of the points, in the file's unit."""
+        """Positions of the points, in the file's unit."""
         return self._columns(("x", "y", "z"))
 
     def normals(self) -> Float[np.ndarray, "n 3"]:
-        """Unit normals, to either side: the file's, else the faces', else those of neighbouring points.
+        """Unit normals, to either side: the file's, or else of the faces, or else of neighbouring points.
 
-        0 for a point that has none, such as a vertex of no face.
+        They are 0 for a point without one, such as a vertex of no face.
 
         Raises:
-            InputError: the faces make no sense.
+            InputError: the faces do not refer to vertices of the file.
         """
         if self.has(_NORMAL):
             normals = self._columns(_NORMAL)
         elif len(triangles := self._triangles()):
-            import trimesh
-
-            normals = np.array(trimesh.Trimesh(self.positions(), triangles, process=False).vertex_normals)
+            normals = Mesh(self.positions(), triangles).area_weighted_normals()
         else:
-            from hsi_sc_nerf.surface.outliers import estimate_normals
-
-            normals = estimate_normals(self.positions(), facing=np.zeros((len(self), 3)))
+            normals = estimate_normals(self.positions())
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
 
@@ -64,10 +62,10 @@ class PlyPoints:
         """Whether the points have properties of these names."""
         return set(names) <= {column.name for column in self.content["vertex"].properties}
 
-    def _columns(self, names: tuple[str, ...]) -> np.ndarray:
+    def _columns(self, names: tuple[str, ...]) -> Float[np.ndarray, "n columns"]:
         return np.stack([np.asarray(self.content["vertex"][name], float) for name in names], axis=1)
 
-    def _triangles(self) -> np.ndarray:
+    def _triangles(self) -> Int[np.ndarray, "t 3"]:
         try:
             return ply_triangles(self.content)
         except PlyParseError as error:
@@ -78,7 +76,7 @@ def read_points(path: Path) -> PlyPoints:
     """Read a PLY file of any kind: ASCII or binary, with or without faces.
 
     Raises:
-        InputError: it is missing, is no PLY, or has no points, or such that hold more than numbers.
+        InputError: the file is missing, is no PLY, has no points, or its points hold lists or are not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give a point cloud or a mesh as PLY.")
@@ -93,34 +91,32 @@ def read_points(path: Path) -> PlyPoints:
     if lists:
         raise InputError(f"{path}: its points hold lists ({', '.join(lists)}); save it without them.")
     if not np.isfinite(points.positions()).all():
-        raise InputError(f"{path}: some points are not at finite places; remove them.")
+        raise InputError(f"{path}: some points have no finite position; remove them.")
     return points
 
 
 class SpectralColumns:
-    """The points of a file with room for spectra, which are written to it as they come.
+    """The points of a file with columns for spectra, which are filled row by row and then written.
 
     Args:
         points: the file.
         wavelengths_nm: band centres.
-        extra: further columns (float).
+        extra: names of further columns (float).
     """
 
     def __init__(self, points: PlyPoints, wavelengths_nm: Float[np.ndarray, "bands"], extra: tuple[str, ...]) -> None:
+        self._points = points
         bands = band_property_names(wavelengths_nm)
-        ours = [*bands, *extra]
-        given = points.content["vertex"].data
+        vertices = points.content["vertex"].data
         self._normals_missing, self._colours_missing = not points.has(_NORMAL), not points.has(_COLOUR)
         added = [(name, "<f4") for name in _NORMAL if self._normals_missing]
         added += [(name, "u1") for name in _COLOUR if self._colours_missing]
-        kept = [name for name in given.dtype.names if name not in (*ours, *dict(added))]
-        layout = [(name, given.dtype[name]) for name in kept]
-        self._points = points
-        layout += added
-        self._rows = np.zeros(len(points), [*layout, *((name, "<f4") for name in ours)])
+        kept = [name for name in vertices.dtype.names if name not in (*bands, *extra, *dict(added))]
+        layout = [*((name, vertices.dtype[name]) for name in kept), *added]
+        self._rows = np.zeros(len(points), [*layout, *((name, "<f4") for name in (*bands, *extra))])
         for name in kept:
-            self._rows[name] = given[name]
-        # The bands stand next to each other: one array without a copy.
+            self._rows[name] = vertices[name]
+        # The bands are adjacent in memory, so one view of the bytes holds all of them.
         offset = np.dtype(layout).itemsize
         as_bytes = self._rows.view(np.uint8).reshape(len(points), -1)
         self._spectra = as_bytes[:, offset : offset + 4 * len(bands)].view("<f4")
@@ -133,28 +129,31 @@ class SpectralColumns:
         rgb_bands: list[int],
         extra: dict[str, Float[np.ndarray, "n"]],
     ) -> None:
-        """Set spectra and extra columns of some points, and normals and pseudo-RGB where the file has none."""
+        """Set spectra and extra columns of rows, and normals and pseudo-RGB if the file has none."""
         self._spectra[rows] = spectra
+        columns = dict(extra)
         if self._normals_missing:
-            for name, column in zip(_NORMAL, normals.T, strict=True):
-                self._rows[name][rows] = column
-        for name, values in extra.items():
-            self._rows[name][rows] = values
+            columns |= zip(_NORMAL, normals.T, strict=True)
         if self._colours_missing:
-            shown = np.clip(spectra[:, rgb_bands] * 255.0, 0.0, 255.0)
-            for name, column in zip(_COLOUR, shown.T, strict=True):
-                self._rows[name][rows] = np.where(np.isnan(column), _BLANK, column).round()
+            colours = spectra[:, rgb_bands]
+            known = np.isfinite(colours)
+            colours = np.where(known, to_8_bit(np.where(known, colours, 0.0)), _NO_SPECTRUM_GREY)
+            columns |= zip(_COLOUR, colours.T, strict=True)
+        for name, values in columns.items():
+            self._rows[name][rows] = values
 
     def write(self, path: Path) -> None:
         """Write the file with its new columns as binary PLY, whole or not at all.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
-        given = self._points.content
+        content = self._points.content
         elements = [
             PlyElement.describe(self._rows, "vertex") if element.name == "vertex" else element
-            for element in given.elements
+            for element in content.elements
         ]
         with atomic_write(path) as (temporary,):
-            PlyData(elements, byte_order="<", comments=given.comments, obj_info=given.obj_info).write(str(temporary))
+            PlyData(elements, byte_order="<", comments=content.comments, obj_info=content.obj_info).write(
+                str(temporary)
+            )

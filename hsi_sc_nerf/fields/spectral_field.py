@@ -1,8 +1,9 @@
-"""Nerfacto's field with a spectrum instead of a colour: the variant C1, sigma0 of HS-NeRF that the paper follows.
+"""Nerfacto's field with a spectrum instead of a colour, its variant with several densities, and the proposals.
 
-One density that does not depend on wavelength (paper, section "Model Formulation"), and an n-channel radiance that
-depends on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid; or
-the channels are coefficients of a spectral basis, linear so that they can be composited before they are decoded.
+The paper (section "Model Formulation") follows the variant C1, sigma_0 of HS-NeRF (Chen et al. 2024, "Hyperspectral
+Neural Radiance Fields", arXiv 2403.14839): one density for all wavelengths, and a radiance of n channels that depends
+on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid; or the
+channels are coefficients of a spectral basis, linear so that they can be composited before they are decoded.
 """
 
 from __future__ import annotations
@@ -23,67 +24,29 @@ from torch import Tensor, nn
 from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
 BRIGHTNESS_GAIN = 0.05
-
-
-def grid_positions(
-    positions: Float[Tensor, "*bs 3"], aabb: Float[Tensor, "2 3"], spatial_distortion: SpatialDistortion | None
-) -> Float[Tensor, "*bs 3"]:
-    """Scene positions in the hash grid's unit cube: the scene box, or all of space as the distortion contracts it.
-
-    Args:
-        positions: scene units.
-        aabb: scene box; what lies outside it lies outside the unit cube.
-        spatial_distortion: into a ball or cube of radius 2, as nerfstudio's `SceneContraction`; None for the box.
-    """
-    if spatial_distortion is None:
-        return SceneBox.get_normalized_positions(positions, aabb)
-    return (spatial_distortion(positions) + 2.0) / 4.0
-
-
-def _zeroed_outside(positions: Float[Tensor, "*bs 3"]) -> tuple[Float[Tensor, "*bs 3"], Float[Tensor, "*bs 1"]]:
-    """Grid positions, 0 outside the unit cube, and 1 inside it, 0 outside."""
-    inside = ((positions > 0.0) & (positions < 1.0)).all(dim=-1, keepdim=True)
-    return positions * inside, inside.to(positions)
-
-
-class SlowBrightness(nn.Module):
-    """Slow down how fast the first coefficient, a spectrum's brightness, is learned.
-
-    As it stands it is learned far faster than the density, and all ends worse, over the whole frame too: it seems
-    that brightness explains the views before the surface is found. (Pear, 36 frames of 128 x 128, 400 steps,
-    held-out RMSE: 0.052 as it stands, 0.033 with this; 0.038 with all coefficients slowed alike, 0.035 with the
-    direct head, whose steps take a fifth more time. Single runs; another seed moves them by 0.001.)
-
-    Args:
-        rank: number of coefficients.
-    """
-
-    gains: Tensor
-
-    def __init__(self, rank: int) -> None:
-        super().__init__()
-        gains = torch.ones(rank)
-        gains[0] = BRIGHTNESS_GAIN
-        self.register_buffer("gains", gains, persistent=False)
-
-    def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
-        """Coefficients from what the network emits."""
-        return raw * self.gains
+"""Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
+explains the views before a surface forms (docs/dead_ends.md)."""
 
 
 class SpectralField(NerfactoField):
-    """Nerfacto's field whose radiance head has one channel a band, or one a coefficient of a spectral basis.
+    """Nerfacto's field whose radiance head has a channel for each band, or for each coefficient of a spectral basis.
 
     Args:
-        aabb: scene box, (2, 3), scene units; it bounds the field unless a ``spatial_distortion`` is given.
+        aabb: scene box, scene units; it bounds the field unless a ``spatial_distortion`` is given.
         num_bands: bands of the spectra, the channels of the direct head.
         coefficient_start: coefficients of the mean spectrum in a basis (`SpectralSubspace.mean_coefficients`): the
             head has a linear channel for each and begins near these values. None: the direct head, whose channels
             end in a sigmoid.
-        view_dependent: let spectra depend on the direction from which they are seen.
+        view_dependent: whether spectra depend on the viewing direction.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
-        **nerfacto: everything else that `NerfactoField` takes.
+        **nerfacto: other arguments of `NerfactoField`.
+
+    Example:
+        >>> box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        >>> field = SpectralField(box, num_bands=204, num_images=54, implementation="torch")
+        >>> field.density_fn(torch.zeros(1024, 48, 3)).shape
+        torch.Size([1024, 48, 1])
     """
 
     def __init__(
@@ -109,25 +72,25 @@ class SpectralField(NerfactoField):
             implementation="torch",
         )
         if coefficient_start is not None:
-            slow = SlowBrightness(len(coefficient_start))
-            self.mlp_head.out_activation = slow
+            gain = CoefficientGain(len(coefficient_start))
+            self.mlp_head.out_activation = gain
             last = self.mlp_head.layers[-1]
             assert isinstance(last, nn.Linear)
             with torch.no_grad():
-                last.bias.copy_(coefficient_start / slow.gains)
+                last.bias.copy_(coefficient_start / gain.gains)
         fuse_hash_encodings(self)
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
-        """Density and geometry features; positions carry a gradient only where normals are asked for."""
+        """Density and geometry features; positions carry a gradient only where normals are needed."""
         hidden, inside = self._hidden(ray_samples)
         return self._density(hidden[..., :1], inside), hidden[..., 1:]
 
     def _hidden(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs hidden"], Float[Tensor, "*bs 1"]]:
-        """What the base network says of the samples, and which of them (1) lie inside the scene."""
+        """Outputs of the base network, and 1 for samples inside the scene, 0 for the others."""
         positions = ray_samples.frustums.get_positions()
         if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
             positions.requires_grad_()
-        # nerfacto takes grid positions here, and its normals are skewed where the grid is.
+        # Normals are gradients in the scene. nerfacto's are gradients in the grid, skewed where that is not a cube.
         self._sample_locations = positions  # type: ignore[assignment]
         in_grid, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
         hidden = self.mlp_base(in_grid.view(-1, 3))
@@ -136,7 +99,7 @@ class SpectralField(NerfactoField):
         return hidden, inside
 
     def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
-        """Logarithm of the density up to a constant: what normals are gradients of."""
+        """Logarithm of the density up to a constant; normals are its gradients."""
         return hidden[..., :1]
 
     def _density(
@@ -147,10 +110,7 @@ class SpectralField(NerfactoField):
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Spectra (and predicted normals) at samples along rays.
-
-        The viewing direction is encoded once a ray: nerfacto does it at every sample, which shows without a GPU.
-        """
+        """Spectra or coefficients (and predicted normals) at samples along rays."""
         assert density_embedding is not None
         outputs: dict[FieldHeadNames, Tensor] = {}
         if self.use_pred_normals:
@@ -159,17 +119,18 @@ class SpectralField(NerfactoField):
             outputs[FieldHeadNames.PRED_NORMALS] = self.field_head_pred_normals(hidden)
         inputs = [density_embedding]
         if self.view_dependent:
+            # Encoded once a ray, not at every sample as in nerfacto, which saves time without a GPU.
             directions = get_normalized_directions(ray_samples.frustums.directions[..., 0, :])
             encoded = self.direction_encoding(directions)[..., None, :]
             inputs.insert(0, encoded.expand(*density_embedding.shape[:-1], -1))
         if self.embedding_appearance is not None:
             inputs.append(self._appearance(ray_samples).expand(*density_embedding.shape[:-1], -1))
-        # tiny-cuda-nn's networks emit half precision, and this one takes what it was made with.
+        # tiny-cuda-nn's encodings are in half precision, the head's weights are not.
         outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
         return outputs
 
     def _appearance(self, ray_samples: RaySamples) -> Float[Tensor, "#rays #samples embedding"]:
-        """The view's appearance in training; outside it the average or zeros, as nerfacto's option says."""
+        """Embedding of the training view; in evaluation the average embedding or zeros, as in nerfacto."""
         assert self.embedding_appearance is not None
         assert ray_samples.camera_indices is not None
         if self.training:
@@ -186,10 +147,57 @@ class SpectralField(NerfactoField):
         return gradient
 
 
+class BandGroupField(SpectralField):
+    """A field with a density for each group of bands (HS-NeRF's variant sigma_n), for translucent objects.
+
+    Light of one wavelength may pass where light of another is absorbed. The mean of the groups' densities guides the
+    proposals and gives depth, normals and accumulation. The channels of the optical depths follow those of the
+    spectrum, for `composite_band_groups`. The head is the direct one: coefficients of a basis that spans all groups
+    cannot be composited group by group.
+
+    Args:
+        aabb: scene box, scene units.
+        num_bands: bands of the spectra.
+        num_groups: groups of neighbouring bands; with one group, the field is a `SpectralField`.
+        geo_feat_dim: features of the radiance head beside the groups' own.
+        **field: other arguments of `SpectralField`, without ``coefficient_start``.
+    """
+
+    group_sizes: tuple[int, ...]
+
+    def __init__(
+        self, aabb: Float[Tensor, "2 3"], num_bands: int, num_groups: int, geo_feat_dim: int = 15, **field
+    ) -> None:
+        super().__init__(aabb, num_bands, geo_feat_dim=geo_feat_dim + num_groups - 1, **field)
+        self.group_sizes = group_sizes(num_bands, num_groups)
+
+    def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
+        groups = hidden[..., : len(self.group_sizes)]
+        return (groups - torch.tensor(float(groups.shape[-1])).log()).logsumexp(dim=-1, keepdim=True)
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
+        """Mean density, and the groups' densities followed by the geometry features."""
+        hidden, inside = self._hidden(ray_samples)
+        densities = self._density(hidden[..., : len(self.group_sizes)], inside)
+        return densities.mean(dim=-1, keepdim=True), torch.cat([densities, hidden[..., 1:]], dim=-1)
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
+    ) -> dict[FieldHeadNames, Tensor]:
+        """Spectra followed by optical depths (and predicted normals) at samples along rays."""
+        assert density_embedding is not None
+        assert ray_samples.deltas is not None
+        groups = len(self.group_sizes)
+        outputs = super().get_outputs(ray_samples, density_embedding[..., groups:])
+        depths = density_embedding[..., :groups] * ray_samples.deltas
+        outputs[FieldHeadNames.RGB] = torch.cat([outputs[FieldHeadNames.RGB], depths], dim=-1)
+        return outputs
+
+
 class SpectralProposalField(HashMLPDensityField):
     """Nerfacto's proposal density with the fused hash grid.
 
-    Positions are detached: proposals say where to look, and the poses are refined by what the spectral field sees.
+    Positions are detached, so that the poses are refined by the spectral field alone.
     """
 
     def __init__(self, *args, **kwargs) -> None:
@@ -202,3 +210,55 @@ class SpectralProposalField(HashMLPDensityField):
         positions, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
         before_activation = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
         return self.average_init_density * trunc_exp(before_activation.to(positions)) * inside, None
+
+
+class CoefficientGain(nn.Module):
+    """Output layer of a basis head: the first coefficient, a spectrum's brightness, is learned slowly.
+
+    Args:
+        rank: number of coefficients.
+    """
+
+    gains: Tensor
+
+    def __init__(self, rank: int) -> None:
+        super().__init__()
+        gains = torch.ones(rank)
+        gains[0] = BRIGHTNESS_GAIN
+        self.register_buffer("gains", gains, persistent=False)
+
+    def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
+        """Coefficients from the outputs of the network."""
+        return raw * self.gains
+
+
+def group_sizes(num_bands: int, num_groups: int) -> tuple[int, ...]:
+    """Numbers of neighbouring bands in each group, as even as possible.
+
+    Raises:
+        ValueError: the number of groups is not between 1 and that of the bands.
+    """
+    if not 1 <= num_groups <= num_bands:
+        raise ValueError(f"{num_bands} bands cannot be divided into {num_groups} groups")
+    return tuple(num_bands * (i + 1) // num_groups - num_bands * i // num_groups for i in range(num_groups))
+
+
+def grid_positions(
+    positions: Float[Tensor, "*bs 3"], aabb: Float[Tensor, "2 3"], spatial_distortion: SpatialDistortion | None
+) -> Float[Tensor, "*bs 3"]:
+    """Scene positions in the hash grid's unit cube, which holds the scene box or, with a distortion, all of space.
+
+    Args:
+        positions: scene units.
+        aabb: scene box, mapped to the unit cube.
+        spatial_distortion: into a ball or cube of radius 2, as nerfstudio's `SceneContraction`; None for the box.
+    """
+    if spatial_distortion is None:
+        return SceneBox.get_normalized_positions(positions, aabb)
+    return (spatial_distortion(positions) + 2.0) / 4.0
+
+
+def _zeroed_outside(positions: Float[Tensor, "*bs 3"]) -> tuple[Float[Tensor, "*bs 3"], Float[Tensor, "*bs 1"]]:
+    """Grid positions, 0 outside the unit cube, and 1 inside it, 0 outside."""
+    inside = ((positions > 0.0) & (positions < 1.0)).all(dim=-1, keepdim=True)
+    return positions * inside, inside.to(positions)

@@ -1,4 +1,4 @@
-"""Triangle meshes as plain arrays: area, volume, casting rays at them, and the triangles of PLY files."""
+"""Triangle meshes as plain arrays: area, volume, normals, ray casting, and the triangles of PLY files."""
 
 from __future__ import annotations
 
@@ -13,9 +13,18 @@ if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh in metres; triangles run counter-clockwise seen from outside."""
+    """A triangle mesh in metres; triangles run counter-clockwise seen from outside.
+
+    Area, volume and the test for holes are plain sums: trimesh gives the same figures, but takes three to eight times
+    as long and seconds to import.
+
+    Example:
+        >>> triangle = Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))
+        >>> triangle.area_m2()
+        0.5
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     triangles: Int[np.ndarray, "t 3"]
@@ -45,16 +54,29 @@ class Mesh:
         forward, backward = np.sort(start * n + end), np.sort(end * n + start)
         return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
+    def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
+        """Outward unit normal of each vertex: the mean of its triangles' normals, weighted by area.
+
+        A vertex of no triangle has the normal 0.
+        """
+        normals = self.area_weighted_normals()
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+    def area_weighted_normals(self) -> Float[np.ndarray, "v 3"]:
+        """Sum of the outward normals of each vertex's triangles, each as long as twice the triangle's area."""
+        corners, doubled = self.triangles.ravel(), np.repeat(self._doubled_normals(), 3, axis=0)
+        return np.stack([np.bincount(corners, axis, len(self.vertices)) for axis in doubled.T], axis=-1)
+
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return np.cross(b - a, c - a)
 
 
 def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:
-    """Triangles of a PLY file that has vertices, larger faces cut into fans; a point cloud has 0.
+    """Triangles of a PLY file with vertices; polygons are cut into fans, and a point cloud has no triangles.
 
     Raises:
-        PlyParseError: the faces do not name their vertices, or name some that are not there.
+        PlyParseError: the faces have no list of vertices, or refer to vertices that are not in the file.
     """
     if "face" not in content or not content["face"].count:
         return np.zeros((0, 3), np.int64)
@@ -76,8 +98,8 @@ def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> RaycastingScene:
-    """A mesh as Open3D casts rays at it and measures distances to it, in single precision."""
-    from open3d.core import Tensor  # heavy, and training and evaluation do without it
+    """A mesh as Open3D's scene for casting rays and measuring distances, in single precision."""
+    from open3d.core import Tensor  # heavy; training and evaluation do without it
     from open3d.t.geometry import RaycastingScene
 
     scene = RaycastingScene()

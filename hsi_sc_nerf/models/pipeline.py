@@ -1,8 +1,7 @@
-"""nerfstudio's pipeline, whose evaluation uses averaged weights where there are any and holds for a single view."""
+"""nerfstudio's pipeline, which refuses weights of another dataset and logs the spectra of some pixels."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,9 @@ from torch import Tensor
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.models.training_log import draw_spectra
-from hsi_sc_nerf.models.weight_average import WeightAverage
 
-# Buffers that place the scene in the model: weights mean nothing in another box.
-_PLACES = ("aabb", "axis_origin")
+SCENE_BUFFERS = ("aabb", "axis_origin")
+"""Buffers that place the scene; weights are meaningless in another scene box."""
 
 
 @dataclass
@@ -28,30 +26,25 @@ class SpectralPipelineConfig(VanillaPipelineConfig):
 
 
 class SpectralPipeline(VanillaPipeline):
-    """Data and model of a run, and how the model is evaluated.
-
-    Attributes:
-        weight_average: what is evaluated in place of the weights; the trainer sets it. None: the weights.
-    """
+    """Data and model of a run."""
 
     datamanager: SpectralDataManager
-    weight_average: WeightAverage | None = None
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint's weights, if they belong to these settings and to the dataset as it is.
+        """Load the weights of a checkpoint that was made with the same model settings and dataset.
 
-        nerfstudio would load what fits and leave the rest; a scene box that moved since training would fit.
+        nerfstudio would load the weights that fit, into a scene box that may have moved since.
         """
         own = self.state_dict()
-        unlike = own.keys() ^ loaded_state.keys()
-        if unlike:
+        different = own.keys() ^ loaded_state.keys()
+        if different:
             raise SystemExit(
                 "hsi-sc-nerf: the checkpoint was made with other settings of the model "
-                f"({', '.join(sorted(unlike)[:3])}); take those of the config.yml beside it."
+                f"({', '.join(sorted(different)[:3])}); take those of the config.yml beside it."
             )
         if any(
             value.shape != loaded_state[name].shape
-            or (name.rpartition(".")[2] in _PLACES and not torch.equal(value.cpu(), loaded_state[name].cpu()))
+            or (name.rpartition(".")[2] in SCENE_BUFFERS and not torch.equal(value.cpu(), loaded_state[name].cpu()))
             for name, value in own.items()
         ):
             raise SystemExit(
@@ -60,20 +53,10 @@ class SpectralPipeline(VanillaPipeline):
             )
         super().load_pipeline(loaded_state, step)
 
-    def averaged(self) -> AbstractContextManager[None]:
-        """The model has its averaged weights within this context, where there are any."""
-        return nullcontext() if self.weight_average is None else self.weight_average.in_use()
-
-    def get_eval_loss_dict(self, step: int) -> tuple[dict, dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs, losses and metrics of random pixels of held-out views."""
-        with self.averaged():
-            return super().get_eval_loss_dict(step)
-
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics and pictures of one held-out view, and the spectra of some of its pixels."""
-        with self.averaged():
-            metrics, images = super().get_eval_image_metrics_and_images(step)
-            images["spectra"] = self._spectra_picture()
+        metrics, images = super().get_eval_image_metrics_and_images(step)
+        images["spectra"] = self._spectra_picture()
         return metrics, images
 
     def _spectra_picture(self) -> Float[Tensor, "h w 3"]:
@@ -98,13 +81,12 @@ class SpectralPipeline(VanillaPipeline):
         output_path: Path | None = None,
         get_std: bool = False,
     ) -> dict[str, float]:
-        """Mean and standard deviation of each metric over the views; the spread of one view is 0.
+        """Mean and standard deviation of each metric over the views.
 
-        nerfstudio's is NaN there, which no JSON reader takes.
+        The standard deviation over one view is 0; nerfstudio's is NaN, which JSON does not allow.
         """
-        with self.averaged():
-            metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
-        # nerfstudio's loader counts all views of its dataset, whichever it is to give.
+        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
+        # The length of nerfstudio's loader is that of its dataset, not of the views that it yields.
         if get_std and len(getattr(data_loader, "image_indices", data_loader)) == 1:
             metrics |= dict.fromkeys((name for name in metrics if name.endswith("_std")), 0.0)
         return metrics

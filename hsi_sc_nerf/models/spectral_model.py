@@ -1,16 +1,14 @@
-"""The model: nerfacto with a spectrum a ray, before the chamber that stands still behind the turntable."""
+"""The model: nerfacto with a spectrum instead of a colour, and the chamber as the background."""
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
@@ -18,10 +16,11 @@ from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRen
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
-from nerfstudio.models.nerfacto import NerfactoModel
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.cameras import CAMERA_ROTATION
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
 from hsi_sc_nerf.errors import InputError
@@ -32,24 +31,104 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_rmse,
     squared_error_map,
 )
-from hsi_sc_nerf.fields.band_groups import BandGroupField, BandGroupSum
-from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
-from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
-from hsi_sc_nerf.models.compositing import SumBeforeLastSample, WeightedSum
-from hsi_sc_nerf.models.from_dataset import band_weights, chamber_background, field_grid
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, charbonnier_loss, hsi_loss
-from hsi_sc_nerf.models.pose_refinement import PoseRefinement
-from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
+from hsi_sc_nerf.fields.grid_size import grid_for_dataset
+from hsi_sc_nerf.fields.spectral_field import BandGroupField, SpectralField, SpectralProposalField
+from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
+from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.renderers import BandGroupRenderer, BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
-from hsi_sc_nerf.viewer.panel import SpectralPanel
+
+
+@dataclass
+class SpectralModelConfig(NerfactoModelConfig):
+    """Configuration of the spectral model; defaults that differ from nerfacto's are those of a turntable scene."""
+
+    _target: type = field(default_factory=lambda: SpectralModel)
+    head: Literal["direct", "basis"] = "basis"
+    """Output of the field at a sample. direct: the reflectance in every band. basis: a few coefficients in a basis of
+    spectra that is found in the training pixels; they are decoded to all bands once a pixel."""
+    basis_rank: int | None = None
+    """Coefficients of the basis head. None: as many as are above the noise of the training pixels."""
+    background: BackgroundKind = "image"
+    """Spectrum of the light that the object lets through. image: a picture of the chamber, which stands still with
+    the camera, taken from the frames. spectrum: the chamber's median spectrum. last-sample: that of the last sample
+    of the ray, as in nerfacto."""
+    angular_loss: Literal["cosine", "angle"] = "angle"
+    """Loss of the spectral angle. cosine: one minus its cosine (the paper), whose gradient vanishes at small angles.
+    angle: the angle in radians, whose weight has to be about ten times smaller."""
+    angular_loss_mult: float = 0.03
+    """Weight of the spectral angle's loss."""
+    hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
+    """Weight of the reflectance errors over pixels and bands."""
+    interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
+    """Weight of the proposal loss."""
+    distortion_loss_mult: float = 0.02
+    """Weight of the distortion loss, which concentrates the density along a ray. nerfacto's 0.002 leaves surfaces
+    thicker, and with 0.2 no surface forms (docs/accuracy_and_time.md)."""
+    orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
+    """Weight of the orientation loss on computed normals."""
+    pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
+    """Weight of the predicted-normal loss."""
+    view_dependent: bool = True
+    """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
+    stand still while the object turns."""
+    predict_normals: bool = False
+    """Predict normals, as the paper does. Steps take half again as long, and the cloud's normals are the density's in
+    any case."""
+    near_plane: float = 0.01
+    """Least distance of samples from the camera, scene units."""
+    disable_scene_contraction: bool = True
+    """True: the scene is the box of everything that turns. False: an unbounded scene whose rays end at the far plane,
+    to be combined with the data parser's --scene cameras."""
+    proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
+    """Spacing of the first samples; uniform suits rays that are bounded by the box."""
+    num_proposal_samples_per_ray: tuple[int, ...] = (48, 24)
+    """Samples a ray for each proposal network; a box of 0.2 m needs far fewer than an unbounded scene."""
+    num_nerf_samples_per_ray: int = 24
+    """Samples a ray for the spectral field."""
+    proposal_net_args_list: list[dict] = field(
+        default_factory=lambda: [
+            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
+            for max_res in (64, 128)
+        ]
+    )
+    """The proposal networks, with smaller tables than nerfacto's for a scene of 0.2 m."""
+    match_resolution: bool = True
+    """Size the field's hash grid by what a pixel resolves in the scene box. False: by num-levels, max-res and
+    log2-hashmap-size."""
+    average_init_density: float = 0.1
+    """Initial density; the box starts nearly empty."""
+    use_appearance_embedding: bool = False
+    """Learn an appearance of each view. Calibrated reflectance under fixed lamps needs none."""
+    implementation: Literal["tcnn", "torch"] = "torch"
+    """Networks and grids. "torch" works with and without a GPU."""
+    eval_num_rays_per_chunk: int = 4096
+    """Rays rendered at a time."""
+    density_groups: int = 1
+    """Groups of neighbouring bands with a density of their own, for translucent objects (direct head only). 1: one
+    density for all bands."""
+    camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
+    """Refinement of the measured poses."""
+
+    def __post_init__(self) -> None:
+        if self.density_groups < 1:
+            raise SystemExit(
+                f"hsi-sc-nerf: --pipeline.model.density-groups is {self.density_groups}; take 1 at least."
+            )
+        if self.head == "basis" and (self.background == "last-sample" or self.density_groups > 1):
+            raise SystemExit(
+                "hsi-sc-nerf: --pipeline.model.head basis goes neither with the background last-sample nor with "
+                "density groups, which need a value in every band at each sample; take --pipeline.model.head direct."
+            )
 
 
 class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
-    Outputs of a ray: ``spectral`` (bands) beside nerfacto's own, with ``rgb`` a pseudo-RGB of three bands.
+    It adds the output ``spectral`` (reflectance, a value a band) to nerfacto's; ``rgb`` is three of its bands.
     """
 
     config: SpectralModelConfig
@@ -58,7 +137,6 @@ class SpectralModel(NerfactoModel):
     subspace: SpectralSubspace | None
     decoder: nn.Module
     renderer_rgb: nn.Module  # type: ignore[assignment]
-    band_weights: Tensor | None
 
     def populate_modules(self) -> None:
         """Build the modules.
@@ -73,29 +151,53 @@ class SpectralModel(NerfactoModel):
         self.subspace, self.decoder = None, nn.Identity()
         if config.head == "basis":
             self.subspace = training_subspace(dataset, metadata["frames"], config.basis_rank)
-            basis = torch.from_numpy(self.subspace.scaled_basis).float()
-            self.decoder = BasisDecoder(basis, learnable=config.learn_basis)
+            self.decoder = BasisDecoder(torch.from_numpy(self.subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
-        own: dict[str, Any] = {
+        self.field = self._build_field(dataset, contraction)
+        self._build_proposals(contraction)
+        self.camera_optimizer = config.camera_optimizer.setup(
+            pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
+        )
+        if contraction is None:
+            self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
+        else:
+            self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
+        self.background = make_background(config.background, dataset, metadata["frames"])
+
+        if isinstance(self.field, BandGroupField):
+            self.renderer_rgb = BandGroupRenderer(self.field.group_sizes)
+        else:
+            self.renderer_rgb = SpectralRenderer("last-sample" if self.background is None else "none")
+        self.renderer_accumulation = AccumulationRenderer()
+        self.renderer_depth = DepthRenderer(method="median")
+        self.renderer_expected_depth = DepthRenderer(method="expected")
+        self.renderer_normals = NormalsRenderer()
+        self.normals_shader = NormalsShader()
+        self.step = 0
+
+    def _build_field(self, dataset: PackedDataset, contraction: SceneContraction | None) -> SpectralField:
+        """The spectral field, with a grid for what the camera resolves."""
+        config, num_bands = self.config, len(dataset.wavelengths_nm)
+        if config.density_groups > num_bands:
+            raise InputError(
+                f"--pipeline.model.density-groups is {config.density_groups}, but the dataset has {num_bands} bands; "
+                "take fewer groups."
+            )
+        options: dict[str, Any] = {
             "num_levels": config.num_levels,
             "max_res": config.max_res,
             "log2_hashmap_size": config.log2_hashmap_size,
         }
         if config.match_resolution:
-            grid = field_grid(dataset)
-            own = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
+            grid = grid_for_dataset(dataset)
+            options = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
         if self.subspace is not None:
-            own["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
-        if config.density_groups > len(self.wavelengths_nm):
-            raise InputError(
-                f"--pipeline.model.density-groups is {config.density_groups}, but the dataset has "
-                f"{len(self.wavelengths_nm)} bands; take fewer groups."
-            )
+            options["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
         if config.density_groups > 1:
-            own["num_groups"] = config.density_groups
-        self.field = (SpectralField if config.density_groups == 1 else BandGroupField)(
+            options["num_groups"] = config.density_groups
+        return (SpectralField if config.density_groups == 1 else BandGroupField)(
             self.scene_box.aabb,
-            num_bands=len(self.wavelengths_nm),
+            num_bands=num_bands,
             view_dependent=config.view_dependent,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
@@ -108,41 +210,8 @@ class SpectralModel(NerfactoModel):
             appearance_embedding_dim=config.appearance_embed_dim if config.use_appearance_embedding else 0,
             average_init_density=config.average_init_density,
             implementation=config.implementation,
-            **own,
+            **options,
         )
-        self._build_proposals(contraction)
-        self.camera_optimizer = config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
-        )
-        if contraction is None:
-            self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
-        else:
-            self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
-        self.background = chamber_background(config.background, dataset, metadata["frames"])
-        self.register_buffer("band_weights", band_weights(dataset) if config.weigh_bands else None, persistent=False)
-
-        if isinstance(self.field, BandGroupField):
-            self.renderer_rgb = BandGroupSum(self.field.group_sizes)
-        elif self.background is None:
-            self.renderer_rgb = SumBeforeLastSample()
-        else:
-            self.renderer_rgb = WeightedSum()
-        self.renderer_accumulation = AccumulationRenderer()
-        self.renderer_depth = DepthRenderer(method="median")
-        self.renderer_expected_depth = DepthRenderer(method="expected")
-        self.renderer_normals = NormalsRenderer()
-        self.normals_shader = NormalsShader()
-        self.panel = SpectralPanel(self.wavelengths_nm, self.num_train_data)
-        self.step = 0
-
-    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Nerfacto's groups; the basis and the background, where they learn, have rates of their own."""
-        groups = super().get_param_groups()
-        for name, module in (("basis", self.decoder), ("background", self.background)):
-            parameters = [] if module is None else list(module.parameters())
-            if parameters:
-                groups[name] = parameters
-        return groups
 
     def _build_proposals(self, contraction: SceneContraction | None) -> None:
         """Proposal networks and the sampler that uses them, as in nerfacto."""
@@ -176,34 +245,30 @@ class SpectralModel(NerfactoModel):
             initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
         )
 
-    def spectra_behind(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
-        """The chamber's reflectance behind rays as measured, before a refinement of the poses has moved them."""
+    def background_spectrum(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
+        """Reflectance of the chamber behind rays as measured, before the pose refinement; 0 without a background."""
         if self.background is None:
             return torch.zeros(*ray_bundle.shape, len(self.wavelengths_nm), device=self.device)
         return self.background(ray_bundle.directions, ray_bundle.metadata.get(CAMERA_ROTATION))
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict:  # type: ignore[override]
-        """Nerfacto's outputs with the spectrum; held-out views are corrected like training views."""
-        behind = None if self.background is None else self.spectra_behind(ray_bundle)
+        """Nerfacto's outputs and the spectrum; held-out views are corrected like training views."""
+        background = None if self.background is None else self.background_spectrum(ray_bundle)
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
         spectral, opacity = self.decoder(outputs["rgb"]), outputs["accumulation"]
         if isinstance(self.field, BandGroupField):
             spectral, opacity = spectral.chunk(2, dim=-1)
-        if behind is not None:
-            spectral = spectral + behind * (1.0 - opacity)
-        # A basis can go below black by a little.
+        if background is not None:
+            spectral = spectral + background * (1.0 - opacity)
+        # Coefficients of a basis may decode to slightly negative reflectance.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
         outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
         return outputs
 
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """A rendered camera; a viewer's with the pictures that its controls ask for."""
-        return self.panel.render(camera, partial(super().get_outputs_for_camera, obb_box=obb_box))
-
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
-        """Reflectance, and which values of it are measurements where not all are."""
+        """Measured reflectance, and which of its values are measurements (None for all)."""
         valid = batch.get("valid")
         return batch["spectral"].to(self.device), None if valid is None else valid.to(self.device)
 
@@ -211,7 +276,7 @@ class SpectralModel(NerfactoModel):
         """SAM, RMSE and PSNR of the batch over all bands, distortion, size of the pose corrections."""
         with torch.no_grad():
             target, valid = self._measured(batch)
-            # As a picture of one line.
+            # The metrics take images: the batch is one of a single line.
             line = outputs["spectral"][None], target[None], None, None if valid is None else valid[None]
             metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
@@ -226,13 +291,10 @@ class SpectralModel(NerfactoModel):
         target, valid = self._measured(batch)
         losses = {}
         if config.hsi_loss_mult > 0:
-            errors = hsi_loss if config.hsi_loss == "squared" else charbonnier_loss
-            value = errors(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
-            losses["hsi_loss"] = config.hsi_loss_mult * value
+            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target, valid=valid)
         if config.angular_loss_mult > 0:
-            angles = angular_loss if config.angular_loss == "cosine" else angle_loss
-            value = angles(outputs["spectral"], target, valid=valid, band_weights=self.band_weights)
-            losses["angular_loss"] = config.angular_loss_mult * value
+            loss = angular_loss if config.angular_loss == "cosine" else angle_loss
+            losses["angular_loss"] = config.angular_loss_mult * loss(outputs["spectral"], target, valid=valid)
         if not self.training:
             return losses
         assert metrics_dict is not None

@@ -1,4 +1,4 @@
-"""Both stages of training in one run, which goes on where it was killed and skips steps that turn non-finite."""
+"""Trainer that runs all stages in one run, resumes killed runs to the same weights and skips non-finite steps."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ from hsi_sc_nerf.models.checkpoints import (
 )
 from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
-from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
@@ -38,9 +37,7 @@ from hsi_sc_nerf.models.stages import (
     plan_within,
     step_seed,
 )
-from hsi_sc_nerf.models.training_log import stage_summary
-from hsi_sc_nerf.models.training_progress import TrainingProgress
-from hsi_sc_nerf.models.weight_average import WeightAverage
+from hsi_sc_nerf.models.training_log import TrainingProgress, stage_summary
 
 
 @dataclass
@@ -49,24 +46,20 @@ class StagedTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: StagedTrainer)
     full_frame: StageConfig = field(default_factory=full_frame_stage)
-    """First stage: whole frames, the object and its rim more often than the rest."""
+    """First stage: whole frames, with the object and its boundary sampled more often than the rest."""
     masked: StageConfig = field(default_factory=masked_stage)
-    """Second stage: the masked object, and what lies beside it."""
-    ema_decay: float | None = None
-    """Evaluate, save and export the average of the weights over the last steps instead of the last step's weights,
-    which still jitter with the random pixels. 0.99 averages over about 100 steps, beginning anew in each stage. None:
-    the last step's weights."""
+    """Second stage: the masked object, and some background rays."""
     evaluate_stages: bool = True
-    """Evaluate the held-out views at the end of each stage and keep the result beside the stage's checkpoint."""
+    """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
     max_nonfinite_steps: int = 20
-    """Stop the run after this many skipped steps in a row."""
+    """Number of consecutive skipped steps that stops the run."""
 
 
 class StagedTrainer(Trainer):
-    """Trains stage after stage.
+    """Trains one stage after the other.
 
-    What a step does follows from the step, the configuration and what a checkpoint holds: a run that was killed and
-    resumed comes to the same weights.
+    A step depends on its number, the configuration and the contents of a checkpoint only, so that a run that was
+    killed and resumed ends with the same weights.
     """
 
     config: StagedTrainerConfig
@@ -74,16 +67,14 @@ class StagedTrainer(Trainer):
     pipeline: SpectralPipeline
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up as nerfstudio does, then place the stages."""
+        """Check the settings, plan the stages, and set up as nerfstudio does."""
         if self.world_size > 1:
-            # Rays and random numbers follow from the step: every process would train on the same.
+            # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
         stages = (self.config.full_frame, self.config.masked)
         try:
             for stage in stages:
                 stage.check(self.config.optimizers)
-            if self.config.ema_decay is not None and not 0.0 < self.config.ema_decay < 1.0:
-                raise ValueError(f"--ema-decay {self.config.ema_decay} is not between 0 and 1")
             self.plan = plan_stages(stages, self.config.max_num_iterations)
         except ValueError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
@@ -100,15 +91,12 @@ class StagedTrainer(Trainer):
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
     def setup_optimizers(self) -> GuardedOptimizers:
-        """Optimisers that skip non-finite steps, and the average of what they change."""
+        """Optimisers that skip non-finite steps."""
         optimizers = GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
         self._trainable = {
             group: [parameter for parameter in parameters if parameter.requires_grad]
             for group, parameters in optimizers.parameters.items()
         }
-        if self.config.ema_decay is not None:
-            learned = {name: value for name, value in self.pipeline.named_parameters() if value.requires_grad}
-            self.pipeline.weight_average = WeightAverage(learned, self.config.ema_decay)
         return optimizers
 
     @property
@@ -116,7 +104,7 @@ class StagedTrainer(Trainer):
         return cast(SpectralModel, self.pipeline.model)
 
     def train(self) -> None:
-        """Train what is left of the plan: nerfstudio would add ``max_num_iterations`` to a resumed run."""
+        """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
             if self._loaded is not None:
                 self._keep_stage_of(self._loaded)
@@ -130,7 +118,7 @@ class StagedTrainer(Trainer):
             with TrainingProgress(self.plan.num_iterations, self._start_step) as self._progress:
                 super().train()
         except TrainingDivergedError as error:
-            # Skipped steps leave the weights as they were: these are the last good ones.
+            # Skipped steps do not change the weights, so these are the last finite ones.
             self.save_checkpoint(self.step)
             raise SystemExit(f"hsi-sc-nerf: {error}. The last good checkpoint is in {self.checkpoint_dir}") from error
         except InputError as error:
@@ -139,7 +127,7 @@ class StagedTrainer(Trainer):
             _flush_logs()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
-        """One guarded step of the stage that it belongs to."""
+        """One step of its stage."""
         stage = self.plan.at(step)
         if stage is not self._stage:
             self._enter(stage)
@@ -147,40 +135,38 @@ class StagedTrainer(Trainer):
         rates = self._set_learning_rates(stage, step)
         torch.manual_seed(step_seed(self.config.machine.seed, step))
         sampler = self._model.proposal_sampler
-        # Evaluations and the viewer move these counters, too, and no checkpoint of nerfstudio's holds them.
+        # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
         sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
         loss, loss_dict, metrics_dict = super().train_iteration(step)
 
         self._steps_since_update = sampler._steps_since_update + 1
-        if self.pipeline.weight_average is not None:
-            self.pipeline.weight_average.update(step - stage.start + 1)
-        complaint = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
-        if complaint is not None:
-            CONSOLE.print(f"[yellow]{escape(complaint)}")
+        warning = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
+        if warning is not None:
+            CONSOLE.print(f"[yellow]{escape(warning)}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            for group, rate in rates.items():  # named as nerfstudio names those of its schedules
+            for group, rate in rates.items():  # under the names of nerfstudio's own schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
         self._progress.update(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
 
     def _enter(self, stage: Stage) -> None:
-        """Begin, or go on with, ``stage``."""
-        self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_share
-        self.pipeline.datamanager.boundary_ray_fraction = stage.config.rim_share
+        """Set the rays and loss weights of ``stage``."""
+        self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_ray_fraction
+        self.pipeline.datamanager.boundary_ray_fraction = stage.config.boundary_ray_fraction
         weights: dict[str, Any] = stage.config.loss_weights()
         self._model.config = dataclasses.replace(cast(SpectralModelConfig, self.config.pipeline.model), **weights)
         self._stage = stage
 
     def _freeze(self, frozen: set[str]) -> None:
-        """Let all parameter groups learn but these."""
+        """Freeze these parameter groups, and no others."""
         if frozen == self._frozen:
             return
         for group, parameters in self._trainable.items():
             for parameter in parameters:
                 parameter.requires_grad_(group not in frozen)
                 parameter.grad = None
-        # Some modes of refinement throw away what was learned.
+        # Mode free-discarded resets the corrections when they are frozen.
         self._model.camera_optimizer.freeze("camera_opt" in frozen)
         self._frozen = frozen
 
@@ -195,21 +181,21 @@ class StagedTrainer(Trainer):
         return rates
 
     def eval_iteration(self, step: int) -> None:
-        """nerfstudio's evaluations; after the last step of a stage, what the stage leaves behind."""
+        """nerfstudio's evaluations; after the last step of a stage, its checkpoint and held-out metrics."""
         super().eval_iteration(step)
         stage = self.plan.at(step)
         if step == stage.end - 1:
             self._keep(stage)
 
     def _keep_stage_of(self, loaded: Path) -> None:
-        """Keep the stage that a loaded checkpoint completed, where its run was killed before it did so itself."""
+        """Keep the stage that a loaded checkpoint completed, if its run was killed before it did so."""
         stage = self.plan.at(self._start_step - 1)
         kept = loaded.resolve().parents[1] / f"stage-{stage.config.name}" / loaded.name
         if self._completed == stage.config.name and self._start_step == stage.end and not kept.exists():
             self._keep(stage)
 
     def _keep(self, stage: Stage) -> None:
-        """Keep the last checkpoint of a finished stage, and what it gives on the held-out views."""
+        """Keep the last checkpoint of a finished stage, and its metrics of the held-out views."""
         step = stage.end - 1
         kept = checkpoint_path(self.base_dir / f"stage-{stage.config.name}", step)
         self.save_checkpoint(step)
@@ -223,28 +209,22 @@ class StagedTrainer(Trainer):
         _flush_logs()
 
     def _after_train(self) -> None:
-        """Save, then finish as nerfstudio does, with the averaged weights where there are any."""
+        """Save, then finish as nerfstudio does."""
         self.save_checkpoint(self.step)
-        if self.pipeline.weight_average is not None:
-            self.pipeline.weight_average.swap()
-            self.pipeline.weight_average = None
         super()._after_train()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint whole or not at all, then delete the older ones where the configuration says so.
+        """Write a checkpoint, then delete the older ones if the configuration says so.
 
-        ``pipeline`` holds the averaged weights, where there are any: nerfstudio's commands take them from there.
-        ``training`` holds what else a resumed run needs to come to the same result.
+        ``training`` holds what a resumed run needs beside nerfstudio's contents to give the same result.
         """
         if step == self._saved_step:
             return
-        stage, average = self.plan.at(step), self.pipeline.weight_average
-        with self.pipeline.averaged():
-            pipeline = self.pipeline.state_dict()
+        stage = self.plan.at(step)
         state = {
             "step": step,
-            "pipeline": pipeline,
+            "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {},
             "scalers": self.grad_scaler.state_dict(),
@@ -252,7 +232,6 @@ class StagedTrainer(Trainer):
                 "stage": {"name": stage.config.name, "start": stage.start},
                 "completed_stage": stage.config.name if step == stage.end - 1 else None,
                 "steps_since_update": self._steps_since_update,
-                "weights": {} if average is None else average.weights(),
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
@@ -267,7 +246,7 @@ class StagedTrainer(Trainer):
                     older.unlink()
 
     def _load_checkpoint(self) -> None:
-        """Load what ``save_checkpoint`` wrote; nerfstudio's own method knows nothing of ``training``."""
+        """Load a checkpoint of `save_checkpoint`, with the contents of ``training``."""
         if self.config.load_dir is not None:
             path = find_checkpoint(self.config.load_dir, self.config.load_step)
         elif self.config.load_checkpoint is not None:
@@ -277,22 +256,18 @@ class StagedTrainer(Trainer):
         state = read_checkpoint(path)
         self._start_step = state["step"] + 1
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        unlike = set(state["optimizers"]) ^ set(self.optimizers.optimizers)
-        if unlike:
+        different = set(state["optimizers"]) ^ set(self.optimizers.optimizers)
+        if different:
             raise InputError(
-                f"{path}: was made with other parameter groups ({', '.join(sorted(unlike))}); take the settings of "
-                "the config.yml beside it."
+                f"{path}: was made with other parameter groups ({', '.join(sorted(different))}); take the settings "
+                "of the config.yml beside it."
             )
-        if self.pipeline.weight_average is not None:
-            self.pipeline.weight_average.restart()
         self.optimizers.load_optimizers(state["optimizers"])
-        if state["scalers"]:  # empty where training was not in mixed precision
+        if state["scalers"]:  # empty unless training was in mixed precision
             self.grad_scaler.load_state_dict(state["scalers"])
         training = state["training"]
-        if training["weights"]:
-            self.pipeline.load_state_dict(training["weights"], strict=False)
         self._steps_since_update = training["steps_since_update"]
-        # Another run's first stage may have been longer or shorter than this run's would be.
+        # Another run's first stage may have had another length.
         self.plan = plan_within(self.plan, **training["stage"])
         self._completed = training["completed_stage"]
         if self._completed is not None:
@@ -302,7 +277,7 @@ class StagedTrainer(Trainer):
 
 
 def _flush_logs() -> None:
-    """Write to disk what is logged so far: TensorBoard's writer loses what waits in it when the process ends."""
+    """Write the logs to disk; TensorBoard's writer would lose its buffer if the process ended."""
     writer.write_out_storage()
     for event_writer in writer.EVENT_WRITERS:
         if isinstance(event_writer, writer.TensorboardWriter):

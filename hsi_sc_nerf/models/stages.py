@@ -1,9 +1,8 @@
 """The two stages of training, as plain data and pure functions of the step.
 
 The paper (section "Training Protocol") trains on full frames with pose optimisation, then on the masked object with
-the camera optimiser off. Everything that differs between the stages is a field of `StageConfig`; which stage a step
-belongs to, its learning rates and its random numbers follow from the step alone, so a resumed run continues as if
-never interrupted.
+the camera optimiser off. All that differs between the stages is a field of `StageConfig`. The stage of a step, its
+learning rates and its random numbers follow from the step alone, so that a resumed run gives the same result.
 """
 
 from __future__ import annotations
@@ -18,60 +17,60 @@ from hsi_sc_nerf import paper
 
 @dataclass
 class StageConfig:
-    """One stage of training. Parameter groups are those of --optimizers: fields, proposal_networks, camera_opt,
-    basis, background."""
+    """One stage of training. The parameter groups are fields, proposal_networks and camera_opt."""
 
     name: str
     """Shown in the progress bar, and the name of the stage's checkpoint folder."""
-    share: float
-    """Share of --max-num-iterations that this stage gets."""
+    fraction: float
+    """Fraction of --max-num-iterations that this stage takes."""
     num_iterations: int | None = None
-    """Length of this stage on its own; where it is given it goes before the share."""
-    foreground_share: float | None = None
-    """Share of the rays that hit the foreground masks; the others, anywhere else in the frames, keep empty space
-    empty. 1: the object's pixels alone, as in the paper. None: anywhere in whole frames."""
-    rim_share: float = 0.0
-    """Share of the other rays, where there is a foreground share, that pass just beside the masks: these say most
-    sharply where the object ends."""
+    """Length of this stage, in place of the fraction."""
+    foreground_ray_fraction: float | None = None
+    """Fraction of the rays that hit the foreground masks. The others keep empty space empty. 1: the object's pixels
+    alone, as in the paper's second stage. None: rays anywhere in whole frames."""
+    boundary_ray_fraction: float = 0.0
+    """Fraction of the other rays that pass within 3 pixels of the masks, where the object ends. It has no effect
+    without a foreground ray fraction."""
     angular_loss_mult: float | None = None
     """Weight of the spectral angle's loss in this stage. None: the model's."""
     hsi_loss_mult: float | None = None
     """Weight of the squared error in this stage. None: the model's."""
     frozen_groups: tuple[str, ...] = ()
-    """Parameter groups that this stage does not change: what they learned so far stays in force (camera_opt: unless
-    the pose refinement's mode says otherwise)."""
+    """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
+    refinement's mode is free-discarded."""
     learn_after: dict[str, float] = field(default_factory=lambda: {"camera_opt": 0.3})
-    """Share of the stage's steps that pass before a parameter group begins to learn. Poses wait by default: fog tells
-    nothing of where the camera is."""
+    """Fraction of the stage's steps after which a parameter group begins to learn. Pose refinement starts after 30 %
+    of the first stage, when the density has converged to a surface."""
     lr_start: float = 1.0
     """Factor on every learning rate at the start of the stage."""
     lr_end: float = 0.5
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
     group_lr: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Both factors for single parameter groups, in place of those above."""
-    warmup_iterations: int = 0
-    """Steps over which the learning rate rises linearly from nothing at the start of the stage."""
 
     def loss_weights(self) -> dict[str, float]:
-        """Loss weights of the model that this stage sets, by their names in the model's configuration."""
+        """Loss weights that this stage sets, by their names in the model's configuration."""
         weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
         return {name: weight for name, weight in weights.items() if weight is not None}
 
     def check(self, groups: Collection[str]) -> None:
-        """Refuse what cannot be trained with.
+        """Check the settings.
 
         Args:
             groups: names of all parameter groups that have an optimiser.
 
         Raises:
-            ValueError: one sentence that names the stage and its field.
+            ValueError: a setting is out of range or names no parameter group; the message names the stage.
         """
-        shares = {"foreground-share": self.foreground_share, "rim-share": self.rim_share}
-        for option, share in shares.items():
-            if share is not None and not 0.0 <= share <= 1.0:
-                raise ValueError(f"{self.name}: {option} {share} is not between 0 and 1")
-        if self.share < 0.0:
-            raise ValueError(f"{self.name}: share {self.share} is below 0")
+        fractions = {
+            "foreground-ray-fraction": self.foreground_ray_fraction,
+            "boundary-ray-fraction": self.boundary_ray_fraction,
+        }
+        for option, fraction in fractions.items():
+            if fraction is not None and not 0.0 <= fraction <= 1.0:
+                raise ValueError(f"{self.name}: {option} {fraction} is not between 0 and 1")
+        if self.fraction < 0.0:
+            raise ValueError(f"{self.name}: fraction {self.fraction} is below 0")
         factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
         factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
         for option, factor in factors.items():
@@ -85,14 +84,14 @@ class StageConfig:
 def full_frame_stage() -> StageConfig:
     """The paper's first stage: whole frames, poses refined.
 
-    A share of the rays is sure to hit the object, and one to pass just beside it: its surface comes into being here,
-    and on a turntable it is seen in less than a tenth of the pixels.
+    The surface forms in this stage, and a turntable's object covers less than a tenth of the pixels. A fraction of
+    the rays is therefore drawn from the object and its boundary.
     """
     return StageConfig(
         name="full-frame",
-        share=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
-        foreground_share=0.2,
-        rim_share=0.2,
+        fraction=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
+        foreground_ray_fraction=0.2,
+        boundary_ray_fraction=0.2,
     )
 
 
@@ -100,10 +99,10 @@ def masked_stage() -> StageConfig:
     """The paper's second stage: the object's pixels and some background rays, poses frozen."""
     return StageConfig(
         name="masked",
-        share=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
-        foreground_share=0.75,
-        rim_share=0.8,
-        frozen_groups=("camera_opt", "background"),
+        fraction=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
+        foreground_ray_fraction=0.75,
+        boundary_ray_fraction=0.8,
+        frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,
     )
@@ -112,20 +111,20 @@ def masked_stage() -> StageConfig:
 def exponential_decay(final_factor: float, schedule_steps: int, step: int) -> float:
     """Factor on a learning rate at ``step`` of a schedule that falls to ``final_factor`` over ``schedule_steps``.
 
-    A schedule that is longer than the run, as the paper's released settings have it (to 0.01 over 200,000 steps, of
-    which 20,000 are run), is expressed by its values at the ends of the stages.
+    The schedule of the paper's released settings is longer than the run; its values at the ends of the stages are
+    their ``lr_start`` and ``lr_end``.
     """
     return final_factor ** min(1.0, step / schedule_steps)
 
 
 def step_seed(seed: int, step: int) -> int:
-    """Seed of the random numbers of one training step, unlike those of all other steps and seeds."""
+    """Seed of the random numbers of one training step, different for every step and seed."""
     return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0])
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage placed in a run: it covers the steps ``start <= step < end``."""
+    """A stage of a run, which covers the steps ``start <= step < end``."""
 
     config: StageConfig
     start: int
@@ -137,12 +136,10 @@ class Stage:
         return group not in self.config.frozen_groups and step >= self.start + waiting
 
     def lr_factor(self, step: int, group: str) -> float:
-        """Factor on the learning rate of ``group`` at ``step``: exponential between its two, after a warm-up."""
+        """Factor on the learning rate of ``group`` at ``step``, exponential from the stage's start to its end."""
         first, last = self.config.group_lr.get(group, (self.config.lr_start, self.config.lr_end))
-        done = step - self.start
-        progress = done / max(1, self.end - self.start - 1)
-        decayed = first * (last / first) ** min(1.0, progress)
-        return decayed * min(1.0, (done + 1) / (self.config.warmup_iterations + 1))
+        progress = (step - self.start) / max(1, self.end - self.start - 1)
+        return first * (last / first) ** min(1.0, progress)
 
 
 @dataclass(frozen=True)
@@ -157,7 +154,7 @@ class StagePlan:
         return self.stages[-1].end
 
     def at(self, step: int) -> Stage:
-        """The stage that ``step`` belongs to; past the end of the run, the last one."""
+        """The stage of ``step``; after the end of the run, the last one."""
         for stage in self.stages:
             if step < stage.end:
                 return stage
@@ -165,10 +162,10 @@ class StagePlan:
 
 
 def plan_after(plan: StagePlan, completed: str, next_step: int) -> StagePlan:
-    """The plan of a run that goes on at ``next_step`` from the end of the stage named ``completed``.
+    """The plan of a run that continues at ``next_step`` from the end of the stage named ``completed``.
 
-    The stages after it follow at once, with the lengths that ``plan`` gives them, however long the completed one was.
-    Where it is the last stage, or none of the plan's, the plan stays as it is.
+    The stages after it follow with the lengths that they have in ``plan``, however long the completed one was. If it
+    is the last stage of the plan, or not in it, the plan does not change.
     """
     names = [stage.config.name for stage in plan.stages]
     if completed not in names[:-1]:
@@ -177,10 +174,10 @@ def plan_after(plan: StagePlan, completed: str, next_step: int) -> StagePlan:
 
 
 def plan_within(plan: StagePlan, name: str, start: int) -> StagePlan:
-    """The plan of a run whose stage ``name`` began at the step ``start``, as after another run's first stage.
+    """The plan of a run whose stage ``name`` began at ``start``, for example after another run's first stage.
 
-    That stage and those after it keep the lengths that ``plan`` gives them; the one before it ends where it begins.
-    Where ``plan`` has no such stage, it stays as it is.
+    That stage and those after it keep the lengths that they have in ``plan``; the one before it ends where it begins.
+    If ``plan`` has no such stage, it does not change.
     """
     names = [stage.config.name for stage in plan.stages]
     if name not in names or start == plan.stages[names.index(name)].start:
@@ -193,35 +190,40 @@ def plan_within(plan: StagePlan, name: str, start: int) -> StagePlan:
 
 
 def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> StagePlan:
-    """Place stages in a run of ``max_num_iterations`` steps.
+    """Divide a run of ``max_num_iterations`` steps into stages.
 
-    Stages with a ``num_iterations`` of their own get it; the others divide what is left by their shares. Where all
-    have their own, the run is as long as they are together. Stages of no steps are left out.
+    A stage with ``num_iterations`` has that length; the others divide the remaining steps by their fractions. If all
+    stages have a length, the run is as long as their sum. Stages of no steps are left out.
 
     Raises:
-        ValueError: nothing is left to train, or the stages' own lengths exceed the run while others wait.
+        ValueError: there are no steps to train, or the stages' lengths leave none for the other stages.
+
+    Example:
+        >>> plan = plan_stages((full_frame_stage(), masked_stage()), max_num_iterations=500)
+        >>> plan.at(300).config.name
+        'masked'
     """
-    own = sum(config.num_iterations or 0 for config in configs)
-    sharing = [config for config in configs if config.num_iterations is None]
-    left = max_num_iterations - own
-    if sharing and left < 0:
+    fixed = sum(config.num_iterations or 0 for config in configs)
+    divided = [config for config in configs if config.num_iterations is None]
+    left = max_num_iterations - fixed
+    if divided and left < 0:
         raise ValueError(
-            f"the stages' own num-iterations ({own}) exceed --max-num-iterations ({max_num_iterations}); raise the "
+            f"the stages' num-iterations ({fixed}) exceed --max-num-iterations ({max_num_iterations}); raise the "
             "latter, or give every stage its own"
         )
-    weight = sum(config.share for config in sharing)
-    if sharing and left > 0 and not weight > 0.0:
-        raise ValueError("the stages' shares add up to 0: one of them has to be more")
+    weight = sum(config.fraction for config in divided)
+    if divided and left > 0 and not weight > 0.0:
+        raise ValueError("the stages' fractions add up to 0: one of them has to be above 0")
     stages: list[Stage] = []
-    start, shared = 0, 0.0
+    start, cumulated = 0, 0.0
     for config in configs:
         if config.num_iterations is not None:
             length = config.num_iterations
         else:
-            # Rounding the running sum, not each part, keeps the total exact.
-            before = round(left * shared / weight)
-            shared += config.share
-            length = round(left * shared / weight) - before
+            # Rounding the cumulated fractions, not each one, keeps the total exact.
+            before = round(left * cumulated / weight)
+            cumulated += config.fraction
+            length = round(left * cumulated / weight) - before
         if length > 0:
             stages.append(Stage(config, start, start + length))
             start += length

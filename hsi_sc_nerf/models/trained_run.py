@@ -1,4 +1,4 @@
-"""A trained run opened for export: its model, its frames, and the way between metres and the scene's units."""
+"""A trained run opened for export: its model, its data, and the transform between metres and scene units."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.checkpoints import find_checkpoint
-from hsi_sc_nerf.models.spectral_config import SpectralModelConfig
-from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
 
@@ -26,8 +25,8 @@ class TrainedRun:
     """A model in evaluation mode with the data that it was trained on.
 
     Attributes:
-        model: with the weights of the latest checkpoint.
-        manager: its data manager, with training and held-out frames.
+        model: model with the weights of the latest checkpoint.
+        manager: data manager of its training and held-out frames.
     """
 
     model: SpectralModel
@@ -40,20 +39,20 @@ class TrainedRun:
 
     @property
     def scale(self) -> float:
-        """Scene units in a metre."""
+        """Scene units per metre."""
         return self.manager.train_dataparser_outputs.dataparser_scale
 
     @property
     def centre_m(self) -> Float[np.ndarray, "3"]:
-        """Where the scene's origin is in the object frame."""
+        """Origin of the scene in the object frame."""
         return -self.manager.train_dataparser_outputs.dataparser_transform[:, 3].numpy().astype(float)
 
     def to_scene(self, points_m: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Places of the object frame (metres) in scene units."""
+        """Points in the object frame (metres) in scene units."""
         return (points_m - self.centre_m) * self.scale
 
     def to_metres(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Places in scene units in the object frame (metres)."""
+        """Points in scene units in the object frame (metres)."""
         return points / self.scale + self.centre_m
 
     @torch.no_grad()
@@ -73,25 +72,31 @@ def open_run(load_config: Path) -> TrainedRun:
     """Open a run of hsi-sc-nerf by its ``config.yml``, with its latest checkpoint.
 
     Raises:
-        InputError: there is no such file, it is no run of hsi-sc-nerf, or no checkpoint lies beside it.
+        InputError: there is no such file, it is no run of this version of hsi-sc-nerf, or there is no checkpoint.
+
+    Example:
+        >>> run = open_run(Path("outputs/pear/hsi-sc-nerf/2026-11-22_101500/config.yml"))
+        >>> run.to_metres(np.zeros(3))  # the centre of the scene in the object frame
     """
     if not load_config.is_file():
         raise InputError(f"{load_config}: there is no such file; give the config.yml of a trained run.")
     try:
         config = yaml.load(load_config.read_text(encoding="utf-8"), Loader=yaml.Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{load_config}: cannot be read; give the config.yml of a trained run.") from error
+        raise InputError(
+            f"{load_config}: cannot be read; give the config.yml of a run that this version of hsi-sc-nerf trained."
+        ) from error
     if not (isinstance(config, TrainerConfig) and isinstance(config.pipeline.model, SpectralModelConfig)):
         raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
-    find_checkpoint(_where_it_lies(config, load_config).get_checkpoint_dir())
-    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _where_it_lies(c, load_config))
+    find_checkpoint(_relocated(config, load_config).get_checkpoint_dir())
+    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _relocated(c, load_config))
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
 
 
-def _where_it_lies(config: TrainerConfig, load_config: Path) -> TrainerConfig:
-    """Settings that look for checkpoints beside their file, for a run may be moved, or given from another folder.
+def _relocated(config: TrainerConfig, load_config: Path) -> TrainerConfig:
+    """Settings with the paths of where the run lies now; it may have been moved since training.
 
-    A dataset that was given relative to the folder of training is sought from the run's own folder upwards.
+    Checkpoints are looked for beside the file, a dataset with a relative path from the run's folder upwards.
     """
     config.output_dir = load_config.parent
     config.experiment_name = config.method_name = config.timestamp = "."

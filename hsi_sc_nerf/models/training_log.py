@@ -1,26 +1,32 @@
-"""What a run tells beside nerfstudio's own logs: spectra of fixed pixels, and each stage's result in a line."""
+"""What a training run shows beside nerfstudio's logs: progress bar, results of each stage, spectra of some pixels."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from types import TracebackType
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
 
-# What the paper's table has, with units; the whole frame's have the prefix `full_`.
+from hsi_sc_nerf.models.stages import Stage
+from hsi_sc_nerf.progress import timed_progress
+
+# Metrics of the paper's table.
 _SUMMARY = {"sam": "SAM {:.4f} rad", "rmse": "RMSE {:.4f}", "ssim": "SSIM {:.3f}", "psnr": "PSNR {:.1f} dB"}
 
 
 def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
-    """One line on the held-out views at the end of a stage.
+    """One line with the metrics of the held-out views at the end of a stage.
 
     Args:
-        name: of the stage.
-        metrics: masked metrics by name, and with the prefix ``full_`` those of whole frames.
+        name: name of the stage.
+        metrics: metrics inside the masks by name, and those of whole frames with the prefix ``full_``.
     """
     masked, full = (
         ", ".join(text.format(metrics[prefix + key]) for key, text in _SUMMARY.items()) for prefix in ("", "full_")
@@ -42,7 +48,7 @@ def draw_spectra(
         measured: reflectance, in [0, 1].
         rendered: reflectance of the same pixels.
         labels: name of each pixel.
-        valid: which measured values are measurements; the others are not drawn. All without it.
+        valid: which measured values are measurements; the others are not drawn. None for all.
     """
     figure = Figure(figsize=(7, 4), dpi=90, layout="constrained")
     axes = figure.subplots()
@@ -55,3 +61,33 @@ def draw_spectra(
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return torch.from_numpy(np.asarray(canvas.buffer_rgba())[..., :3] / np.float32(255))
+
+
+class TrainingProgress:
+    """Progress bar with stage, steps, PSNR of the batches and time left, as a context manager."""
+
+    def __init__(self, total_steps: int, first_step: int) -> None:
+        self._progress = timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}"))
+        self._task = self._progress.add_task("training", total=total_steps, completed=first_step, quality="")
+        self._smoothed_psnr: float | None = None
+
+    def __enter__(self) -> TrainingProgress:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, step: int, stage: Stage, psnr: float) -> None:
+        """Show that ``step`` of ``stage`` is done."""
+        if math.isfinite(psnr):  # not so in a skipped step
+            before = self._smoothed_psnr
+            self._smoothed_psnr = psnr if before is None else 0.95 * before + 0.05 * psnr
+        self._progress.update(
+            self._task,
+            completed=step + 1,
+            description=f"training, {stage.config.name} stage",
+            quality="" if self._smoothed_psnr is None else f"PSNR {self._smoothed_psnr:.1f} dB",
+        )

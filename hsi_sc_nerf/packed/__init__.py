@@ -1,1 +1,1 @@
-"""The packed dataset on disk: its format, its cubes, reading them pixel by pixel."""
+"""The packed dataset on disk: its format, its cubes, and its pixels."""

@@ -1,4 +1,4 @@
-"""The packed dataset on disk (docs/architecture.md): calibrated frames that training reads pixel by pixel."""
+"""The packed dataset on disk (docs/architecture.md): frames, masks and poses, described by ``transforms.json``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 
 TRANSFORMS_NAME = "transforms.json"
 
@@ -30,7 +30,7 @@ class Container:
 
 @dataclass(frozen=True, eq=False)
 class PackedFrame:
-    """One frame: paths and pose; pixels are read on request.
+    """One frame: its files and its pose.
 
     Attributes:
         capture: name of the capture it was made from.
@@ -39,7 +39,7 @@ class PackedFrame:
         cube_path: header of the reflectance cube.
         flags_path: picture of the pixels' flags.
         angle_deg: the turntable's angle relative to the first frame, counter-clockwise seen from above.
-        reprojection_error_px: root mean square of the markers or features in this frame; None for poses as given.
+        reprojection_error_px: root mean square over the frame's markers or features; None for given poses.
         camera_to_world: pose in the object frame, OpenGL axes, metres.
     """
 
@@ -53,7 +53,7 @@ class PackedFrame:
     camera_to_world: Float[np.ndarray, "4 4"]
 
     def cube(self) -> UInt16[np.memmap, "lines samples bands"]:
-        """Memory map of reflectance times ``REFLECTANCE_SCALE``, ``FLAGGED`` where there is none (`unpack`).
+        """Memory map of the packed reflectance (`unpack`).
 
         Raises:
             InputError: the file is no packed cube.
@@ -65,29 +65,27 @@ class PackedFrame:
 
     def mask(self) -> Bool[np.ndarray, "lines samples"]:
         """True on the object."""
-        mask = cv2.imread(str(self.mask_path), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise InputError(f"{self.mask_path}: is no readable mask; process the session again.")
-        return mask > 127
+        return _read_picture(self.mask_path, cv2.IMREAD_GRAYSCALE) > 127
 
     def flags(self) -> UInt8[np.ndarray, "lines samples"]:
         """`PixelFlag`s of each pixel."""
-        flags = cv2.imread(str(self.flags_path), cv2.IMREAD_GRAYSCALE)
-        if flags is None:
-            raise InputError(f"{self.flags_path}: is no readable picture of flags; process the session again.")
-        return flags.astype(np.uint8)
+        return _read_picture(self.flags_path, cv2.IMREAD_GRAYSCALE)
 
     def pseudo_rgb(self) -> UInt8[np.ndarray, "lines samples 3"]:
         """The pseudo-RGB picture."""
-        image = cv2.imread(str(self.image_path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError(f"{self.image_path}: is no readable picture; process the session again.")
-        return image[..., ::-1]
+        return _read_picture(self.image_path, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def _read_picture(path: Path, mode: int) -> UInt8[np.ndarray, "lines samples *channels"]:
+    image = cv2.imread(str(path), mode)
+    if image is None:
+        raise InputError(f"{path}: is no readable picture; process the session again.")
+    return image.astype(np.uint8, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
 class PackedDataset:
-    """What ``transforms.json`` says.
+    """The content of ``transforms.json``.
 
     Attributes:
         root: the dataset's folder.
@@ -101,13 +99,13 @@ class PackedDataset:
         background_reflectance: median spectrum of the chamber behind the object.
         container: what the object stands on, if its size is known.
         frames: in capture order.
-        flagged_values: how many values of all cubes are ``FLAGGED``.
-        bad_bands_nm: centres of the file's bands that were left out because they measure nothing.
-        fwhm_nm: full widths at half maximum of the bands; None where the session does not tell.
-        uncertainty: of each reflectance; None where the session does not tell (a finished reflectance product).
-        typical_uncertainty: standard deviation a band, at the object's mean reflectance; None likewise.
-        pose_method: how the poses were found: "markers", "colmap" or "angles"; None in datasets without it.
-        fingerprint: of the session and the settings that this was made from.
+        flagged_values: number of values that are ``FLAGGED``, in all cubes.
+        bad_bands_nm: centres of the bands that were left out because they measure nothing.
+        fwhm_nm: full widths at half maximum of the bands; None if they are unknown.
+        uncertainty: of the reflectance; None if it is unknown (finished reflectance).
+        typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
+        pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
+        fingerprint: of the session and the settings that the dataset was made from.
     """
 
     root: Path
@@ -136,7 +134,7 @@ class PackedDataset:
 
 
 def transforms_path(path: Path) -> Path:
-    """The ``transforms.json`` of a dataset that is given by its folder or by that file."""
+    """The ``transforms.json`` of a dataset given by its folder or by that file."""
     path = Path(path)
     return path if path.name == TRANSFORMS_NAME else path / TRANSFORMS_NAME
 
@@ -153,8 +151,12 @@ def open_packed(path: Path) -> PackedDataset:
     """Open a packed dataset by its folder or its ``transforms.json``.
 
     Raises:
-        InputError: there is no ``transforms.json``, it is no JSON, a key is missing or unreadable, no frame is
-            listed, or a frame's file is missing.
+        InputError: ``transforms.json`` is missing, is no JSON, lacks a key, has one that cannot be read, or lists no
+            frames; or a frame's file is missing.
+
+    Example:
+        >>> dataset = open_packed(Path("dataset"))
+        >>> reflectance, valid = unpack(dataset.frames[0].cube()[256])  # one line: (samples, bands)
     """
     path = transforms_path(path)
     if not path.is_file():
@@ -176,7 +178,7 @@ def open_packed(path: Path) -> PackedDataset:
 
 
 def write_transforms(dataset: PackedDataset) -> Path:
-    """Write ``transforms.json`` into the dataset's folder, whole or not at all, and return its path.
+    """Write ``transforms.json`` into the dataset's folder and return its path.
 
     Raises:
         InputError: the operating system refused to write.
@@ -237,8 +239,8 @@ def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
     try:
         return np.array(content[key], dtype=float).reshape(shape)
     except (TypeError, ValueError) as error:
-        wanted = " x ".join(str(size) for size in shape if size >= 0)
-        raise ValueError(f"{key} is no list of {wanted} numbers".replace("  ", " ")) from error
+        expected = " x ".join(str(size) for size in shape if size >= 0)
+        raise ValueError(f"{key} is no list of {expected} numbers".replace("  ", " ")) from error
 
 
 def _numbers_or_none(content: dict[str, Any], key: str, *shape: int) -> np.ndarray | None:

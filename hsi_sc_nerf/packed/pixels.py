@@ -1,4 +1,4 @@
-"""Random pixels of packed cubes on disk: a training batch reads those pixels and nothing else."""
+"""Random pixels of packed cubes on disk: a training batch reads its own pixels and nothing else."""
 
 from __future__ import annotations
 
@@ -15,46 +15,35 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 
-RIM_PX = 3
-"""The rim of the foreground is so wide: the pixels just beside it, which decide where the object ends."""
+BOUNDARY_PX = 3
+"""Width of the band of background pixels along the foreground, which decide where the object ends."""
 
 
 class PixelReader:
-    """The spectra of single pixels, read from their places in the files.
+    """Reads the spectra of single pixels by their position in the files.
 
-    Memory stays what one batch needs. Reading through the memory maps would count every page that was ever touched as
-    this process's own (a whole session after some hundred batches), and to give the pages back between batches
-    costs three times as much as to read by position. Before a batch is read, the system is told of all its places:
-    a disk then serves many at once (benchmarks/pixel_fetch.py).
+    Memory stays at the size of one batch; memory maps would keep every page that was ever touched. Before a batch is
+    read, the system is told of all positions, so that a disk serves many at once (benchmarks/pixel_fetch.py).
 
     Args:
-        cubes: memory maps of BIP cubes of one shape, one a frame; a generator of them never has more than two open,
-            each of which is one of the files that a process may hold. Only where the system cannot read by position
-            (Windows) are they kept and read through.
+        cubes: memory maps of BIP cubes of one shape, one for each frame. A generator of them keeps at most two maps
+            open at a time; each is one of the files that a process may hold.
     """
 
     def __init__(self, cubes: Iterable[np.memmap]) -> None:
-        by_position = hasattr(os, "pread")
-        self._paths: list[Path] = []
         self._files: list[FileIO] = []
-        self._cubes: list[np.memmap] = []
         starts = []
         for cube in cubes:
             self.shape: tuple[int, int, int] = cube.shape
             self.dtype = cube.dtype
-            self._paths.append(Path(str(cube.filename)))
+            self._files.append(FileIO(str(cube.filename), "rb"))
             starts.append(cube.offset)
-            if by_position:
-                self._files.append(self._paths[-1].open("rb", buffering=0))
-            else:
-                self._cubes.append(cube)
         self._starts = np.array(starts)
 
     def close(self) -> None:
-        """Give the files back: for a reader that is done before the process is."""
+        """Close the files."""
         for file in self._files:
             file.close()
-        self._cubes.clear()
 
     def read(self, indices: Int[np.ndarray, "count 3"]) -> UInt16[np.ndarray, "count bands"]:
         """Packed spectra at (frame, line, sample).
@@ -62,42 +51,37 @@ class PixelReader:
         Raises:
             InputError: a file became shorter since it was opened.
         """
-        return self._read_by_position(indices) if self._files else self._read_through_maps(indices)
-
-    def _read_by_position(self, indices: np.ndarray) -> np.ndarray:
         _, samples, bands = self.shape
         size = bands * self.dtype.itemsize
         frames, pixels = indices[:, 0], indices[:, 1] * samples + indices[:, 2]
         offsets = (self._starts[frames] + pixels * size).tolist()
         files = [self._files[frame].fileno() for frame in frames.tolist()]
-        sizes = [size] * len(files)
-        if hasattr(os, "posix_fadvise"):
+        if hasattr(os, "posix_fadvise"):  # not on macOS
             for file, offset in zip(files, offsets, strict=True):
                 os.posix_fadvise(file, offset, size, os.POSIX_FADV_WILLNEED)
-        spectra = b"".join(map(os.pread, files, sizes, offsets))
+        spectra = b"".join(os.pread(file, size, offset) for file, offset in zip(files, offsets, strict=True))
         if len(spectra) != size * len(files):
-            raise InputError(f"{self._paths[0].parent}: a cube became shorter while it was in use; process again.")
+            folder = Path(self._files[0].name).parent
+            raise InputError(f"{folder}: a cube became shorter while it was in use; process again.")
         return np.frombuffer(spectra, self.dtype).reshape(len(files), bands)
-
-    def _read_through_maps(self, indices: np.ndarray) -> np.ndarray:
-        spectra = np.empty((len(indices), self.shape[2]), self.dtype)
-        for frame in np.unique(indices[:, 0]):
-            rows = np.flatnonzero(indices[:, 0] == frame)
-            spectra[rows] = self._cubes[frame][indices[rows, 1], indices[rows, 2]]
-        return spectra
 
 
 class PixelSampler:
-    """Batches of random pixels of a set of frames; the same seed and step give the same batch.
+    """Batches of random pixels of a set of frames.
 
-    A resumed run therefore sees the batches that an uninterrupted one would have seen.
+    The same seed and step give the same batch, so that a resumed run sees the batches of an uninterrupted one.
 
     Args:
         reader: of the frames' packed cubes.
         masks: foreground of each frame.
-        num_rays_per_batch: pixels a batch.
+        num_rays_per_batch: pixels in a batch.
         seed: part of every batch's seed.
-        has_flagged: whether the cubes hold values that are no measurements.
+        has_flagged: whether the cubes have values that are no measurements.
+
+    Example:
+        >>> reader = PixelReader(frame.cube() for frame in dataset.frames)
+        >>> masks = np.stack([frame.mask() for frame in dataset.frames])
+        >>> batch = PixelSampler(reader, masks, 4096, seed=0, has_flagged=True).sample(step=0)
     """
 
     def __init__(
@@ -114,81 +98,84 @@ class PixelSampler:
         self.num_rays_per_batch = num_rays_per_batch
         self.seed = seed
         self._foreground = np.flatnonzero(masks)
-        # How many pixels of the rest lie before each pixel of the foreground.
-        self._rest_before = self._foreground - np.arange(len(self._foreground))
-        self._values = _measured_values if has_flagged else _values
+        # Number of background pixels before each foreground pixel.
+        self._background_before = self._foreground - np.arange(len(self._foreground))
+        self._has_flagged = has_flagged
 
     def sample(
-        self, step: int, foreground_share: float | None = None, rim_share: float = 0.0
+        self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
     ) -> dict[str, np.ndarray]:
         """One batch.
 
         Args:
             step: training step.
-            foreground_share: share of the pixels drawn from the foreground, in [0, 1], the others from the rest of
-                the frames; ``None`` draws evenly from whole frames.
-            rim_share: share of those others that is drawn from the foreground's rim.
+            foreground_ray_fraction: fraction of the pixels drawn from the foreground, in [0, 1]; the others are drawn
+                from the background. None draws evenly from whole frames.
+            boundary_ray_fraction: fraction of the background pixels drawn from within ``BOUNDARY_PX`` of the
+                foreground, in [0, 1].
 
         Returns:
-            What `at` returns.
+            As `at`.
 
         Raises:
-            InputError: pixels of the foreground, or of the rest, are asked for, and there are none.
+            InputError: the batch needs foreground or background pixels and the masks have none.
         """
         rng = np.random.default_rng((self.seed, step))
         count = self.num_rays_per_batch
-        if foreground_share is None:
+        if foreground_ray_fraction is None:
             flat = rng.integers(0, self.masks.size, count)
-        else:
-            in_foreground = round(count * foreground_share)
-            if in_foreground > 0 and len(self._foreground) == 0:
-                raise InputError(
-                    "the masks of all training frames are empty, so that there is no object to train on; look at "
-                    "report/ in the dataset and process again."
-                )
-            in_rim = round((count - in_foreground) * rim_share) if rim_share > 0.0 and len(self._rim) > 0 else 0
-            in_rest, num_rest = count - in_foreground - in_rim, self.masks.size - len(self._foreground)
-            if in_rest > 0 and num_rest == 0:
-                raise InputError(
-                    "the masks of all training frames cover whole images, so that nothing tells where the object "
-                    "ends; look at report/ in the dataset and process again with a larger --masks.threshold."
-                )
-            drawn = [
-                self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
-                self._rest(rng.integers(0, num_rest, in_rest)),
-            ]
-            if in_rim > 0:
-                drawn.append(self._rim[rng.integers(0, len(self._rim), in_rim)])
-            flat = np.concatenate(drawn)
-        return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
+            return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
+        in_foreground = round(count * foreground_ray_fraction)
+        if in_foreground > 0 and len(self._foreground) == 0:
+            raise InputError(
+                "the masks of all training frames are empty, so that there is no object to train on; look at "
+                "report/ in the dataset and process again."
+            )
+        on_boundary = 0
+        if boundary_ray_fraction > 0.0 and len(self._boundary) > 0:
+            on_boundary = round((count - in_foreground) * boundary_ray_fraction)
+        in_background, background_size = count - in_foreground - on_boundary, self.masks.size - len(self._foreground)
+        if in_background > 0 and background_size == 0:
+            raise InputError(
+                "the masks of all training frames cover whole images, so that nothing tells where the object "
+                "ends; look at report/ in the dataset and process again with a larger --masks.threshold."
+            )
+        drawn = [
+            self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
+            self._background(rng.integers(0, background_size, in_background)),
+        ]
+        if on_boundary > 0:
+            drawn.append(self._boundary[rng.integers(0, len(self._boundary), on_boundary)])
+        return self.at(np.stack(np.unravel_index(np.concatenate(drawn), self.masks.shape), axis=1))
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
-        """Given pixels (frame, line, sample).
+        """The given pixels (frame, line, sample).
 
         Returns:
-            ``indices`` (count, 3) int64: frame, line, sample; ``spectral`` (count, bands) float32 reflectance;
-            ``mask`` (count, 1) bool: foreground; where the cubes have flagged values also ``valid`` (count, bands)
-            bool: which of ``spectral`` were measured (0 otherwise).
+            ``indices`` (count, 3) int64; ``spectral`` (count, bands) float32, reflectance; ``mask`` (count, 1) bool,
+            foreground; and, if the cubes have flagged values, ``valid`` (count, bands) bool, which of ``spectral``
+            were measured (the others are 0).
         """
         frame, line, sample = indices.T
-        return {
-            "indices": indices,
-            "mask": self.masks[frame, line, sample, None],
-            **self._values(self.reader.read(indices)),
-        }
+        batch = {"indices": indices, "mask": self.masks[frame, line, sample, None]}
+        counts = self.reader.read(indices)
+        if not self._has_flagged:
+            return batch | {"spectral": unpack_unflagged(counts)}
+        spectral, valid = unpack(counts)
+        return batch | {"spectral": spectral, "valid": valid}
 
     @cached_property
-    def _rim(self) -> Int[np.ndarray, "count"]:
-        """The pixels outside the foreground that are at most ``RIM_PX`` from it."""
-        return np.flatnonzero(np.stack([dilate(mask, 2 * RIM_PX + 1) & ~mask for mask in self.masks]))
+    def _boundary(self) -> Int[np.ndarray, "count"]:
+        """Background pixels within ``BOUNDARY_PX`` of the foreground (flat indices)."""
+        return np.flatnonzero(np.stack([dilate(mask, 2 * BOUNDARY_PX + 1) & ~mask for mask in self.masks]))
 
-    def _rest(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
-        """The pixels with these places among all that are not foreground.
+    def _background(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
+        """Flat indices of the background pixels with these ranks.
 
-        A list of the rest would be a session's largest: a pixel has as many of the foreground before it as have no
-        more of the rest before them than it has.
+        A list of all background pixels would be the largest array of a session. A pixel's index is its rank plus the
+        number of foreground pixels before it.
         """
-        return ranks + np.searchsorted(self._rest_before, ranks, side="right")
+        return ranks + np.searchsorted(self._background_before, ranks, side="right")
 
 
 def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:
@@ -197,12 +184,3 @@ def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> 
     count = min(count, len(foreground))
     chosen = foreground[((np.arange(count) + 0.5) / max(count, 1) * len(foreground)).astype(int)]
     return np.stack(np.unravel_index(chosen, masks.shape), axis=1)
-
-
-def _values(counts: UInt16[np.ndarray, "count bands"]) -> dict[str, np.ndarray]:
-    return {"spectral": unpack_unflagged(counts)}
-
-
-def _measured_values(counts: UInt16[np.ndarray, "count bands"]) -> dict[str, np.ndarray]:
-    spectra, valid = unpack(counts)
-    return {"spectral": spectra, "valid": valid}

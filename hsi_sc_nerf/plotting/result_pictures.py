@@ -8,60 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps, rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
-from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
 
-_DPI = 160
-_STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "0.4",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "0.9",
-    "xtick.color": "0.3",
-    "ytick.color": "0.3",
-    "legend.frameon": False,
-}
-# Okabe and Ito's colours, which colour-blind readers tell apart; yellow left out, it is faint on white.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _DASHED = (0.0, (3.0, 1.5))
 _CLOUD_POINTS = 200_000
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with atomic_write(Path(path)) as (temporary,):
-        figure.savefig(temporary)
-
-
-def _show(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
-    """An image without ticks, in pixel coordinates that start at its upper left corner."""
-    height, width = image.shape[:2]
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
-    axes.grid(False)
-    if image.ndim == 3 and image.dtype != np.uint8:
-        image = np.clip(image, 0, 1)
-    return axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **options)
 
 
 def _finite_mean(values: np.ndarray) -> float:
@@ -69,7 +26,7 @@ def _finite_mean(values: np.ndarray) -> float:
     return float(finite.mean()) if len(finite) else math.nan
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_views(
     path: Path,
     truth_rgb: Sequence[Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]],
@@ -90,7 +47,7 @@ def draw_views(
     labels = ["Measured", "Rendered"] + (["Spectral angle"] if angle_maps_rad is not None else [])
     height, width = truth_rgb[0].shape[:2]
     cell_in = 1.7
-    figure = _figure(
+    figure = new_figure(
         max(3.2, cell_in * len(names) + 0.4 + (0.7 if angle_maps_rad is not None else 0.0)),
         cell_in * height / width * len(labels) + 0.3 + (0.2 if angle_maps_rad is not None else 0.0),
     )
@@ -98,21 +55,21 @@ def draw_views(
     for column, name in enumerate(names):
         grid[0, column].set_title(name)
         for row, images in enumerate((truth_rgb, rendered_rgb)):
-            _show(grid[row, column], images[column])
+            show_image(grid[row, column], images[column])
     for row, label in enumerate(labels):
         grid[row, 0].set_ylabel(label)
     if angle_maps_rad is not None:
         angles = np.concatenate([angle_map[np.isfinite(angle_map)] for angle_map in angle_maps_rad])
         top = float(np.percentile(angles, 99)) if len(angles) else 1.0
-        colours = colormaps["magma"].with_extremes(bad="0.85")
+        colours = colormaps[ANGLE_COLOURS].with_extremes(bad="0.85")
         for column, angle_map in enumerate(angle_maps_rad):
-            drawn = _show(grid[2, column], angle_map, cmap=colours, vmin=0, vmax=top or 1.0)
+            drawn = show_image(grid[2, column], angle_map, cmap=colours, vmin=0, vmax=top or 1.0)
             grid[2, column].set_xlabel(f"mean {_finite_mean(angle_map):.4f} rad")
         figure.colorbar(drawn, ax=grid[2].tolist(), label="rad", extend="max", fraction=0.05, aspect=15, pad=0.02)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_spectra(
     path: Path,
     wavelengths_nm: Float[np.ndarray, "bands"],
@@ -133,15 +90,15 @@ def draw_spectra(
         image: Pseudo-RGB, float in [0, 1] or 8 bit.
         pixels: (x, y) of each point in the image, from its upper left corner.
     """
-    figure = _figure(9.0, 3.8)
+    figure = new_figure(9.0, 3.8)
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.7))[0]
     picture = left.subplots()
-    _show(picture, image)
+    show_image(picture, image)
     spectra, difference = right.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     order = np.argsort(wavelengths_nm)
     nm = np.asarray(wavelengths_nm)[order]
     for index, label in enumerate(labels):
-        colour = _COLOURS[index % len(_COLOURS)]
+        colour = COLOURS[index % len(COLOURS)]
         x, y = pixels[index]
         picture.plot(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="white", markeredgewidth=3.5)
         picture.plot(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=2)
@@ -156,7 +113,7 @@ def draw_spectra(
     difference.axhline(0, color="0.4", linewidth=0.8)
     difference.set(xlabel="wavelength (nm)", ylabel="reconstructed\n− measured", xlim=(nm[0], nm[-1]))
     right.align_ylabels()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 # Title, horizontal axis, vertical axis, axis towards the viewer; each axis with its sign, in the object frame.
@@ -167,7 +124,7 @@ _SIDES = (
 )
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def draw_cloud(
     path: Path,
     points_m: Float[np.ndarray, "n 3"],
@@ -195,7 +152,7 @@ def draw_cloud(
     heights = [size[side[2][0]] for side in sides]
     # One side shows about half of the points; a little over twice their spacing leaves hardly a gap.
     dot_mm = 2.2 * math.sqrt(2.0 * size[0] * size[2] / max(len(points), 1))
-    figure = _figure(sum(widths) * inch_per_mm + 0.75 * len(sides), max(heights) * inch_per_mm + 0.85)
+    figure = new_figure(sum(widths) * inch_per_mm + 0.75 * len(sides), max(heights) * inch_per_mm + 0.85)
     for axes, side in zip(figure.subplots(1, len(sides), width_ratios=widths, squeeze=False)[0], sides, strict=True):
         title, (across, across_sign), (up, up_sign), (near, near_sign) = side
         order = np.argsort(near_sign * points[:, near])
@@ -218,4 +175,4 @@ def draw_cloud(
         )
     if outside:
         figure.supxlabel(f"{outside / len(points):.2%} of the points lie outside the frame", fontsize=8, color="0.4")
-    _save(figure, path)
+    save_figure(figure, path)

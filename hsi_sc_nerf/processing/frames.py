@@ -18,12 +18,9 @@ import numpy as np
 from jaxtyping import Float, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.calibration.pixel_counts import Tally
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration, pack_counts
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
-from hsi_sc_nerf.capture.cube_lines import CubeLines
-from hsi_sc_nerf.capture.envi import Cube, open_cube
+from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
@@ -68,14 +65,14 @@ class FrameCache:
         gray: mean over the marker bands, in which markers are detected.
         score: foreground score (`masks.foreground_score`).
         brightness: mean reflectance (`masks.brightness`).
-        tally: numbers of clipped and flagged values by kept band.
+        pixel_counts: numbers of clipped and flagged values by kept band.
     """
 
     fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
     score: Float[np.ndarray, "lines samples"]
     brightness: Float[np.ndarray, "lines samples"]
-    tally: Tally
+    pixel_counts: PixelCounts
 
 
 def pack_frames(
@@ -192,13 +189,13 @@ def process_frame(
         gray=upright(to_8_bit(frame.gray)),
         score=upright(foreground_score(frame.binned)),
         brightness=upright(brightness(frame.binned)),
-        tally=frame.tally,
+        pixel_counts=frame.pixel_counts,
     )
     with atomic_write(paths.cache) as (temporary,):
         np.savez(
             temporary,
-            **{f.name: getattr(cache, f.name) for f in fields(FrameCache) if f.name != "tally"},
-            **{f.name: getattr(cache.tally, f.name) for f in fields(Tally)},
+            **{f.name: getattr(cache, f.name) for f in fields(FrameCache) if f.name != "pixel_counts"},
+            **{f.name: getattr(cache.pixel_counts, f.name) for f in fields(PixelCounts)},
         )
     return cache
 
@@ -207,9 +204,9 @@ def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
     """The cache of a frame that was finished from the same files with the same settings, or None."""
     try:
         with np.load(paths.cache) as stored:
-            tally = Tally(**{f.name: stored[f.name] for f in fields(Tally)})
+            pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
             cache = FrameCache(
-                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], tally
+                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], pixel_counts
             )
         open_cube(paths.cube)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):

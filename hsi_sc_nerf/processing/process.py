@@ -12,16 +12,15 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.pixel_counts import Tally
+from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
     describe_calibration,
-    describe_tally,
+    describe_pixel_counts,
     draw_calibration,
     write_calibration,
 )
-from hsi_sc_nerf.calibration.session_calibration import SessionCalibration, calibrate_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -35,7 +34,6 @@ from hsi_sc_nerf.packed.dataset import (
     transforms_path,
     write_transforms,
 )
-from hsi_sc_nerf.packed.uncertainty import typical_uncertainty
 from hsi_sc_nerf.poses.from_features import FeatureConfig
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.ways import PoseWay, find_poses
@@ -90,7 +88,7 @@ def process_session(
     progress: bool = True,
     estimate_poses: PoseFunction = find_poses,
 ) -> Path:
-    """Make a packed dataset (docs/architecture.md) from a capture session.
+    """Make a packed dataset (docs/reference/files.md) from a capture session.
 
     The same session is processed once with the same settings: a second call returns at once, and a run that stopped
     goes on with the frames that are not finished. ``transforms.json`` is written last, so a dataset that has one is
@@ -142,8 +140,9 @@ def process_session(
         workers=config.workers,
         progress=progress,
     )
-    tally = Tally.total(cache.tally for cache in caches)
-    console.print(describe_tally(tally, sum(c.score.size for c in caches) * len(calibration.bands)), highlight=False)
+    pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
+    num_values = sum(cache.score.size for cache in caches) * len(calibration.bands)
+    console.print(describe_pixel_counts(pixel_counts, num_values), highlight=False)
     poses = pose_frames(
         session,
         [cache.gray for cache in caches],
@@ -162,8 +161,8 @@ def process_session(
     object_box_m, scene_box_m = _boxes(session, frames, masks, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
-        typical = typical_uncertainty(calibration.uncertainty, object_spectrum(frames, masks))
-    write_calibration(output_dir / REPORT_NAME, session, calibration, tally, typical)
+        typical = calibration.uncertainty.standard_deviation(object_spectrum(frames, masks))
+    write_calibration(output_dir / REPORT_NAME, session, calibration, pixel_counts, typical)
 
     wavelengths_nm = session.wavelengths_nm[calibration.bands]
     widths_nm = session.frames[0].cube.fwhm_nm
@@ -180,7 +179,7 @@ def process_session(
         background_reflectance=background_spectrum(frames, masks),
         container=container,
         frames=tuple(frames),
-        flagged_values=sum(int(cache.tally.flagged.sum()) for cache in caches),
+        flagged_values=sum(int(cache.pixel_counts.flagged.sum()) for cache in caches),
         bad_bands_nm=np.delete(session.wavelengths_nm, calibration.bands),
         uncertainty=calibration.uncertainty,
         typical_uncertainty=typical,

@@ -1,4 +1,4 @@
-"""Rendered views as ENVI cubes, each with a map of where the model holds something."""
+"""Render views of a trained model and write them as ENVI cubes, each with a map of valid pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
-from hsi_sc_nerf.surface.depth_renders import MIN_OPACITY
+from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
 
 CubeType = Literal["float32", "uint16"]
 
@@ -26,8 +26,8 @@ class RenderedView:
     """What the model shows from one camera.
 
     Attributes:
-        spectral: reflectance, with the background's share where the object lets it through.
-        opacity: share of each pixel that the model's scene covers, in [0, 1].
+        spectral: reflectance; transparent pixels include the background's.
+        opacity: fraction of each pixel that the model's scene covers, in [0, 1].
     """
 
     spectral: Float[torch.Tensor, "h w bands"]
@@ -35,7 +35,7 @@ class RenderedView:
 
     @property
     def valid(self) -> Bool[torch.Tensor, "h w"]:
-        """Pixels that show what the model holds rather than what is behind it."""
+        """Pixels that show the model's scene rather than the background."""
         return self.opacity > MIN_OPACITY
 
 
@@ -45,26 +45,30 @@ def render_view(model: SpectralModel, camera: Cameras) -> RenderedView:
     Args:
         model: trained model, in evaluation mode.
         camera: one camera, scene units.
+
+    Example:
+        >>> run = open_run(Path("config.yml"))
+        >>> view = render_view(run.model, run.manager.eval_dataset.cameras[:1])
     """
     outputs = model.get_outputs_for_camera(camera.to(model.device))
     return RenderedView(outputs["spectral"].cpu(), outputs["accumulation"][..., 0].cpu())
 
 
 def write_view(folder: Path, name: str, view: RenderedView, dataset: PackedDataset, kind: CubeType) -> None:
-    """Write ``NAME.hdr`` + ``.raw``, a BIL cube of reflectance, and ``NAME_valid``, one band, 1 where it is valid.
+    """Write a BIL cube of reflectance ``NAME.hdr`` and ``.raw``, and ``NAME_valid``, a band that is 1 where valid.
 
-    A cube of 16-bit numbers has reflectance times `REFLECTANCE_SCALE`, as its header says. Each of the two pairs
-    appears whole or not at all.
+    A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header says. Each pair of files appears whole or
+    not at all.
 
     Args:
-        folder: where to.
+        folder: folder of the files.
         name: of the view.
-        view: what to write.
-        dataset: whose bands they are.
-        kind: of the numbers.
+        view: the rendered view.
+        dataset: gives the bands.
+        kind: type of the numbers.
 
     Raises:
-        InputError: the operating system refused to write.
+        InputError: the files cannot be written.
     """
     wavelengths_nm = dataset.wavelengths_nm
     header = {

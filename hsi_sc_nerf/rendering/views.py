@@ -1,4 +1,4 @@
-"""Which views to render: frames of the session, an orbit, or a camera path from nerfstudio's viewer."""
+"""Cameras to render from: frames of the session, an orbit, or a camera path from nerfstudio's viewer."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Views:
     """Cameras to render from, in scene units.
 
     Attributes:
-        kind: what they are, in a word.
+        kind: one word for them, used in file names.
         cameras: the cameras.
-        names: a file name for each.
-        measured: the frames that were taken there, in the same order; None where none were.
+        names: a file name for each camera.
+        measured: the frames taken by these cameras, in the same order; None if none were taken.
     """
 
     kind: str
@@ -44,25 +44,30 @@ class Views:
 
 
 def views_of_frames(run: TrainedRun, split: Literal["held-out", "training"]) -> Views:
-    """The frames of a split, with what they measured."""
+    """The cameras of a split's frames, and the measured frames.
+
+    Example:
+        >>> for name, camera in views_of_frames(open_run(Path("config.yml")), "held-out"):
+        ...     view = render_view(run.model, camera)
+    """
     manager = run.manager
     dataset = manager.eval_dataset if split == "held-out" else manager.train_dataset
     return Views(split, dataset.cameras, [frame.capture for frame in dataset.frames], dataset)
 
 
 def orbit_poses(first_camera_to_world: Float[np.ndarray, "4 4"], count: int) -> Float[np.ndarray, "count 4 4"]:
-    """Poses of a camera before an object that makes one even, counter-clockwise turn, beginning with the first."""
+    """Poses of a fixed camera before an object that makes one even counter-clockwise turn, from the first pose on."""
     angles_deg = np.arange(count) * 360.0 / count
     return np.stack([turntable_camera_to_world(first_camera_to_world, float(angle)) for angle in angles_deg])
 
 
 def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
-    """The session's camera before the object that makes one even turn, and the chamber standing still behind it.
+    """The session's camera while the object makes one even turn before the fixed background.
 
     Args:
         run: the trained run.
         count: views in the turn.
-        size: of the images, as a factor on the camera's.
+        size: factor on the size of the camera's images.
     """
     poses = orbit_poses(run.refined_poses_m()[0], count)
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
@@ -76,7 +81,7 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
 def views_of_path(path: Path) -> Views:
     """The cameras of a path that nerfstudio's viewer exported (its Render tab).
 
-    Behind them is the chamber's median spectrum: none of them stands before the turntable as the camera did.
+    Their background is the chamber's median spectrum, since none of them stands where the camera stood.
 
     Raises:
         InputError: the file is missing or is no camera path.

@@ -14,16 +14,19 @@ from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.progress import progress_bar
-from hsi_sc_nerf.report.blocks import CloudViewer, KeyFigure, Section
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
-from hsi_sc_nerf.report.comparison_section import comparison_key_figure, comparison_section
 from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section, read_json
-from hsi_sc_nerf.report.logs import read_scalars, stage_ends
-from hsi_sc_nerf.report.page import html_page
-from hsi_sc_nerf.report.rendering import HeldOutView
-from hsi_sc_nerf.report.settings import flat_settings, package_versions, settings_section
-from hsi_sc_nerf.report.training_section import training_section
-from hsi_sc_nerf.report.traits_section import traits_section
+from hsi_sc_nerf.report.held_out_views import HeldOutView
+from hsi_sc_nerf.report.page import CloudViewer, KeyFigure, Section, html_page
+from hsi_sc_nerf.report.result_sections import comparison_key_figure, comparison_section, traits_section
+from hsi_sc_nerf.report.run_sections import (
+    flat_settings,
+    package_versions,
+    read_scalars,
+    settings_section,
+    stage_ends,
+    training_section,
+)
 from hsi_sc_nerf.report.view_sections import (
     bands_section,
     metric_key_figures,
@@ -124,7 +127,7 @@ def _opened(folder: Path) -> TrainedRun:
 
 
 def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralCloud:
-    from hsi_sc_nerf.report.rendering import sample_cloud
+    from hsi_sc_nerf.report.held_out_views import sample_cloud
 
     path = sources.cloud or folder / "point_cloud.ply"
     if sources.cloud is not None or path.is_file():
@@ -134,7 +137,7 @@ def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralClo
 
 def _rendered(run: TrainedRun, count: int) -> Sequence[HeldOutView]:
     """Held-out views, with a bar that tells the time left."""
-    from hsi_sc_nerf.report.rendering import render_held_out
+    from hsi_sc_nerf.report.held_out_views import render_held_out
 
     views: list[HeldOutView] = []
     with progress_bar("rendering", "held-out views", count) as done:

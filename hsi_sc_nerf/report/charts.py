@@ -1,28 +1,50 @@
-"""Charts as inline SVG: lines with a band of uncertainty around them, and bars. Numbers and texts in, markup out.
+"""Charts of the report as inline SVG, drawn by matplotlib.
 
-Colours come from the page's style sheet (classes ``s0`` to ``s6``), so that a chart is readable in light and dark
-mode and in print. Names and labels are escaped.
+The colours are variables of the page's style sheet, so that a chart can be read in light and dark mode and in print.
 """
 
 from __future__ import annotations
 
-import math
+import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-SERIES_COLOURS = 7
-"""How many colours the style sheet has; further curves begin anew."""
-_WIDTH, _HEIGHT = 640.0, 300.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 66.0, 14.0, 12.0, 46.0
-_LEGEND_ROW, _LETTER = 20.0, 7.4
-_TICKS = 6
-# Of the largest value that a logarithmic axis reaches down to: below, a curve that touches zero would use it all up.
-_SMALLEST_SHARE = 1e-6
+from hsi_sc_nerf.plotting.figures import STYLE, new_figure
+
+_SERIES = ("#0072b2", "#d55e00", "#00805f", "#b0568c", "#b07800", "#2f93cf", "#1c2126")
+_TEXT, _FAINT, _RULE = "#1c2126", "#5b6670", "#d9dee3"
+# Colours that are drawn, and the variables of the style sheet that stand in the page instead.
+_VARIABLES = {_FAINT: "faint", _RULE: "rule"} | {colour: f"s{i}" for i, colour in enumerate(_SERIES)}
+_STYLE = STYLE | {
+    "axes.edgecolor": _FAINT,
+    "axes.labelcolor": _TEXT,
+    "axes.spines.left": False,
+    "grid.color": _RULE,
+    "text.color": _TEXT,
+    "text.parse_math": False,
+    "xtick.color": _FAINT,
+    "ytick.color": _FAINT,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "ytick.minor.size": 0,
+    "svg.fonttype": "none",
+}
+_SVG = "http://www.w3.org/2000/svg"
+_WIDTH_IN, _HEIGHT_IN, _LEGEND_ROW_IN = 6.4, 3.0, 0.2
+_LEGEND_CHARACTERS = 72
+# Smallest value of a logarithmic axis as a fraction of the largest; a curve that touches 0 would use up all the axis.
+_SMALLEST_FRACTION = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +57,7 @@ class Curve:
         y: values; NaN leaves a gap.
         spread: half the height of a band around the line; None for none.
         dashed: draw it dashed.
-        colour: number of its colour; None: its place among the curves.
+        colour: number of its colour; None: its position among the curves.
         thin: draw it thin and faint.
     """
 
@@ -46,156 +68,6 @@ class Curve:
     dashed: bool = False
     colour: int | None = None
     thin: bool = False
-
-    @property
-    def style(self) -> str:
-        """Classes of the style sheet."""
-        return "line" + " dashed" * self.dashed + " thin" * self.thin
-
-
-def nice_ticks(low: float, high: float, count: int = _TICKS) -> list[float]:
-    """About ``count`` round numbers (1, 2 or 5 times a power of ten apart) within ``low`` to ``high``."""
-    span = high - low
-    if not math.isfinite(span) or span <= 0.0:
-        return [low]
-    power = 10.0 ** math.floor(math.log10(span / count))
-    step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if span / (power * factor) <= count)
-    first = math.ceil(low / step - 1e-9)
-    return [step * i for i in range(first, math.floor(high / step + 1e-9) + 1)]
-
-
-def _log_ticks(low: float, high: float) -> list[float]:
-    decades = range(math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9) + 1)
-    ticks = [10.0**decade for decade in decades]
-    return ticks[:: max(1, math.ceil(len(ticks) / _TICKS))] if len(ticks) > 1 else [low, high]
-
-
-def _label(value: float, ticks: Sequence[float], logarithmic: bool = False) -> str:
-    """A tick's number with as many digits as it takes to tell it from its neighbours."""
-    if value == 0.0:
-        return "0"
-    if logarithmic:
-        return f"{value:.2g}".replace("e-0", "e-")
-    step = min((abs(b - a) for a, b in pairwise(ticks)), default=abs(value))
-    if abs(value) >= 1e6 or abs(value) < 1e-4:
-        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
-    decimals = max(0, math.ceil(-math.log10(step) - 1e-9)) if step > 0 else 2
-    return f"{value:.{min(decimals, 6)}f}"
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Values ``low`` to ``high`` on the page from ``start`` to ``end``."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    logarithmic: bool = False
-
-    def place(self, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-        """Where values lie; on a logarithmic axis what is not above its low end lies at it."""
-        places, low, high = np.asarray(values, float), self.low, self.high
-        if self.logarithmic:
-            places, low, high = np.log10(np.maximum(places, low)), math.log10(low), math.log10(high)
-        return self.start + (places - low) / (high - low) * (self.end - self.start)
-
-    @property
-    def ticks(self) -> list[float]:
-        return _log_ticks(self.low, self.high) if self.logarithmic else nice_ticks(self.low, self.high)
-
-
-def _range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: bool) -> tuple[float, float]:
-    """Ends of an axis that holds the finite values, with a little room."""
-    finite = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
-    if not len(finite):
-        return (0.1, 1.0) if logarithmic else (0.0, 1.0)
-    low, high = float(finite.min()), float(finite.max())
-    if logarithmic:
-        low = max(low, high * _SMALLEST_SHARE)
-        return low / 1.2, high * 1.2
-    if from_zero:
-        low, high = min(low, 0.0), max(high, 0.0)
-    room = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-    return (low if from_zero and low == 0.0 else low - room), high + room
-
-
-def _path(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> str:
-    """SVG path through the finite points, with gaps at the others."""
-    parts, pen = [], "M"
-    for a, b in zip(x.tolist(), y.tolist(), strict=True):
-        if math.isfinite(a) and math.isfinite(b):
-            parts.append(f"{pen}{a:.1f} {b:.1f}")
-            pen = "L"
-        else:
-            pen = "M"
-    return "".join(parts)
-
-
-def _band(x: Float[np.ndarray, "n"], lower: Float[np.ndarray, "n"], upper: Float[np.ndarray, "n"]) -> str:
-    """SVG path round the area between two lines; a piece for each run of finite points."""
-    finite = np.isfinite(lower) & np.isfinite(upper)
-    pieces = np.split(np.arange(len(x)), np.flatnonzero(np.diff(finite.astype(int))) + 1)
-    around = [np.concatenate([piece, piece[::-1]]) for piece in pieces if finite[piece].all() and len(piece) > 1]
-    ys = [np.concatenate([upper[ring[: len(ring) // 2]], lower[ring[len(ring) // 2 :]]]) for ring in around]
-    return "".join(_path(x[ring], y) + "Z" for ring, y in zip(around, ys, strict=True))
-
-
-def _legend(entries: Sequence[tuple[str, int, str]]) -> tuple[Markup, float]:
-    """Legend in rows over the plot, and the height that it takes."""
-    parts, x, row = [], _LEFT, 0
-    for name, colour, style in entries:
-        width = 34.0 + _LETTER * len(name)
-        if x + width > _WIDTH and x > _LEFT:
-            x, row = _LEFT, row + 1
-        y = 12.0 + _LEGEND_ROW * row
-        line = Markup('<path class="{} s{}" d="M{:.0f} {:.0f}h18"/>').format(style, colour, x, y)
-        parts.append(line + Markup('<text x="{:.0f}" y="{:.0f}">{}</text>').format(x + 23.0, y + 4.0, name))
-        x += width
-    return Markup("").join(parts), (_LEGEND_ROW * (row + 1) if entries else 0.0)
-
-
-def _frame(x: _Axis, y: _Axis, x_label: str, y_label: str) -> Markup:
-    """Grid, numbers and labels."""
-    parts = []
-    for tick in y.ticks:
-        at = float(y.place(tick))
-        parts.append(Markup('<path class="grid" d="M{:.1f} {:.1f}H{:.1f}"/>').format(x.start, at, x.end))
-        text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="end">{}</text>')
-        parts.append(text.format(x.start - 6.0, at + 4.0, _label(tick, y.ticks, y.logarithmic)))
-    for tick in x.ticks:
-        at = float(x.place(tick))
-        text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="middle">{}</text>')
-        parts.append(text.format(at, y.start + 17.0, _label(tick, x.ticks)))
-        parts.append(Markup('<path class="axis" d="M{:.1f} {:.1f}v4"/>').format(at, y.start))
-    parts.append(Markup('<path class="axis" d="M{:.1f} {:.1f}H{:.1f}"/>').format(x.start, y.start, x.end))
-    label = Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="middle">{}</text>')
-    parts.append(label.format((x.start + x.end) / 2.0, y.start + 38.0, x_label))
-    middle = (y.start + y.end) / 2.0
-    upright = Markup('<text transform="translate(14 {:.1f}) rotate(-90)" text-anchor="middle">{}</text>')
-    parts.append(upright.format(middle, y_label))
-    return Markup("").join(parts)
-
-
-def _marks(marks: Mapping[str, float], x: _Axis, y: _Axis) -> Markup:
-    """Named vertical lines."""
-    parts = []
-    for row, (name, value) in enumerate(marks.items()):
-        if not x.low <= value <= x.high:
-            continue
-        at = float(x.place(value))
-        right = at > (x.start + x.end) / 2.0
-        parts.append(Markup('<path class="mark" d="M{:.1f} {:.1f}V{:.1f}"/>').format(at, y.start, y.end))
-        text = Markup('<text class="number" x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>')
-        parts.append(
-            text.format(at + (-4.0 if right else 4.0), y.end + 11.0 + 14.0 * row, "end" if right else "start", name)
-        )
-    return Markup("").join(parts)
-
-
-def _svg(body: Markup, alt: str, height: float) -> Markup:
-    opening = Markup('<svg class="chart" role="img" viewBox="0 0 {:.0f} {:.0f}" aria-label="{}">')
-    return opening.format(_WIDTH, height, alt) + Markup("<title>{}</title>").format(alt) + body + Markup("</svg>")
 
 
 def line_chart(
@@ -208,39 +80,57 @@ def line_chart(
     logarithmic: bool = False,
     marks: Mapping[str, float] | None = None,
 ) -> Markup:
-    """Curves over a common axis.
+    """Curves over a common axis, as an ``svg`` element.
 
     Args:
         curves: at least one; NaN is a gap.
         x_label: with its unit.
         y_label: with its unit.
-        alt: what a reader who does not see it should know.
-        from_zero: the vertical axis begins at 0.
-        logarithmic: the vertical axis is logarithmic; what is not positive lies at its foot.
+        alt: description for readers who do not see the chart.
+        from_zero: the vertical axis includes 0.
+        logarithmic: the vertical axis is logarithmic; values that are not positive lie at its lower end.
         marks: vertical lines by name.
+
+    Example:
+        >>> wavelengths_nm = np.linspace(400.0, 1000.0, 204)
+        >>> curve = Curve("measured", wavelengths_nm, np.sin(wavelengths_nm / 100.0))
+        >>> svg = line_chart([curve], x_label="wavelength (nm)", y_label="reflectance", alt="A spectrum")
     """
-    colours = [(i if c.colour is None else c.colour) % SERIES_COLOURS for i, c in enumerate(curves)]
-    named = [(c.name, colour, c.style) for c, colour in zip(curves, colours, strict=True) if c.name]
-    legend, legend_height = _legend(named)
-    top = _TOP + legend_height
-    bottom = top + _HEIGHT - _TOP - _BOTTOM
-    xs = np.concatenate([np.asarray(c.x, float) for c in curves])
-    edges = [c.y if c.spread is None else np.concatenate([c.y - c.spread, c.y + c.spread]) for c in curves]
-    ys = np.concatenate([np.asarray(edge, float) for edge in edges])
-    finite = xs[np.isfinite(xs)]
-    low_x, high_x = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    x = _Axis(low_x, high_x if high_x > low_x else low_x + 1.0, _LEFT, _WIDTH - _RIGHT)
-    y = _Axis(*_range(ys, from_zero, logarithmic), bottom, top, logarithmic)
-    parts = [legend, _frame(x, y, x_label, y_label), _marks(marks or {}, x, y)]
-    for curve, colour in zip(curves, colours, strict=True):
-        if curve.spread is not None:
-            lower, upper = y.place(curve.y - curve.spread), y.place(curve.y + curve.spread)
-            shape = Markup('<path class="band s{}" d="{}"/>')
-            parts.append(shape.format(colour, _band(x.place(curve.x), lower, upper)))
-    for curve, colour in zip(curves, colours, strict=True):
-        line = Markup('<path class="{} s{}" d="{}"/>')
-        parts.append(line.format(curve.style, colour, _path(x.place(curve.x), y.place(curve.y))))
-    return _svg(Markup("").join(parts), alt, bottom + _BOTTOM)
+    named = [curve.name for curve in curves if curve.name]
+    columns = max(1, _LEGEND_CHARACTERS // (8 + max(map(len, named), default=0)))
+    rows = -(-len(named) // columns)
+    with rc_context(_STYLE):
+        figure = new_figure(_WIDTH_IN, _HEIGHT_IN + _LEGEND_ROW_IN * rows)
+        axes = figure.subplots()
+        values = [edge for c in curves for edge in ((c.y,) if c.spread is None else (c.y - c.spread, c.y + c.spread))]
+        low, high = _value_range(np.concatenate(values), from_zero, logarithmic)
+        if logarithmic:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(low, high)
+        for index, curve in enumerate(curves):
+            colour = _SERIES[(index if curve.colour is None else curve.colour) % len(_SERIES)]
+            if curve.spread is not None:
+                edges = (np.maximum(curve.y + side * curve.spread, low) for side in (-1.0, 1.0))
+                band = axes.fill_between(curve.x, *edges)
+                band.remove()  # matplotlib writes a collection as references by identifiers; a patch needs none
+                for path in band.get_paths():
+                    axes.add_patch(PathPatch(path, color=colour, alpha=0.22, linewidth=0, gid="band"))
+            axes.plot(
+                curve.x,
+                np.maximum(curve.y, low),
+                color=colour,
+                linewidth=0.6 if curve.thin else 1.3,
+                linestyle="--" if curve.dashed else "-",
+                label=curve.name or None,
+                gid="line",
+            )
+        if named:
+            figure.legend(loc="outside upper left", ncols=columns, fontsize=9)
+        _finish(axes, x_label, y_label, marks or {})
+        axes.margins(x=0.0)
+        return _inline_svg(figure, alt)
 
 
 def bar_chart(
@@ -252,26 +142,88 @@ def bar_chart(
     alt: str,
     marks: Mapping[str, float] | None = None,
 ) -> Markup:
-    """Bars that stand on 0 between neighbouring edges, a histogram for instance; a bar of NaN is left out.
+    """Bars from 0 upwards between neighbouring edges, such as a histogram, as an ``svg`` element.
 
     Args:
         edges: ascending.
-        heights: not negative.
+        heights: not negative; a bar of NaN is left out.
         x_label: with its unit.
         y_label: with its unit.
-        alt: what a reader who does not see it should know.
+        alt: description for readers who do not see the chart.
         marks: vertical lines by name.
     """
-    x = _Axis(float(edges[0]), float(edges[-1]), _LEFT, _WIDTH - _RIGHT)
-    y = _Axis(*_range(np.asarray(heights, float), True, False), _HEIGHT - _BOTTOM, _TOP)
-    left, right, top = x.place(edges[:-1]), x.place(edges[1:]), y.place(heights)
-    gap = min(1.0, 0.15 * float(right[0] - left[0]))
-    bars = "".join(
-        f"M{a + gap / 2:.1f} {y.start:.1f}V{t:.1f}H{b - gap / 2:.1f}V{y.start:.1f}Z"
-        for a, b, t in zip(left.tolist(), right.tolist(), top.tolist(), strict=True)
-        if math.isfinite(t)
+    with rc_context(_STYLE):
+        figure = new_figure(_WIDTH_IN, _HEIGHT_IN)
+        axes = figure.subplots()
+        shown = np.isfinite(heights)
+        widths = 0.9 * np.diff(edges)[shown]
+        centres = (edges[:-1] + edges[1:])[shown] / 2.0
+        for bar in axes.bar(centres, heights[shown], widths, color=_SERIES[0]):
+            bar.set_gid("bar")
+        axes.set(xlim=(edges[0], edges[-1]), ylim=_value_range(heights, True, False))
+        axes.grid(axis="x", visible=False)
+        _finish(axes, x_label, y_label, marks or {})
+        return _inline_svg(figure, alt)
+
+
+def _value_range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: bool) -> tuple[float, float]:
+    """Ends of an axis that holds the finite values, with a margin."""
+    finite = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
+    if not len(finite):
+        return (0.1, 1.0) if logarithmic else (0.0, 1.0)
+    low, high = float(finite.min()), float(finite.max())
+    if logarithmic:
+        return max(low, high * _SMALLEST_FRACTION) / 1.2, high * 1.2
+    if from_zero:
+        low, high = min(low, 0.0), max(high, 0.0)
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
+    return (low if from_zero and low == 0.0 else low - margin), high + margin
+
+
+def _finish(axes: Axes, x_label: str, y_label: str, marks: Mapping[str, float]) -> None:
+    """Labels, and the named vertical lines that lie within the axis."""
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.grid(axis="x", visible=False)
+    low, high = axes.get_xlim()
+    for row, (name, value) in enumerate(marks.items()):
+        if not low <= value <= high:
+            continue
+        axes.axvline(value, color=_FAINT, linewidth=0.8, linestyle=(0.0, (3.0, 3.0)))
+        right = value > (low + high) / 2.0
+        axes.annotate(
+            name,
+            (value, 1.0),
+            (-3 if right else 3, -9 - 10 * row),
+            xycoords=axes.get_xaxis_transform(),
+            textcoords="offset points",
+            ha="right" if right else "left",
+            color=_FAINT,
+        )
+
+
+def _inline_svg(figure: Figure, alt: str) -> Markup:
+    """The figure as SVG for an HTML page: without metadata, identifiers and font names."""
+    memory = io.BytesIO()
+    figure.savefig(memory, format="svg", transparent=True)
+    drawn = ElementTree.fromstring(memory.getvalue())
+    for parent in list(drawn.iter()):
+        for child in list(parent):
+            if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}defs"):
+                parent.remove(child)
+        identifier = parent.attrib.pop("id", None)
+        if identifier in ("line", "band", "bar"):
+            parent.set("class", identifier)
+        # Nothing is drawn beyond the axes, and identifiers would have to be unique on the page.
+        parent.attrib.pop("clip-path", None)
+        if "style" in parent.attrib:
+            style = re.sub(r"font-family: [^;]*;", "", parent.attrib["style"])
+            for colour, variable in _VARIABLES.items():
+                style = style.replace(colour, f"var(--{variable})")
+            parent.set("style", style)
+    svg = ElementTree.Element(
+        f"{{{_SVG}}}svg", {"class": "chart", "role": "img", "viewBox": drawn.attrib["viewBox"], "aria-label": alt}
     )
-    frame = _frame(x, y, x_label, y_label)
-    return _svg(
-        frame + Markup('<path class="bar s0" d="{}"/>').format(bars) + _marks(marks or {}, x, y), alt, _HEIGHT
-    )
+    ElementTree.SubElement(svg, f"{{{_SVG}}}title").text = alt
+    svg.extend(drawn)
+    ElementTree.register_namespace("", _SVG)
+    return Markup(ElementTree.tostring(svg, encoding="unicode"))

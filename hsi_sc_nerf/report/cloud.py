@@ -81,8 +81,8 @@ def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], f
     """Values in 65535 steps from their smallest to their largest, which follow; NaN and infinity are 65535."""
     finite = np.isfinite(values)
     low, high = (float(f(values[finite])) for f in (np.min, np.max)) if finite.any() else (0.0, 1.0)
-    shares = (np.where(finite, values, low) - low) / ((high - low) or 1.0)
-    return np.where(finite, np.rint(shares * (_MISSING - 1)), _MISSING).astype(np.uint16), low, high
+    fractions = (np.where(finite, values, low) - low) / ((high - low) or 1.0)
+    return np.where(finite, np.rint(fractions * (_MISSING - 1)), _MISSING).astype(np.uint16), low, high
 
 
 def thinned(cloud: SpectralCloud, max_points: int, seed: int = 0) -> SpectralCloud:

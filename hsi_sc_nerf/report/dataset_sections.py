@@ -13,9 +13,8 @@ from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.report.blocks import Block, Figure, Folded, Missing, Section, Table, Warnings
 from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
-from hsi_sc_nerf.report.embed import embedded_file
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, Warnings, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
 _DIRECTIONS = {"ccw": "counter-clockwise", "cw": "clockwise"}
@@ -98,8 +97,8 @@ def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Tabl
     if white:
         rows.append(("pixels of the white", f"{white['pixels']}"))
     rows.append(("dead detector elements", f"{found.get('dead_elements', 0)}"))
-    share = dataset.flagged_values / _values(dataset)
-    rows.append(("values that are no measurement", f"{dataset.flagged_values} ({100.0 * share:.3f} %)"))
+    fraction = dataset.flagged_values / _values(dataset)
+    rows.append(("values that are no measurement", f"{dataset.flagged_values} ({100.0 * fraction:.3f} %)"))
     if noise:
         rows.append(("read noise, median over bands", f"{np.median(noise['read_noise_counts']):.2f} counts"))
         rows.append(("counts per photo-electron", f"{noise['counts_per_electron']:.3f}"))
@@ -121,20 +120,20 @@ def _values(dataset: PackedDataset) -> int:
 
 
 def _flagged_values(dataset: PackedDataset, found: Mapping[str, Any]) -> list[Figure]:
-    """Curves of the values that were clipped or flagged, a share a band; none where there are none."""
+    """Curves of the values that were clipped or flagged in each band; empty if there are none."""
     of_band = _values(dataset) / len(dataset.wavelengths_nm)
-    shares = {name: np.asarray(found.get(key, ()), float) / of_band for key, name in _FLAGGED.items()}
+    fractions = {name: np.asarray(found.get(key, ()), float) / of_band for key, name in _FLAGGED.items()}
     curves = [
-        Curve(name, dataset.wavelengths_nm, 100.0 * share)
-        for name, share in shares.items()
-        if len(share) == len(dataset.wavelengths_nm) and share.any()
+        Curve(name, dataset.wavelengths_nm, 100.0 * fraction)
+        for name, fraction in fractions.items()
+        if len(fraction) == len(dataset.wavelengths_nm) and fraction.any()
     ]
     if not curves:
         return []
     chart = line_chart(
         curves,
         x_label="wavelength (nm)",
-        y_label="share of values (%)",
+        y_label="fraction of values (%)",
         alt="Share of values that were clipped or flagged, by wavelength",
         from_zero=True,
     )
@@ -147,7 +146,7 @@ def masks_section(dataset: PackedDataset) -> Section:
     usual, spread = float(np.median(areas_px)), float(areas_px.std())
     rows = [
         ("pixels of the object, median over frames", f"{usual:.0f}"),
-        ("share of the frame", f"{100.0 * usual / (dataset.intrinsics.w * dataset.intrinsics.h):.1f} %"),
+        ("fraction of the frame", f"{100.0 * usual / (dataset.intrinsics.w * dataset.intrinsics.h):.1f} %"),
         ("standard deviation over frames", f"{100.0 * spread / max(usual, 1.0):.1f} %"),
         ("smallest", f"{areas_px.min()} ({dataset.frames[int(areas_px.argmin())].capture})"),
         ("largest", f"{areas_px.max()} ({dataset.frames[int(areas_px.argmax())].capture})"),

@@ -1,17 +1,120 @@
-"""The report as one HTML file: sections in, text out."""
+"""What a section of the report is made of, and the page as one HTML file; the template escapes every text."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
+from pathlib import Path
+from typing import Any, ClassVar
 
+import numpy as np
+from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from PIL import Image, UnidentifiedImageError
 
-from hsi_sc_nerf.report.blocks import KeyFigure, Section
+from hsi_sc_nerf.errors import InputError
 
 _PACKAGE = "hsi_sc_nerf.report"
 _SCRIPTS = ("cloud_data.js", "cloud_renderer.js", "cloud_controls.js")
+WIDEST_PX = 1600
+"""Wider pictures are made smaller: no screen shows more of them in a page."""
+_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A sentence or two."""
+
+    kind: ClassVar[str] = "paragraph"
+    text: str
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What there is not, and what to run to get it."""
+
+    kind: ClassVar[str] = "missing"
+    text: str
+    command: str
+
+
+@dataclass(frozen=True)
+class Warnings:
+    """What to be wary of, a sentence each."""
+
+    kind: ClassVar[str] = "warnings"
+    sentences: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts; the first column names the row."""
+
+    kind: ClassVar[str] = "table"
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Pictures or charts with a caption that tells their units."""
+
+    kind: ClassVar[str] = "figure"
+    pictures: Sequence[Markup]
+    caption: str
+    titles: Sequence[str] = ()
+    """Of each picture, where they have any."""
+    columns: int = 1
+    """How many stand side by side on a wide screen."""
+
+
+@dataclass(frozen=True)
+class Folded:
+    """What only some readers want to see, opened by a click."""
+
+    kind: ClassVar[str] = "folded"
+    summary: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class CloudViewer:
+    """The object in 3D."""
+
+    kind: ClassVar[str] = "cloud"
+    payload: dict[str, Any]
+    caption: str
+
+
+Block = Paragraph | Missing | Warnings | Table | Figure | Folded | CloudViewer
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page.
+
+    Attributes:
+        anchor: its name in links.
+        title: its heading.
+        blocks: what is in it.
+    """
+
+    anchor: str
+    title: str
+    blocks: Sequence[Block] = field(default_factory=tuple)
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """A number at the head of the page, with its unit in the text."""
+
+    value: str
+    name: str
 
 
 def html_page(title: str, subtitle: str, key_figures: Sequence[KeyFigure], sections: Sequence[Section]) -> str:
@@ -40,3 +143,31 @@ def html_page(title: str, subtitle: str, key_figures: Sequence[KeyFigure], secti
 def _own_text(name: str) -> Markup:
     """A file of this package, which goes into the page as it is."""
     return Markup((files(_PACKAGE) / "templates" / name).read_text(encoding="utf-8"))
+
+
+def embedded_array(image: UInt8[np.ndarray, "h w 3"], alt: str) -> Markup:
+    """An ``img`` of an array, without loss; the page shows its pixels as squares."""
+    return _img(Image.fromarray(np.ascontiguousarray(image)), alt, lossless=True, css_class="pixels")
+
+
+def embedded_file(path: Path, alt: str) -> Markup:
+    """An ``img`` of a picture file, made smaller where it is large.
+
+    Raises:
+        InputError: the file is no readable picture.
+    """
+    try:
+        with Image.open(path) as opened:
+            image = opened.convert("RGB")
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"{path}: is no readable picture ({error}); delete it, or make it again.") from error
+    if image.width > WIDEST_PX:
+        image = image.resize((WIDEST_PX, round(image.height * WIDEST_PX / image.width)), Image.Resampling.LANCZOS)
+    return _img(image, alt, lossless=False, css_class="picture")
+
+
+def _img(image: Image.Image, alt: str, lossless: bool, css_class: str) -> Markup:
+    memory = io.BytesIO()
+    image.save(memory, "WEBP", lossless=lossless, quality=_QUALITY)
+    tag = Markup('<img class="{}" alt="{}" width="{}" height="{}" src="data:image/webp;base64,{}">')
+    return tag.format(css_class, alt, image.width, image.height, base64.b64encode(memory.getvalue()).decode())

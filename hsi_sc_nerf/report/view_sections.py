@@ -10,14 +10,18 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from markupsafe import Markup
 
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
+from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
-from hsi_sc_nerf.report.blocks import Block, Figure, KeyFigure, Paragraph, Section, Table
 from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
-from hsi_sc_nerf.report.embed import embedded_array
-from hsi_sc_nerf.report.places import PlaceSpectra
-from hsi_sc_nerf.report.rendering import HeldOutView
-from hsi_sc_nerf.report.scores import ViewScores, object_angles, over_views, spread_of_views
+from hsi_sc_nerf.report.held_out_views import (
+    HeldOutView,
+    PlaceSpectra,
+    ViewScores,
+    object_angles,
+    over_views,
+    spread_of_views,
+)
+from hsi_sc_nerf.report.page import Block, Figure, KeyFigure, Paragraph, Section, Table, embedded_array
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 PICTURED_VIEWS = 4
@@ -161,7 +165,7 @@ def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
         edges,
         100.0 * counts / len(angles),
         x_label="spectral angle (rad)",
-        y_label="share of pixels (%)",
+        y_label="fraction of pixels (%)",
         alt="Histogram of the spectral angle over the object's pixels",
         marks={"mean": float(angles.mean())},
     )

@@ -1,4 +1,4 @@
-"""Which bands make pictures of cubes (pseudo-RGB, gray for markers), and their 8-bit numbers."""
+"""Bands of pseudo-RGB and gray pictures, and their 8-bit values."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def nearest_bands(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: ArrayL
 def bands_within(
     wavelengths_nm: Float[np.ndarray, "bands"], range_nm: tuple[float, float]
 ) -> Int[np.ndarray, "inside"]:
-    """Indices of the bands in ``range_nm``; of all bands where the instrument has none there."""
+    """Indices of the bands in ``range_nm``, or of all bands if none is in it."""
     inside = (wavelengths_nm >= range_nm[0]) & (wavelengths_nm <= range_nm[1])
     return np.flatnonzero(inside if inside.any() else np.ones_like(inside))
 
 
 def to_8_bit(reflectance: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Reflectance 0 to 1 as 0 to 255, linear (no gamma) and rounded; what lies outside is clipped."""
+    """Reflectance 0 to 1 as 0 to 255, linear (no gamma), rounded and clipped."""
     return np.rint(np.clip(reflectance, 0.0, 1.0) * 255.0).astype(np.uint8)

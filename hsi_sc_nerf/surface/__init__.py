@@ -1,1 +1,1 @@
-"""The surface of a trained field: where it is, points on it, which frames see it."""
+"""The surface of a trained model: depth maps, mesh, evenly spread points, and the frames that see them."""

@@ -1,50 +1,193 @@
-"""What the training frames see of a trained model's surface: their rays, poses and depth maps (scene units)."""
+"""Depth maps that a trained model renders for its training cameras, and which frames see a point (scene units)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
-from torch.nn import functional
 
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.numerics import safe_ratio
 from hsi_sc_nerf.progress import progress_bar
-from hsi_sc_nerf.surface.crossing import opacity_crossing_depth
-from hsi_sc_nerf.surface.visibility import MIN_COSINE, DepthMaps
+from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, MIN_OPACITY, camera_rays, model_output, surface_depth
 
-MIN_OPACITY = 0.5
-"""Rays that collect less than this hit no surface (released settings of the paper)."""
-SURFACE_OPACITY = 0.07
-"""The surface is where a ray from the front has collected this much. Other views keep the space outside the object
-empty, so the density begins at the true surface; how far into the object a ray reaches before it is half absorbed
-says how long the model was trained (benchmarks/surface_depth.py)."""
-WELL_WITHIN = 0.25
-"""Where a ray has collected this much, the density rises towards the object; further out its gradient is noise."""
-SEARCH_DEPTH = 0.1
-"""The surface is sought this far around a depth that is nearly right, scene units (about a centimetre)."""
-SEARCH_STEPS = 40
-DEPTH_RAYS = 300_000
-"""Rays of all depth maps together; where frames have more pixels on the object, cells of several pixels share one."""
-CELLS_AROUND = 5
-"""Depth maps reach this far beyond the masks."""
-_LEAST_OPACITY = 1e-3
+MAX_DEPTH_RAYS = 300_000
+"""Rays of all depth maps together. If the masks hold more pixels, cells of several pixels share a ray."""
+MARGIN_CELLS = 5
+"""Depth maps reach this far beyond the masks: rays beside the object show that the space there is empty. Without
+them, parts thinner than the truncation distance of the fused mesh would swell."""
 _DEPTH_TOLERANCE = 0.02
-"""Scene units: about 2 mm."""
+"""About 2 mm."""
+_SLOPE_TOLERANCE = 0.75
+"""Within a cell the depth changes by half the cell's diagonal (0.71 of its side) times the surface's slope."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """What one frame sees of points.
+
+    Attributes:
+        visible: whether the point is in the picture and the mask, faces the camera, and nothing is before it.
+        cosines: of the angle between the point's normal and the direction to the camera.
+        xy_px: image coordinates (x, y) from the upper left corner; undefined behind the camera.
+        pixels: (sample, line) that holds the point; (0, 0) outside the picture.
+    """
+
+    visible: Bool[Tensor, "n"]
+    cosines: Float[Tensor, "n"]
+    xy_px: Float[Tensor, "n 2"]
+    pixels: Int[Tensor, "n 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthRenders:
+    """Poses and depth maps of frames; lengths in any one unit.
+
+    Attributes:
+        camera_to_world: refined poses (OpenGL axes).
+        intrinsics: of the one camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        depths: distance from the camera to the surface at each cell's centre; infinite where a ray hits nothing, NaN
+            where no ray was rendered.
+        cell_px: side of the cells, pixels.
+        masks: pixels in which points may be seen.
+        points: hits of the rays within the masks.
+        depth_tolerance: a point this far behind the depth map is still visible.
+    """
+
+    camera_to_world: Float[Tensor, "frames 4 4"]
+    intrinsics: PinholeIntrinsics
+    distortion: tuple[float, float, float, float]
+    depths: Float[Tensor, "frames cells_down cells_across"]
+    cell_px: int
+    masks: Bool[Tensor, "frames lines samples"]
+    points: Float[np.ndarray, "hits 3"]
+    depth_tolerance: float = _DEPTH_TOLERANCE
+
+    def views(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Iterator[FrameView]:
+        """What each frame, in order, sees of points with outward unit normals."""
+        return (self.view(frame, points, normals) for frame in range(len(self.depths)))
+
+    def view(self, frame: int, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> FrameView:
+        """What one frame sees of points with outward unit normals."""
+        to_point, xy_px, inside, pixels = self._project(frame, points)
+        distance = to_point.norm(dim=-1)
+        inside &= self.masks[frame, pixels[:, 1], pixels[:, 0]]
+        cosines = -(normals * to_point).sum(dim=-1) / distance
+        bounded = cosines.clamp_min(MIN_COSINE)
+        slope = (1.0 - bounded.square()).clamp_min(0.0).sqrt() / bounded
+        cell = distance * self.cell_px / min(self.intrinsics.fl_x, self.intrinsics.fl_y)
+        tolerance = self.depth_tolerance + _SLOPE_TOLERANCE * slope * cell
+        visible = inside & (cosines > MIN_COSINE) & (distance <= self._depth_of(frame, pixels) + tolerance)
+        return FrameView(visible, cosines, xy_px, pixels)
+
+    def most_frontal(
+        self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
+    ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+        """The frame that sees each point most from the front.
+
+        Returns:
+            Its index (-1 if no frame sees the point), the point's image coordinates (x, y) in it, and the cosine
+            between normal and view, at least ``MIN_COSINE``.
+        """
+        best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
+        frames = torch.full((len(points),), -1, device=points.device)
+        xy_px = points.new_zeros(len(points), 2)
+        for index, view in enumerate(self.views(points, normals)):
+            better = view.visible & (view.cosines > best)
+            best = torch.where(better, view.cosines, best)
+            frames = torch.where(better, index, frames)
+            xy_px = torch.where(better[:, None], view.xy_px, xy_px)
+        return frames, xy_px, best
+
+    def depth_at(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Distances of points from a frame's camera, and the depth map at them; NaN where no ray was rendered."""
+        to_point, _, inside, pixels = self._project(frame, points)
+        return to_point.norm(dim=-1), torch.where(inside, self._depth_of(frame, pixels), torch.nan)
+
+    def pixels_of(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Int[Tensor, "n 2"]]:
+        """Which points lie in a frame's picture, hidden or not, and their pixels (sample, line); else (0, 0)."""
+        return self._project(frame, points)[2:]
+
+    def _project(self, frame: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Vectors from the camera to points, image coordinates, whether these are in the picture, and pixels."""
+        pose, intrinsics = self.camera_to_world[frame], self.intrinsics
+        to_point = points - pose[:3, 3]
+        rotation = pose[:3, :3].reshape(9).expand(len(points), 9)
+        xy_px, forward = image_coordinates(in_camera_frame(to_point, rotation), intrinsics, self.distortion)
+        inside = forward & ((xy_px >= 0.0) & (xy_px < xy_px.new_tensor([intrinsics.w, intrinsics.h]))).all(dim=-1)
+        return to_point, xy_px, inside, torch.where(inside[:, None], xy_px, 0.0).long()
+
+    def _depth_of(self, frame: int, pixels: Tensor) -> Tensor:
+        cells = pixels // self.cell_px
+        return self.depths[frame, cells[:, 1], cells[:, 0]]
+
+
+@torch.no_grad()
+def render_depth_maps(
+    model: SpectralModel,
+    cameras: Cameras,
+    masks: Bool[np.ndarray, "frames lines samples"],
+    rays_per_batch: int,
+    depth_output_name: str = "depth",
+    max_rays: int = MAX_DEPTH_RAYS,
+) -> DepthRenders:
+    """Depth maps of training cameras in the cells that the masks touch, and ``MARGIN_CELLS`` beyond them.
+
+    Args:
+        model: trained model, in evaluation mode.
+        cameras: the training cameras.
+        masks: object's pixels in each camera's frame.
+        rays_per_batch: rays rendered at a time.
+        depth_output_name: output of the model around which the surface is searched.
+        max_rays: more pixels than this are rendered in cells of several pixels.
+
+    Raises:
+        InputError: the model has no such output.
+    """
+    lines, samples = masks.shape[1:]
+    cell_px = max(1, int(np.ceil(np.sqrt(masks.sum() / max_rays))))
+    mask_cells = _touched_cells(masks, cell_px)
+    cells = np.argwhere(np.stack([dilate(mask, 2 * MARGIN_CELLS + 1) for mask in mask_cells]))
+    depths = torch.full(mask_cells.shape, torch.nan, device=model.device)
+    points = [np.zeros((0, 3), np.float32)]
+    with progress_bar("rendering depth maps", "rays", len(cells)) as update:
+        for start in range(0, len(cells), rays_per_batch):
+            frame, line, sample = cells[start : start + rays_per_batch].T
+            xy_px = np.minimum((np.stack([sample, line], axis=1) + 0.5) * cell_px, (samples - 0.5, lines - 0.5))
+            rays = camera_rays(cameras, frame, xy_px, model.device)
+            outputs = model(rays)
+            initial_depth = model_output(outputs, depth_output_name, "depth")
+            depth, _ = surface_depth(model, rays.origins, rays.directions, initial_depth)
+            hit = outputs["accumulation"][:, 0] > MIN_OPACITY
+            depths[frame, line, sample] = torch.where(hit, depth[:, 0], torch.inf)
+            hit &= torch.from_numpy(mask_cells[frame, line, sample]).to(hit.device)
+            points.append((rays.origins + rays.directions * depth)[hit].cpu().numpy())
+            update(start + rays_per_batch)
+    fx, fy, cx, cy = (float(getattr(cameras, name)[0, 0]) for name in ("fx", "fy", "cx", "cy"))
+    k1, k2, _, _, p1, p2 = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[0].tolist()
+    return DepthRenders(
+        camera_to_world=refined_poses(model, cameras),
+        intrinsics=PinholeIntrinsics(samples, lines, fx, fy, cx, cy),
+        distortion=(k1, k2, p1, p2),
+        depths=depths,
+        cell_px=cell_px,
+        masks=torch.from_numpy(masks).to(model.device),
+        points=np.concatenate(points),
+    )
 
 
 @torch.no_grad()
 def refined_poses(model: SpectralModel, cameras: Cameras) -> Float[Tensor, "frames 4 4"]:
-    """Camera-to-world of training cameras as training has refined them, scene units."""
+    """Camera-to-world of training cameras after the model's refinement, scene units."""
     poses = torch.eye(4).repeat(len(cameras), 1, 1)
     poses[:, :3] = cameras.camera_to_worlds.cpu()
     assert cameras.metadata is not None
@@ -52,150 +195,11 @@ def refined_poses(model: SpectralModel, cameras: Cameras) -> Float[Tensor, "fram
     return model.camera_optimizer.corrected(frames, poses.to(model.device))
 
 
-def camera_rays(
-    cameras: Cameras, frames: Int[np.ndarray, "n"], places: Float[np.ndarray, "n 2"], device: torch.device | str
-) -> RayBundle:
-    """Rays of cameras as measured, which the model corrects, through places (x, y) in pixels from the corner."""
-    return cameras.generate_rays(
-        camera_indices=torch.from_numpy(np.asarray(frames)[:, None]),
-        coords=torch.from_numpy(np.asarray(places)[:, ::-1].copy()).float(),
-    ).to(device)
-
-
-@torch.no_grad()
-def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tensor], Float[Tensor, "n bands"]]:
-    """The model's outputs for rays as measured, and the object's own reflectance: without the background's share.
-
-    A model without a background fills the rest of a ray with what the ray met last, which is the object's already.
-    """
-    behind = model.spectra_behind(rays)  # before the model corrects the rays
-    outputs = model(rays)
-    spectra, opacity = outputs["spectral"], outputs["accumulation"]
-    if model.background is not None:
-        spectra = safe_ratio(spectra - behind * (1.0 - opacity), opacity, minimum=_LEAST_OPACITY)
-    return outputs, spectra.clamp(0.0, 1.0)
-
-
-@torch.no_grad()
-def surface_along(
-    model: SpectralModel,
-    origins: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    near_depth: Float[Tensor, "n 1"],
-    cosines: Float[Tensor, "n 1"] | None = None,
-) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
-    """Depth of the surface, sought in fine steps around a depth, and the opacity collected on the way.
-
-    Args:
-        model: trained model, in evaluation mode.
-        origins: of the rays, scene units.
-        directions: unit vectors.
-        near_depth: a depth that is nearly right.
-        cosines: of the angles between the rays and the surface's inward normal; without it, the density's gradient
-            where a ray is well within the surface says which way that faces. An oblique ray's way through the same
-            density is longer: what counts is what a ray from the front would collect.
-    """
-    offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=near_depth.device)
-    edges = (near_depth + offsets).clamp_min(0.0)
-    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
-    densities = model.field.density_fn(origins[:, None] + directions[:, None] * middles[..., None])[..., 0]
-    opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
-    if cosines is None:
-        within = origins + directions * opacity_crossing_depth(edges, densities, WELL_WITHIN)[:, None]
-        inwards = functional.normalize(model.field.density_gradient(within), dim=-1)
-        cosines = (inwards * directions).sum(dim=-1, keepdim=True).clamp_min(MIN_COSINE)
-    return opacity_crossing_depth(edges, densities * cosines, SURFACE_OPACITY)[:, None], opacity
-
-
-@dataclass(frozen=True, eq=False)
-class SeenSurface:
-    """What training cameras see.
-
-    Attributes:
-        maps: depth maps.
-        points: where rays in the masks meet something, scene units.
-    """
-
-    maps: DepthMaps
-    points: Float[np.ndarray, "n 3"]
-
-
-@torch.no_grad()
-def look_from_cameras(
-    model: SpectralModel,
-    cameras: Cameras,
-    masks: Bool[np.ndarray, "frames lines samples"],
-    rays_per_batch: int,
-    depth_output_name: str = "depth",
-) -> SeenSurface:
-    """Depth maps of training cameras, in the cells that the masks touch and a little beyond them.
-
-    What a ray just beside the object passes through is known to be empty; without these rays, what is thinner than
-    the mesh's band of distances would swell.
-
-    Args:
-        model: trained model, in evaluation mode.
-        cameras: the training cameras.
-        masks: pixels of each camera's frame to look through.
-        rays_per_batch: rays rendered at a time.
-        depth_output_name: the model's output that the surface is sought around.
-
-    Raises:
-        InputError: the model has no such output.
-    """
-    lines, samples = masks.shape[1:]
-    cell_px = max(1, int(np.ceil(np.sqrt(masks.sum() / DEPTH_RAYS))))
-    in_mask = _touched_cells(masks, cell_px)
-    around = np.stack([dilate(mask, 2 * CELLS_AROUND + 1) for mask in in_mask])
-    cells = np.argwhere(around)
-    depths = torch.full(around.shape, torch.nan, device=model.device)
-    met = [np.zeros((0, 3), np.float32)]
-    with progress_bar("seeking the surface", "rays", len(cells)) as done:
-        for start in range(0, len(cells), rays_per_batch):
-            frame, line, sample = cells[start : start + rays_per_batch].T
-            places = (np.stack([sample, line], axis=1) + 0.5) * cell_px
-            rays = camera_rays(cameras, frame, np.minimum(places, (samples - 0.5, lines - 0.5)), model.device)
-            outputs = model(rays)
-            near_depth = model_output(outputs, depth_output_name, "depth")
-            depth, _ = surface_along(model, rays.origins, rays.directions, near_depth)
-            hit = outputs["accumulation"][:, 0] > MIN_OPACITY
-            depths[frame, line, sample] = torch.where(hit, depth[:, 0], torch.inf)
-            wanted = hit & torch.from_numpy(in_mask[frame, line, sample]).to(hit.device)
-            met.append((rays.origins + rays.directions * depth)[wanted].cpu().numpy())
-            done(start + rays_per_batch)
-    lens = PinholeIntrinsics(
-        samples, lines, *(float(getattr(cameras, name)[0, 0]) for name in ("fx", "fy", "cx", "cy"))
-    )
-    k1, k2, _, _, p1, p2 = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[0].tolist()
-    maps = DepthMaps(
-        camera_to_world=refined_poses(model, cameras),
-        intrinsics=lens,
-        distortion=(k1, k2, p1, p2),
-        depths=depths,
-        cell_px=cell_px,
-        masks=torch.from_numpy(masks).to(model.device),
-        tolerance=_DEPTH_TOLERANCE,
-    )
-    return SeenSurface(maps, np.concatenate(met))
-
-
 def _touched_cells(
     masks: Bool[np.ndarray, "frames lines samples"], cell_px: int
 ) -> Bool[np.ndarray, "frames cells_down cells_across"]:
-    """Cells of some pixels' side that hold a pixel of the masks."""
+    """Cells of ``cell_px`` x ``cell_px`` pixels that hold a pixel of the masks."""
     frames, lines, samples = masks.shape
     down, across = -(-lines // cell_px), -(-samples // cell_px)
     padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
     return padded.reshape(frames, down, cell_px, across, cell_px).max(axis=(2, 4))
-
-
-def model_output(outputs: dict[str, Tensor], name: str, option: str) -> Tensor:
-    """An output of the model.
-
-    Raises:
-        InputError: there is none of that name.
-    """
-    if name not in outputs:
-        given = ", ".join(sorted(key for key in outputs if torch.is_tensor(outputs[key])))
-        raise InputError(f"--{option}-output-name {name}: the model has no such output; choose one of {given}.")
-    return outputs[name]

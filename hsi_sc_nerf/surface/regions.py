@@ -1,99 +1,150 @@
-"""Regions of interest: boxes and upright cylinders in the object frame, metres; and the bands that are asked for."""
+"""Regions of interest: which points of the surface a cloud keeps (scene units)."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.data.scene_box import OrientedBox
+from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.bands import require_bands
+from hsi_sc_nerf.geometry.visual_hull import silhouette_counts
+from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.surface.depth_renders import DepthRenders
 
-_RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
+MIN_MASK_FRACTION = 0.8
+"""A point must be in the mask in this fraction of the frames that have it in the image: a few masks may be wrong."""
+MASK_MARGIN_PX = 2
+"""Masks are widened by this for the visual hull: boundaries are uncertain by a pixel or two."""
+
+Vector = Sequence[float]
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Which points are wanted.
+    """Points to keep.
 
     Attributes:
-        holds: which points (scene units, with outward unit normals) it holds.
-        bounds: minimum and maximum of a box around it, scene units; it spares the search elsewhere.
+        contains: which points, given with outward unit normals, lie in the region.
+        bounds: minimum and maximum of a box around the region; the surface is sampled only near it.
+
+    Example:
+        >>> region = box_region(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])) & EVERYWHERE
+        >>> region.contains(np.array([[0.5, 0.5, 0.5], [2.0, 0.0, 0.0]]), np.zeros((2, 3)))
+        array([ True, False])
     """
 
-    holds: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
+    contains: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
     bounds: Float[np.ndarray, "2 3"] = field(default_factory=lambda: np.array([[-np.inf] * 3, [np.inf] * 3]))
 
     def __and__(self, other: Region) -> Region:
-        """What lies in both."""
+        """The intersection of two regions."""
         return Region(
-            lambda points, facing: self.holds(points, facing) & other.holds(points, facing),
+            lambda points, normals: self.contains(points, normals) & other.contains(points, normals),
             np.stack([np.maximum(self.bounds[0], other.bounds[0]), np.minimum(self.bounds[1], other.bounds[1])]),
         )
 
 
 EVERYWHERE = Region(lambda points, _: np.ones(len(points), bool))
-"""The region that holds every point."""
+"""The region that contains every point."""
 
 
-def in_box(points_m: Float[np.ndarray, "n 3"], box_m: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, "n"]:
+def in_box(points: Float[np.ndarray, "n 3"], box: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, "n"]:
     """Which points lie in a box, given by its minimum and maximum, borders included."""
-    return ((points_m >= box_m[0]) & (points_m <= box_m[1])).all(axis=1)
+    return ((points >= box[0]) & (points <= box[1])).all(axis=1)
 
 
-def in_cylinder(
-    points_m: Float[np.ndarray, "n 3"], centre_m: Sequence[float], radius_m: float, z_m: tuple[float, float]
-) -> Bool[np.ndarray, "n"]:
-    """Which points lie in an upright cylinder.
+def box_region(box: Float[np.ndarray, "2 3"]) -> Region:
+    """A box along the axes, given by its minimum and maximum."""
+    return Region(lambda points, _: in_box(points, box), box)
 
-    Args:
-        points_m: object frame.
-        centre_m: x and y of its axis, which is parallel to the turntable's.
-        radius_m: its radius, included.
-        z_m: its lower and upper end, included.
+
+def cylinder_region(box: Float[np.ndarray, "2 3"]) -> Region:
+    """The cylinder parallel to z in a box with a square base."""
+    centre, radius = box[:, :2].mean(axis=0), (box[1, 0] - box[0, 0]) / 2.0
+
+    def contains(points: np.ndarray, _: np.ndarray) -> np.ndarray:
+        in_height = (points[:, 2] >= box[0, 2]) & (points[:, 2] <= box[1, 2])
+        return in_height & (np.linalg.norm(points[:, :2] - centre, axis=1) <= radius)
+
+    return Region(contains, box)
+
+
+def oriented_box_region(centre: Vector, roll_pitch_yaw: Vector, sides: Vector) -> Region:
+    """nerfstudio's oriented box; angles in radians."""
+    box = OrientedBox.from_params(tuple(centre), tuple(roll_pitch_yaw), tuple(sides))
+    reach = np.abs(box.R.numpy()) @ np.divide(sides, 2.0)
+    return Region(
+        lambda points, _: box.within(torch.from_numpy(points).float()).numpy(),
+        np.array(centre) + np.stack([-reach, reach]),
+    )
+
+
+def visual_hull_region(renders: DepthRenders) -> Region:
+    """Points that fall on the object's mask in nearly all frames, seen or hidden (the visual hull, Laurentini 1994).
+
+    The object always does. Floaters and points on the container do so only in frames where the object is before or
+    behind them.
     """
-    from_axis = np.hypot(points_m[:, 0] - centre_m[0], points_m[:, 1] - centre_m[1])
-    return (from_axis <= radius_m) & (points_m[:, 2] >= z_m[0]) & (points_m[:, 2] <= z_m[1])
+    size = 2 * MASK_MARGIN_PX + 1
+    masks = torch.cat([functional.max_pool2d(m[None].float(), size, 1, MASK_MARGIN_PX) > 0.0 for m in renders.masks])
+
+    def contains(points: np.ndarray, _: np.ndarray) -> np.ndarray:
+        positions = torch.from_numpy(points).float().to(masks.device)
+        in_image, in_mask = silhouette_counts(positions, masks, renders.pixels_of)
+        return (in_mask >= MIN_MASK_FRACTION * in_image).cpu().numpy()
+
+    return Region(contains)
 
 
-def around_cylinder(centre_m: Sequence[float], radius_m: float, z_m: tuple[float, float]) -> Float[np.ndarray, "2 3"]:
-    """Minimum and maximum of the box around an upright cylinder, which is given as `in_cylinder` takes it."""
-    x, y = centre_m
-    return np.array([[x - radius_m, y - radius_m, z_m[0]], [x + radius_m, y + radius_m, z_m[1]]])
-
-
-def chosen_bands(wavelengths_nm: Float[np.ndarray, "bands"], wanted: Sequence[str]) -> Int[np.ndarray, "chosen"]:
-    """Indices, ascending, of the bands that are asked for; all without a wish.
+def painted_region(masks: dict[int, Bool[np.ndarray, "lines samples"]], renders: DepthRenders) -> Region:
+    """Points inside painted masks in every frame of the masks that sees them, and seen in at least one.
 
     Args:
-        wavelengths_nm: band centres.
-        wanted: wavelengths in nm (``"670"``: the nearest band) and ranges (``"600-700"``: every band in it).
+        masks: masks by index of the frame, as `read_roi_masks` gives them.
+        renders: depth maps of all frames.
+    """
+    device = renders.masks.device
+    painted = {frame: torch.from_numpy(mask).to(device) for frame, mask in masks.items()}
+
+    def contains(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        inside, outside = torch.zeros(2, len(points), dtype=torch.bool, device=device)
+        positions, outward = (torch.from_numpy(array).float().to(device) for array in (points, normals))
+        for frame, mask in painted.items():
+            view = renders.view(frame, positions, outward)
+            on_mask = mask[view.pixels[:, 1], view.pixels[:, 0]]
+            inside |= view.visible & on_mask
+            outside |= view.visible & ~on_mask
+        return (inside & ~outside).cpu().numpy()
+
+    return Region(contains)
+
+
+def read_roi_masks(
+    folder: Path, frames: Sequence[PackedFrame], shape: tuple[int, int]
+) -> dict[int, Bool[np.ndarray, "lines samples"]]:
+    """Painted masks by the index of their frame: pictures named as the frames' own masks, white in the region.
 
     Raises:
-        InputError: a word is neither, or no band is there.
+        InputError: the folder holds no picture of these frames, or one that cannot be read or has another size.
     """
-    if not wanted:
-        return np.arange(len(wavelengths_nm))
-    chosen: set[int] = set()
-    for word in wanted:
-        if match := _RANGE.fullmatch(word):
-            low, high = float(match[1]), float(match[2])
-            inside = np.flatnonzero((wavelengths_nm >= low) & (wavelengths_nm <= high))
-            if len(inside) == 0:
-                raise InputError(
-                    f"--bands {word}: the bands go from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm and "
-                    "none lies in this range; give another one, the smaller wavelength first."
-                )
-            chosen.update(inside.tolist())
-        else:
-            try:
-                wavelength_nm = float(word)
-            except ValueError as error:
-                raise InputError(
-                    f"--bands {word}: is neither a wavelength in nm, such as 670, nor a range, such as 600-700."
-                ) from error
-            chosen.update(require_bands(wavelengths_nm, [wavelength_nm], f"--bands {word}").tolist())
-    return np.array(sorted(chosen))
+    masks = {}
+    for index, frame in enumerate(frames):
+        path = folder / frame.mask_path.name
+        if not path.is_file():
+            continue
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if picture is None or picture.shape != shape:
+            raise InputError(f"{path}: is no picture of {shape[1]} x {shape[0]} pixels; paint on a copy of the mask.")
+        masks[index] = picture > 127
+    if not masks:
+        raise InputError(
+            f"{folder}: holds no mask of a training frame; name the pictures like {frames[0].mask_path.name}."
+        )
+    return masks

@@ -25,13 +25,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.plotting.false_colour import (
-    ANGLE_COLOURS,
-    ANGLE_DRAWN_RAD,
-    INDEX_COLOURS,
-    angle_to_measured,
-    coloured,
-)
+from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
 from hsi_sc_nerf.spectra.bands import covered
 from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
@@ -39,16 +33,38 @@ from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.markdown import ViewerMarkdown
 from hsi_sc_nerf.viewer.picking import PickedPoint, pick
-from hsi_sc_nerf.viewer.training_views import TrainingViews
+from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
+    from nerfstudio.pipelines.base_pipeline import Pipeline
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle
+
+    from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 Outputs = dict[str, Tensor]
 
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
+
+
+def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
+    """Add the panel to the viewer of a pipeline, whose renderings of a viewer's camera then follow its controls.
+
+    nerfstudio's viewer finds the controls as an attribute of the pipeline and renders by ``get_outputs_for_camera``
+    of the model.
+    """
+    model = cast("SpectralModel", pipeline.model)
+    panel = SpectralPanel(model.wavelengths_nm, model.num_train_data)
+    render = model.get_outputs_for_camera
+
+    def render_for_viewer(camera: Cameras, obb_box: OrientedBox | None = None) -> Outputs:
+        return panel.render(camera, lambda of_viewer: render(of_viewer, obb_box=obb_box))
+
+    model.get_outputs_for_camera = render_for_viewer  # type: ignore[method-assign]
+    pipeline.spectral_panel = panel
+    return panel
 
 
 class BrowserControl(ViewerControl):

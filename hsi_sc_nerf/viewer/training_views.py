@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hsi_sc_nerf.data.datamanager import SpectralDataset
+from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.plotting.false_colour import frame_pixels
 
 SAME_PLACE = 1e-4
 """A camera this near to a view's (scene units, of which the scene box has two) sees what the view sees."""
@@ -83,3 +84,39 @@ class TrainingViews:
             return lens, (0.0, 0.0, 0.0, 0.0)
         k1, k2, _, _, p1, p2 = camera.distortion_params.flatten().tolist()
         return lens, (k1, k2, p1, p2)
+
+
+def frame_pixels(
+    directions: Float[Tensor, "*rays 3"],
+    rotation: Float[Tensor, "3 3"],
+    intrinsics: PinholeIntrinsics,
+    distortion: tuple[float, float, float, float],
+) -> tuple[Int[Tensor, "*rays 2"], Bool[Tensor, "*rays"]]:
+    """The pixels (line, sample) of a frame that rays from its camera's centre pass through, and which rays do.
+
+    Args:
+        directions: in the world.
+        rotation: the frame's camera-to-world rotation, OpenGL axes.
+        intrinsics: of the frame.
+        distortion: k1, k2, p1, p2 (OpenCV).
+    """
+    turned = in_camera_frame(directions, rotation.reshape(9).expand(*directions.shape[:-1], 9))
+    places, forward = image_coordinates(turned, intrinsics, distortion)
+    pixels = places.flip(-1).floor().long()
+    size = pixels.new_tensor([intrinsics.h, intrinsics.w])
+    return pixels, forward & ((pixels >= 0) & (pixels < size)).all(dim=-1)
+
+
+def angle_to_measured(
+    rendered: Float[Tensor, "h w bands"],
+    measured: Float[Tensor, "n bands"],
+    valid: Bool[Tensor, "n bands"],
+    seen: Bool[Tensor, "h w"],
+) -> Float[Tensor, "h w"]:
+    """Spectral angle (radians) between a rendering and what was measured of the ``seen`` pixels, in their order.
+
+    NaN elsewhere, and where too few bands are valid.
+    """
+    angles = torch.full(seen.shape, torch.nan, dtype=torch.float32, device=rendered.device)
+    angles[seen] = spectral_angle_map(rendered[seen][:, None], measured[:, None], valid[:, None])[:, 0]
+    return angles

@@ -1,18 +1,19 @@
 """Traits of a simulated apple with a bruise, whose truth is known; and the whole command."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.poisson import MeshConfig, closed_mesh, open_edges
-from hsi_sc_nerf.analysis.regions import PickedRegion, region_spectrum
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
-from hsi_sc_nerf.analysis.traits import classified
+from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
@@ -76,7 +77,7 @@ def test_only_the_base_was_not_seen(measured_apple):
 def test_spectra_of_spots_are_within_two_percent(ideal_apple, measured_apple):
     high = np.flatnonzero(ideal_apple.seen & (ideal_apple.mesh.vertices[:, 2] > STAND_M + 0.01))
     for vertex in np.random.default_rng(0).choice(high, 8):
-        spot = PickedRegion("spot", tuple(ideal_apple.mesh.vertices[vertex].tolist()), 0.005)
+        spot = RegionOfInterest("spot", tuple(ideal_apple.mesh.vertices[vertex].tolist()), 0.005)
         measured, true = (region_spectrum("spot", one, spot.of(one)) for one in (measured_apple, ideal_apple))
         assert relative_rms(measured.mean, true.mean) < 0.02
 
@@ -106,7 +107,7 @@ def small_cloud(path):
     weights = np.eye(2)[(mesh.vertices[:, 1] > 0.0).astype(int)]
     true = TrueSurface(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
     cloud = true.cloud(6000, eyes_around(), 0.0)
-    write_spectral_ply(path, cloud.points, cloud.normals, cloud.colours, cloud.spectra, NM)
+    write_spectral_ply(path, replace(cloud, extra={}))
     return true
 
 
@@ -173,7 +174,8 @@ def test_a_library_that_does_not_fit_is_refused_before_the_work(tmp_path, monkey
     monkeypatch.setattr("hsi_sc_nerf.analysis.poisson.closed_mesh", None)
     nothing = np.zeros((2, 3))
     spectra = np.ones((2, len(NM[bands])))
-    write_spectral_ply(tmp_path / "cloud.ply", nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    cloud = SpectralCloud(nothing, nothing, nothing.astype(np.uint8), spectra, NM[bands])
+    write_spectral_ply(tmp_path / "cloud.ply", cloud)
     (tmp_path / "library.csv").write_text("nm,a\n450,0.1\n900,0.2\n")
     with pytest.raises(InputError, match=says):
         TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", library=tmp_path / "library.csv").main()

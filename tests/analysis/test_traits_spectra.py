@@ -14,9 +14,16 @@ from hsi_sc_nerf.analysis.classes import (
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
-from hsi_sc_nerf.analysis.regions import PickedRegion, picked_region, read_regions, weighted_mean_and_sd
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, vertex_normals, with_spectra, write_mesh
-from hsi_sc_nerf.analysis.traits import WHOLE, analyse, classified
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra, write_mesh
+from hsi_sc_nerf.analysis.traits import (
+    WHOLE,
+    RegionOfInterest,
+    analyse,
+    classified,
+    read_regions,
+    region_of_interest,
+    weighted_mean_and_sd,
+)
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
@@ -51,7 +58,7 @@ def test_areas_of_vertices_add_up():
 def test_normals_point_outwards():
     mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
     middle = mesh.vertices - [0.0, 0.0, 0.02]
-    assert ((vertex_normals(mesh) * middle).sum(axis=1) > 0.0).all()
+    assert ((mesh.vertex_normals() * middle).sum(axis=1) > 0.0).all()
 
 
 def test_class_areas_and_regions_of_two_halves():
@@ -100,7 +107,7 @@ def test_what_was_not_seen_is_in_no_class_and_no_mean():
 
 
 def test_indices_and_composites_of_regions():
-    traits = analyse(two_halves(), [PickedRegion("spot", (0.0, 0.02, 0.02), 0.005)])
+    traits = analyse(two_halves(), [RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)])
     at = {nm: GREEN[np.abs(NM - nm).argmin()] for nm in (670.0, 800.0)}
     ndvi = traits.indices["spot"]["NDVI"]
     assert ndvi.mean == pytest.approx((at[800.0] - at[670.0]) / (at[800.0] + at[670.0]), rel=1e-5)
@@ -186,19 +193,19 @@ def test_pictures_hold_tall_and_flat_objects(width_m, height_m, columns):
 def test_regions_from_yaml(tmp_path):
     path = tmp_path / "regions.yaml"
     path.write_text("bruise: {centre_m: [0.03, 0, 0.1], radius_m: 0.004}\n")
-    assert read_regions(path) == [PickedRegion("bruise", (0.03, 0.0, 0.1), 0.004)]
+    assert read_regions(path) == [RegionOfInterest("bruise", (0.03, 0.0, 0.1), 0.004)]
     path.write_text("bruise: {centre_m: [0.03, 0], radius_m: 0.004}\n")
     with pytest.raises(InputError, match=r"regions\.yaml"):
         read_regions(path)
     with pytest.raises(InputError, match="radius above 0"):
-        picked_region("spot", 0.0, 0.0, 0.0, 0.0)
+        region_of_interest("spot", 0.0, 0.0, 0.0, 0.0)
 
 
 def test_regions_off_the_surface_or_of_one_name_are_refused():
     surface = two_halves()
     with pytest.raises(InputError, match="no seen surface within"):
-        analyse(surface, [PickedRegion("spot", (0.1, 0.0, 0.0), 0.005)])
-    spot = PickedRegion("spot", (0.0, 0.02, 0.02), 0.005)
+        analyse(surface, [RegionOfInterest("spot", (0.1, 0.0, 0.0), 0.005)])
+    spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
     with pytest.raises(InputError, match="two regions are named spot"):
         analyse(surface, [spot, spot])
     with pytest.raises(InputError, match="raise the smoothing radius"):

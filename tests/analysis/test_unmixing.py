@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis.classes import unmix
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import classified
-from hsi_sc_nerf.analysis.unmixing import unmix
 from hsi_sc_nerf.simulate.mesh import cylinder
 
 NM = np.linspace(400.0, 1000.0, 31)

@@ -14,16 +14,22 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import writer
 
-from hsi_sc_nerf.benchmark import plot, run
+from hsi_sc_nerf.benchmark import results, run
 from hsi_sc_nerf.benchmark.configurations import (
     CONFIGURATIONS,
     named_configuration,
     own_configuration,
     training_config,
 )
-from hsi_sc_nerf.benchmark.results import TrainedRun, table, write_csv
-from hsi_sc_nerf.benchmark.run import Checkpoint, HeldOutViews
-from hsi_sc_nerf.benchmark.timing import TrainingClock, checkpoint_iterations, mean_iteration_seconds
+from hsi_sc_nerf.benchmark.results import table, write_csv
+from hsi_sc_nerf.benchmark.run import (
+    BenchmarkRun,
+    Checkpoint,
+    HeldOutViews,
+    TrainingClock,
+    checkpoint_iterations,
+    mean_iteration_seconds,
+)
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
@@ -149,7 +155,7 @@ def made_up_run(name, gpu_memory_mib=0.0):
         )
         for i in (1, 2, 3)
     ]
-    return TrainedRun(name, "hsi-sc-nerf", ("--vis", "viewer"), 0.1, tuple(checkpoints))
+    return BenchmarkRun(name, "hsi-sc-nerf", ("--vis", "viewer"), 0.1, tuple(checkpoints))
 
 
 @pytest.fixture
@@ -180,7 +186,7 @@ def made_up(monkeypatch):
         Path(argv[-1]).write_text(json.dumps(found))
 
     monkeypatch.setattr(benchmark, "run_step", run_step)
-    monkeypatch.setattr(plot, "draw_accuracy_and_time", lambda path, runs, clock: None)
+    monkeypatch.setattr(results, "draw_accuracy_and_time", lambda path, runs, clock: None)
     return ran
 
 
@@ -320,5 +326,5 @@ def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
     runs = [made_up_run(f"run-{i}") for i in range(9)]
     write_csv(tmp_path / "runs.csv", runs)
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 27
-    plot.draw_accuracy_and_time(tmp_path / "runs.png", runs, "cpu")
+    results.draw_accuracy_and_time(tmp_path / "runs.png", runs, "cpu")
     assert cv2.imread(str(tmp_path / "runs.png")).std() > 5

@@ -10,9 +10,8 @@ import pytest
 from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig, LampDriftConfig
-from hsi_sc_nerf.calibration.lamp_drift import LampDrift
-from hsi_sc_nerf.calibration.session_calibration import SessionCalibration, calibrate_session
+from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
@@ -90,7 +89,7 @@ def middle_of_illumination(truth: Truth, capture: str):
 def test_drift_is_recovered(odd, noisy):
     for session in (odd, noisy):
         drift = session.calibration.drift
-        assert isinstance(drift, LampDrift)
+        assert isinstance(drift, LampDriftEstimate)
         assert session.calibration.drift_corrected
         # The falloff is the same in all frames: what is left of the illumination's middle is the lamps'.
         middle = np.stack([middle_of_illumination(session.truth, c.name) for c in session.session.frames])
@@ -132,9 +131,7 @@ def test_errors_are_as_large_as_the_uncertainty_says(noisy):
 
 
 def test_without_corrections_the_same_session_is_wrong(odd, tmp_path):
-    plain = replace(
-        odd, calibration=calibrate_session(odd.session, CalibrationConfig(lamp_drift=LampDriftConfig("never")))
-    )
+    plain = replace(odd, calibration=calibrate_session(odd.session, CalibrationConfig(lamp_drift="never")))
     assert plain.calibration.frames[-1].flat is None
     ratio = odd.calibration.frames[-1].gain / plain.calibration.frames[-1].gain
     # Six percent darker, and redder.
@@ -183,7 +180,7 @@ def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtyp
     assert gappy.white.roi == whole.white.roi
     assert gappy.noise.counts_per_electron == pytest.approx(whole.noise.counts_per_electron, rel=0.05)
     assert gappy.drift_corrected
-    assert gappy.drift.static_share == pytest.approx(whole.drift.static_share, abs=0.01)
+    assert gappy.drift.static_fraction == pytest.approx(whole.drift.static_fraction, abs=0.01)
     np.testing.assert_allclose(gappy.drift.factor, whole.drift.factor, atol=1e-3)
 
 
@@ -255,11 +252,13 @@ def test_finished_reflectance_as_input(tmp_path):
     np.testing.assert_allclose(reflectance, np.clip(truth.reflectance(name), 0.0, 1.0), atol=2e-4)
 
 
-@pytest.mark.parametrize("source", ["capture", "product"])
-def test_a_source_that_the_session_does_not_have(tmp_path, source):
+@pytest.mark.parametrize(
+    ("source", "option"), [("capture", "white-source"), ("product", "white-source"), ("target", "roi")]
+)
+def test_a_source_that_the_session_does_not_have(tmp_path, source, option):
     scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=[])
     session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
-    with pytest.raises(InputError, match=r"choose another --calibration.white-source"):
+    with pytest.raises(InputError, match=f"--calibration.{option}"):
         calibrate_session(session, CalibrationConfig(white_source=source))
 
 

@@ -8,15 +8,15 @@ import functools
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.defects import (
+from hsi_sc_nerf.calibration.detector import (
     Defects,
     Readings,
     elements_without_response,
     find_defects,
+    saturation_counts,
     unlit_bands,
 )
-from hsi_sc_nerf.calibration.saturation import saturation_counts
-from hsi_sc_nerf.calibration.white_steps import find_coarse_roi
+from hsi_sc_nerf.calibration.white_reference import find_coarse_roi
 from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -229,10 +229,10 @@ def test_session_without_dark_cubes():
     assert (defects.dead & truth_of(simulation)).sum() > 0.7 * truth_of(simulation).sum()
 
 
-def test_tally():
+def test_summary():
     dead = np.zeros((4, 3), bool)
     dead[1, 1] = True
-    assert Defects(4095.0, dead, np.array([True, False, False])).tally() == (
+    assert Defects(4095.0, dead, np.array([True, False, False])).summary() == (
         "readings saturate at 4095 counts; 1 of 12 detector elements are dead; 1 of 3 bands are bad"
     )
-    assert Defects(None, dead, np.zeros(3, bool)).tally().startswith("nothing is saturated; ")
+    assert Defects(None, dead, np.zeros(3, bool)).summary().startswith("nothing is saturated; ")

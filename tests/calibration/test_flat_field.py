@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.defects import Readings, find_defects
+from hsi_sc_nerf.calibration.detector import Readings, find_defects
 from hsi_sc_nerf.calibration.flat_field import fit_surface, flat_field, relative_brightness
 from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
@@ -15,7 +14,6 @@ from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff
 SIZE, BANDS, DARK = 96, 6, 120.0
 NM = np.linspace(500.0, 800.0, BANDS)
 LAMP = np.array([900.0, 1500.0, 2400.0, 2900.0, 2000.0, 700.0])
-CONFIG = CalibrationConfig(smoothing_bands=1)
 # 30 000 electrons for 4095 counts.
 COUNTS_PER_ELECTRON = 4095.0 / 30_000.0
 
@@ -56,8 +54,8 @@ def tarp_capture(folder, counts: np.ndarray) -> Capture:
 def test_reflectance_is_right_to_1_percent_over_the_whole_image(tmp_path, gradient, dirty):
     true_light = light(0.2, gradient)
     tarp = tarp_capture(tmp_path, exposed(true_light, tarp_reflectance(dirty), 0))
-    white = white_reference(tarp, CONFIG)
-    flat = flat_field(tarp, white, (SIZE, SIZE), CONFIG)
+    white = white_reference(tarp)
+    flat = flat_field(tarp, white, (SIZE, SIZE))
     if not dirty:
         x0, y0, x1, y1 = white.roi
         assert flat[y0:y1, x0:x1][white.mask].mean() == pytest.approx(1.0, abs=1e-4)
@@ -79,7 +77,7 @@ def test_strong_falloff_and_bad_pixels(tmp_path):
     tarp = tarp_capture(tmp_path, counts)
     defects = find_defects(Readings(counts[10:-10], tarp.dark.read()))
     assert (defects.dead.sum(), defects.bad_bands.sum()) == (3, 1)
-    flat = flat_field(tarp, white_reference(tarp, CONFIG, defects), (SIZE, SIZE), CONFIG, defects)
+    flat = flat_field(tarp, white_reference(tarp, defects=defects), (SIZE, SIZE), defects)
     error = true_light / flat
     assert error.std() / error.mean() < 0.008
 
@@ -127,9 +125,9 @@ def test_brightness_is_of_the_elements_in_use():
 
 def test_tarp_that_cannot_tell(tmp_path):
     tarp = tarp_capture(tmp_path, exposed(light(0.2, 0.0), tarp_reflectance(False), 0))
-    white = white_reference(tarp, CONFIG)
+    white = white_reference(tarp)
     with pytest.raises(InputError, match=r"tarp\.hdr: its \(96, 96\) lines and samples differ from the \(48, 96\)"):
-        flat_field(tarp, white, (48, 96), CONFIG)
-    small = white_reference(tarp, CalibrationConfig(roi=(40, 40, 52, 52)))
+        flat_field(tarp, white, (48, 96))
+    small = white_reference(tarp, (40, 40, 52, 52))
     with pytest.raises(InputError, match=r"tarp\.hdr: the tarp is too small in its image"):
-        flat_field(tarp, small, (SIZE, SIZE), CONFIG)
+        flat_field(tarp, small, (SIZE, SIZE))

@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsi_sc_nerf.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.calibration.pixel_counts import Tally
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration, pack_counts
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
 from hsi_sc_nerf.packed.cube import FLAGGED, LARGEST_REFLECTANCE, REFLECTANCE_SCALE, PixelFlag
 
 LINES, SAMPLES, BANDS = 11, 6, 10
@@ -60,16 +58,16 @@ def check(counts, calibration, pictures=PICTURES):
     np.testing.assert_array_equal(result.flags, np.bitwise_or.reduce(why, axis=-1))
 
     rounded = np.rint(reflectance * REFLECTANCE_SCALE)
-    tally = {
+    expected_counts = {
         "clipped_low": (why == 0) & (rounded < np.rint(low * REFLECTANCE_SCALE)),
         "clipped_high": (why == 0) & (rounded > np.rint(high * REFLECTANCE_SCALE)),
         "saturated": why == PixelFlag.SATURATED,
         "dead": why == PixelFlag.DEAD,
         "no_data": why == PixelFlag.NO_DATA,
     }
-    for name, marked in tally.items():
-        np.testing.assert_array_equal(getattr(result.tally, name), marked.sum(axis=(0, 1)), err_msg=name)
-    assert result.tally.flagged.sum() == (result.packed == FLAGGED).sum()
+    for name, marked in expected_counts.items():
+        np.testing.assert_array_equal(getattr(result.pixel_counts, name), marked.sum(axis=(0, 1)), err_msg=name)
+    assert result.pixel_counts.flagged.sum() == (result.packed == FLAGGED).sum()
 
     seen = shown(reflectance, why, (low, high))
     unit = 1.0 / REFLECTANCE_SCALE
@@ -101,15 +99,15 @@ def plain(rng) -> FrameCalibration:
 
 def test_plain(rng, plain):
     result = check(make_counts(rng), plain)
-    assert result.tally.clipped_low.sum() > 0
-    assert result.tally.clipped_high.sum() > 0
+    assert result.pixel_counts.clipped_low.sum() > 0
+    assert result.pixel_counts.clipped_high.sum() > 0
     assert not result.flags.any()
 
 
 def test_counts_equal_to_dark_are_not_clipped(plain):
     dark = np.rint(plain.dark)
     counts = np.broadcast_to(dark, (LINES, SAMPLES, BANDS)).astype(np.uint16)
-    assert not check(counts, replace(plain, dark=dark)).tally.clipped_low.any()
+    assert not check(counts, replace(plain, dark=dark)).pixel_counts.clipped_low.any()
 
 
 @pytest.mark.parametrize("interleave", ["bip", "bil", "bsq"])
@@ -164,7 +162,7 @@ def test_each_value_has_one_reason(rng, plain):
     result = check(counts, calibration)
     assert result.flags[2, 3] == PixelFlag.NO_DATA | PixelFlag.DEAD
     assert result.flags[5, 0] & PixelFlag.SATURATED
-    assert result.tally.dead[0] == LINES * 2
+    assert result.pixel_counts.dead[0] == LINES * 2
 
 
 def test_floats_that_are_not_finite_are_no_data(rng, plain):
@@ -173,7 +171,7 @@ def test_floats_that_are_not_finite_are_no_data(rng, plain):
     dead = np.zeros((SAMPLES, BANDS), bool)
     dead[2, 3] = True
     result = check(counts, replace(plain, dead=dead, saturation_counts=4095.0, bounds=(0.02, 0.9)))
-    assert result.tally.no_data.sum() == 2
+    assert result.pixel_counts.no_data.sum() == 2
 
 
 def test_finished_reflectance(rng):
@@ -191,7 +189,7 @@ def test_more_lines_than_a_byte_counts(rng, plain):
     counts = make_counts(rng, lines=600)
     counts[:, 0] = 0
     result = check(counts, replace(plain, saturation_counts=4000.0))
-    assert result.tally.clipped_low.min() >= 600
+    assert result.pixel_counts.clipped_low.min() >= 600
 
 
 def test_calibration_that_is_not_finite(rng, plain):
@@ -205,9 +203,9 @@ def test_calibration_that_is_not_finite(rng, plain):
 
 
 def test_total():
-    tallies = [Tally(*(np.array([i, i + k]) for k in range(5))) for i in (1, 10)]
-    total = Tally.total(tallies)
-    assert [getattr(total, f.name).tolist() for f in fields(Tally)] == [[11, 11 + 2 * k] for k in range(5)]
+    of_frames = [PixelCounts(*(np.array([i, i + k]) for k in range(5))) for i in (1, 10)]
+    total = PixelCounts.total(of_frames)
+    assert [getattr(total, f.name).tolist() for f in fields(PixelCounts)] == [[11, 11 + 2 * k] for k in range(5)]
 
 
 @settings(deadline=None, max_examples=60)

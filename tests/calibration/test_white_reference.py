@@ -8,43 +8,44 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig
-from hsi_sc_nerf.calibration.dark import dark_columns
-from hsi_sc_nerf.calibration.defects import Defects
-from hsi_sc_nerf.calibration.line_pictures import PictureBands
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration, pack_counts
-from hsi_sc_nerf.calibration.white_reference import column_white, target_white, white_reference
-from hsi_sc_nerf.calibration.white_steps import (
+from hsi_sc_nerf.calibration.detector import Defects, dark_columns
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, pack_counts
+from hsi_sc_nerf.calibration.report import draw_column_white, draw_white_reference
+from hsi_sc_nerf.calibration.white_reference import (
     column_sums,
+    column_white,
     deviation_map,
     find_coarse_roi,
     mean_over_columns,
     mean_spectrum,
     smooth_spectrum,
     white_mask,
+    white_reference,
 )
 from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.processing.report import column_white_picture, white_reference_picture
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
 WAVELENGTHS_NM = np.linspace(400.0, 1000.0, 7)
+NARROW_NM = np.linspace(400.0, 412.0, 7)
+"""Bands so narrow that five of them are smoothed."""
 LAMP = np.array([100.0, 400.0, 900.0, 1600.0, 1200.0, 800.0, 300.0])
-CONFIG = CalibrationConfig()
 
 
-def capture(folder: Path, name: str, counts: np.ndarray, dark: np.ndarray | None = None) -> Capture:
+def capture(
+    folder: Path, name: str, counts: np.ndarray, dark: np.ndarray | None = None, bands_nm: np.ndarray = WAVELENGTHS_NM
+) -> Capture:
     cubes = []
     for stem, array in ((name, counts), (f"DARKREF_{name}", dark)):
-        cubes.append(None if array is None else cube_of(folder, stem, array))
+        cubes.append(None if array is None else cube_of(folder, stem, array, bands_nm))
     return Capture(name, cubes[0], cubes[1])
 
 
-def cube_of(folder: Path, name: str, array: np.ndarray, **header) -> Cube:
-    write_cube(folder / f"{name}.hdr", array, wavelengths_nm=WAVELENGTHS_NM, extra_header=header)
+def cube_of(folder: Path, name: str, array: np.ndarray, bands_nm: np.ndarray = WAVELENGTHS_NM, **header) -> Cube:
+    write_cube(folder / f"{name}.hdr", array, wavelengths_nm=bands_nm, extra_header=header)
     return open_cube(folder / f"{name}.hdr")
 
 
@@ -160,16 +161,16 @@ def test_a_missing_band_takes_its_mirror_image_out_of_the_window():
 
 def test_a_camera_with_few_broad_bands_keeps_its_lamps_spectrum(tmp_path):
     """Five bands of seven would smooth the lamp away, and with it the reflectance."""
-    white = white_reference(capture(tmp_path, "white", tarp_scene(0.0)), CONFIG)
+    white = white_reference(capture(tmp_path, "white", tarp_scene(0.0)))
     np.testing.assert_array_equal(white.spectrum, white.measured)
-    smoothed = white_reference(capture(tmp_path, "white", tarp_scene(0.0)), CalibrationConfig(smoothing_max_nm=1e3))
+    smoothed = white_reference(capture(tmp_path, "white", tarp_scene(0.0), bands_nm=NARROW_NM))
     np.testing.assert_allclose(smoothed.spectrum, smooth_spectrum(white.measured, WAVELENGTHS_NM, 5, 1e3)[0])
     np.testing.assert_array_equal(smoothed.window_bands, [1, 3, 5, 5, 5, 3, 1])
 
 
 def test_white_reference_of_a_folded_tarp(tmp_path):
     dark = np.full((3, 60, 7), 10.0)
-    white = white_reference(capture(tmp_path, "white", tarp_scene(), dark), CONFIG)
+    white = white_reference(capture(tmp_path, "white", tarp_scene(), dark))
     assert white.roi == (10, 8, 50, 32)
     assert not white.mask[:, :5].any()
     assert white.mask[:, 7:].all()
@@ -181,24 +182,24 @@ def test_white_reference_of_a_folded_tarp(tmp_path):
 
 def test_given_roi(tmp_path):
     tarp = capture(tmp_path, "white", tarp_scene(0.0))
-    white = white_reference(tarp, CalibrationConfig(roi=(20, 10, 29, 30)))
+    white = white_reference(tarp, (20, 10, 29, 30))
     assert white.deviation.shape == (20, 9)
     np.testing.assert_allclose(white.measured, LAMP[None])
     with pytest.raises(InputError, match=r"white\.hdr.*not inside its 60 x 40 pixels"):
-        white_reference(tarp, CalibrationConfig(roi=(20, 10, 61, 30)))
+        white_reference(tarp, (20, 10, 61, 30))
 
 
 @pytest.mark.parametrize("counts", [np.zeros((20, 20, 7)), np.random.default_rng(1).gamma(0.2, 1.0, (20, 20, 7))])
 def test_tarp_with_no_usable_region(tmp_path, counts):
     with pytest.raises(InputError, match=r"white\.hdr: the tarp has no usable region"):
-        white_reference(capture(tmp_path, "white", counts), CONFIG)
+        white_reference(capture(tmp_path, "white", counts))
 
 
 def test_bands_without_light_are_bad_and_not_smoothed_into_others(tmp_path):
     counts = tarp_scene()
     counts[..., 3] = 10.0
-    config = CalibrationConfig(smoothing_max_nm=1e3)
-    white = white_reference(capture(tmp_path, "white", counts, np.full((2, 60, 7), 10.0)), config, defects())
+    tarp = capture(tmp_path, "white", counts, np.full((2, 60, 7), 10.0), NARROW_NM)
+    white = white_reference(tarp, defects=defects())
     np.testing.assert_array_equal(white.bad_bands, np.arange(7) == 3)
     np.testing.assert_array_equal(np.isnan(white.spectrum[0]), white.bad_bands)
     np.testing.assert_array_equal(white.window_bands, [1, 3, 3, 0, 3, 3, 1])
@@ -208,10 +209,10 @@ def test_bands_without_light_are_bad_and_not_smoothed_into_others(tmp_path):
 def test_white_that_is_lit_in_few_bands_is_refused(tmp_path):
     dark, counts = np.full((2, 60, 7), 10.0), tarp_scene()
     counts[..., :3] = 10.0
-    assert white_reference(capture(tmp_path, "white", counts, dark), CONFIG).bad_bands.sum() == 3
+    assert white_reference(capture(tmp_path, "white", counts, dark)).bad_bands.sum() == 3
     counts[..., 3] = 10.0
     with pytest.raises(InputError, match=r"white\.hdr: the white can be used in 3 of its 7 bands only"):
-        white_reference(capture(tmp_path, "white", counts, dark), CONFIG)
+        white_reference(capture(tmp_path, "white", counts, dark))
 
 
 def test_dead_elements_and_saturated_bands_stay_out_of_the_white(tmp_path):
@@ -220,7 +221,7 @@ def test_dead_elements_and_saturated_bands_stay_out_of_the_white(tmp_path):
     counts[:, 31, 4] = 0.0
     counts[..., 3] = np.minimum(counts[..., 3], 1500.0)
     found = defects(dead=[(30, 2), (31, 4)], bad_bands=[6], saturation_counts=1500.0)
-    white = white_reference(capture(tmp_path, "white", counts, np.full((2, 60, 7), 10.0)), CONFIG, found)
+    white = white_reference(capture(tmp_path, "white", counts, np.full((2, 60, 7), 10.0)), defects=found)
     np.testing.assert_array_equal(white.bad_bands, [False, False, False, True, False, False, True])
     good = ~white.bad_bands
     np.testing.assert_allclose(white.measured[0, good], LAMP[good], rtol=2e-3)
@@ -247,12 +248,9 @@ def test_target_in_every_frame_is_read_at_its_place_alone(tmp_path):
     counts = rng.uniform(0.0, 5000.0, (40, 60, 7))
     counts[30:38, 4:20] = LAMP + 10.0
     dark = np.full((3, 60, 7), 10.0)
-    config = CalibrationConfig(roi=(4, 30, 20, 38))
-    white = target_white(capture(tmp_path, "frame", counts, dark), config, defects())
+    white = white_reference(capture(tmp_path, "frame", counts, dark), (4, 30, 20, 38), defects())
     np.testing.assert_allclose(white.spectrum, LAMP[None])
     assert white.pixels == white.mask.sum() >= 0.7 * 8 * 16
-    with pytest.raises(InputError, match=r"frame\.hdr: where the white target is.*--calibration\.roi"):
-        target_white(capture(tmp_path, "frame", counts), CONFIG)
 
 
 def test_white_of_a_capture_by_detector_column(tmp_path):
@@ -262,8 +260,7 @@ def test_white_of_a_capture_by_detector_column(tmp_path):
     slab[:, 20, 2] = 60_000.0
     slab[..., 5] = dark[:, 5]
     white_cube, dark_cube = cube_of(tmp_path, "WHITEREF", slab), cube_of(tmp_path, "DARK", np.stack([dark, dark]))
-    config = CalibrationConfig(smoothing_bands=1)
-    white = column_white(white_cube, dark_cube, 60, config, defects(dead=[(20, 2)]))
+    white = column_white(white_cube, dark_cube, 60, defects(dead=[(20, 2)]))
     assert (white.spectrum.shape, white.pixels) == ((60, 7), 3)
     np.testing.assert_array_equal(white.bad_bands, np.arange(7) == 5)
     expected = columns.copy()
@@ -272,7 +269,7 @@ def test_white_of_a_capture_by_detector_column(tmp_path):
     np.testing.assert_allclose(white.dark, dark)
     np.testing.assert_allclose(white.mean_spectrum(), mean_over_columns(expected))
     # Against the frames' detector, or not at all.
-    one = column_white(white_cube, dark_cube, 80, config, defects(dead=[(20, 2)]))
+    one = column_white(white_cube, dark_cube, 80, defects(dead=[(20, 2)]))
     assert (one.spectrum.shape, one.pixels) == ((1, 7), 180)
     np.testing.assert_allclose(one.spectrum[0], np.nanmean(expected, axis=0)[None][0])
 
@@ -282,7 +279,7 @@ def test_white_of_one_line_leaves_no_data_out(tmp_path, gap, header):
     slab = np.broadcast_to(LAMP, (2, 5, 7)).copy()
     slab[0, 3, 1] = slab[:, 4, 2] = gap
     cube = cube_of(tmp_path, "WHITEREF", slab, **header)
-    white = column_white(cube, None, 5, CalibrationConfig(smoothing_bands=1))
+    white = column_white(cube, None, 5)
     expected = np.broadcast_to(LAMP, (5, 7)).copy()
     expected[4, 2] = np.nan
     np.testing.assert_allclose(white.spectrum, expected)
@@ -300,7 +297,7 @@ def test_real_maize_kernel():
         open_cube(MAIZE / f"{name}.hdr")
         for name in ("4-22-22_right_same_B73_top_00", "dark_reference_crop", "white_reference_crop")
     )
-    reference = white_reference(Capture("white", white, dark), CONFIG)
+    reference = white_reference(Capture("white", white, dark))
     every_band = np.arange(kernel.shape[2])
     calibration = FrameCalibration(reference.dark, 1.0 / reference.spectrum, every_band)
     reflectance, valid = unpack(
@@ -315,12 +312,12 @@ def test_real_maize_kernel():
 def test_white_reference_picture(tmp_path):
     tarp = capture(tmp_path, "white", tarp_scene())
     path = tmp_path / "report" / "white_reference.png"
-    white_reference_picture(path, tarp.cube, white_reference(tarp, CONFIG), (598.0, 548.0, 449.0))
+    draw_white_reference(path, tarp.cube, white_reference(tarp), (598.0, 548.0, 449.0))
     picture = cv2.imread(str(path))
     assert picture.shape[0] > 300
     assert picture.std() > 10.0
-    slab = column_white(cube_of(tmp_path, "WHITEREF", np.full((2, 60, 7), 900.0)), None, 60, CONFIG)
-    column_white_picture(path.with_name("columns.png"), slab, WAVELENGTHS_NM)
+    slab = column_white(cube_of(tmp_path, "WHITEREF", np.full((2, 60, 7), 900.0)), None, 60)
+    draw_column_white(path.with_name("columns.png"), slab, WAVELENGTHS_NM)
     assert cv2.imread(str(path.with_name("columns.png"))).std() > 10.0
     path.with_name("columns.png").unlink()
     assert [p.name for p in path.parent.iterdir()] == ["white_reference.png"]

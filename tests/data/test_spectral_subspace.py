@@ -15,9 +15,8 @@ from hsi_sc_nerf.data.spectral_subspace import (
     sample_training_spectra,
 )
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.cube import FLAGGED, pack, write_packed_cube
+from hsi_sc_nerf.packed.cube import FLAGGED, ReflectanceUncertainty, pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import PackedFrame
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 BANDS = 60
 MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"

@@ -11,14 +11,13 @@ from plyfile import PlyData, PlyElement
 from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation import comparison
-from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare
+from hsi_sc_nerf.evaluation.comparison import CompareConfig, Comparison, compare, read_reference
 from hsi_sc_nerf.evaluation.comparison_report import write_comparison
 from hsi_sc_nerf.evaluation.registration import Registration, Rival
-from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
 from hsi_sc_nerf.evaluation.surface_files import read_surface
-from hsi_sc_nerf.evaluation.threshold_curves import score_at
 from hsi_sc_nerf.geometry.similarity import Similarity
-from hsi_sc_nerf.simulate.scores.visible_surface import seen_points
+from hsi_sc_nerf.simulate.scores.visible_surface import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 RADIUS_M, CAMERA_M = 0.04, 0.2
@@ -35,6 +34,11 @@ def write_cloud(path: Path, points: np.ndarray) -> Path:
 
 def on_ball(count: int, seed: int = 0) -> np.ndarray:
     return sample_surface(np.asarray(BALL.vertices), np.asarray(BALL.faces), count, seed)
+
+
+def compared(cloud: Path, reference: Path, config: CompareConfig = CompareConfig()) -> Comparison:  # noqa: B008
+    read = true_reference if reference.is_dir() else read_reference
+    return compare(cloud, read(reference, config), config)
 
 
 @pytest.fixture
@@ -83,13 +87,13 @@ def test_recall_counts_what_is_seen_and_precision_the_whole(session: Path, tmp_p
     quarter = points[(points[:, 0] > RADIUS_M**2 / CAMERA_M) & (points[:, 2] > 0)]
     below = points[points[:, 2] < -0.01][:1000]
     cloud = write_cloud(tmp_path / "cloud.ply", np.concatenate([quarter, below]))
-    found = compare(cloud, session, CompareConfig(points=10_000))
+    found = compared(cloud, session, CompareConfig(points=10_000))
     score = score_at(found.to_reference_m, found.to_cloud_m, 0.002)
     assert found.alignment == "none"
-    assert found.seen_share == pytest.approx(0.2, abs=0.01)
+    assert found.seen_fraction == pytest.approx(0.2, abs=0.01)
     assert (score.precision, score.recall) == pytest.approx((100, 100), abs=0.5)
-    whole = compare(cloud, session, CompareConfig(points=10_000, whole_reference=True))
-    assert whole.seen_share is None
+    whole = compared(cloud, session, CompareConfig(points=10_000, whole_reference=True))
+    assert whole.seen_fraction is None
     assert score_at(whole.to_reference_m, whole.to_cloud_m, 0.002).recall < 60
 
 
@@ -121,26 +125,17 @@ def test_the_command_writes_figures_pictures_and_the_cloud(mesh: Path, tmp_path:
 
 def test_a_mesh_against_itself_in_millimetres_is_exact(mesh: Path, tmp_path: Path) -> None:
     BALL.copy().apply_scale(1000).export(tmp_path / "mm.stl")
-    found = compare(mesh, tmp_path / "mm.stl", CompareConfig(align="none", reference_unit="mm", points=2000))
+    found = compared(mesh, tmp_path / "mm.stl", CompareConfig(align="none", reference_unit="mm", points=2000))
     assert max(found.to_reference_m.max(), found.to_cloud_m.max()) < 1e-6
     with pytest.raises(InputError, match=r"1e\+03 times as large as .* \(--reference-unit"):
-        compare(mesh, tmp_path / "mm.stl", CompareConfig(align="none", points=2000))
+        compared(mesh, tmp_path / "mm.stl", CompareConfig(align="none", points=2000))
     with pytest.raises(InputError, match=r"mm\.stl: is 1e\+03 times as large as .* the cloud has to be in metres"):
-        compare(tmp_path / "mm.stl", mesh, CompareConfig(align="none", points=2000))
-
-
-def test_distances_to_points_are_the_papers_formulas(mesh: Path, tmp_path: Path) -> None:
-    cloud = write_cloud(tmp_path / "cloud.ply", on_ball(500, seed=1))
-    config = CompareConfig(align="none", distances="points", points=400)
-    found = compare(cloud, mesh, config)
-    slow = np.linalg.norm(found.cloud.points_m[:, None] - found.reference.points_m, axis=-1)
-    np.testing.assert_allclose(found.to_reference_m, slow.min(1), rtol=1e-6)
-    np.testing.assert_allclose(found.to_cloud_m, slow.min(0), rtol=1e-6)
+        compared(tmp_path / "mm.stl", mesh, CompareConfig(align="none", points=2000))
 
 
 def test_icp_brings_a_shifted_cloud_back(mesh: Path, tmp_path: Path) -> None:
     cloud = write_cloud(tmp_path / "cloud.ply", on_ball(3000, seed=1) + np.array([0.003, -0.002, 0.001]))
-    found = compare(cloud, mesh, CompareConfig(align="icp", points=20_000))
+    found = compared(cloud, mesh, CompareConfig(align="icp", points=20_000))
     assert found.registration is not None
     np.testing.assert_allclose(found.registration.transform(np.array([[0.003, -0.002, 0.001]])), 0, atol=1e-4)
     assert found.to_reference_m.max() < 2e-4
@@ -150,8 +145,8 @@ def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, tmp_path: Path, monkeyp
     found = Registration(Similarity(), 0.001, Rival(90.0, 0.0001, 0.0001))
     monkeypatch.setattr(comparison, "align_by_features", lambda *_: found)
     with pytest.raises(InputError, match=r"turned by 90 degrees it fits as well .* --align icp"):
-        compare(mesh, mesh, CompareConfig(points=500))
-    accepted = compare(mesh, mesh, CompareConfig(points=500, accept_symmetric=True))
+        compared(mesh, mesh, CompareConfig(points=500))
+    accepted = compared(mesh, mesh, CompareConfig(points=500, accept_symmetric=True))
     write_comparison(tmp_path / "out", accepted, "cloud", "reference")
     assert "Turned by 90 degrees it fits as well" in (tmp_path / "out" / "comparison.md").read_text()
 
@@ -196,14 +191,14 @@ def test_files_that_cannot_be_compared(mesh: Path, tmp_path: Path, name: str, te
 )
 def test_settings_that_make_no_sense(mesh: Path, config: CompareConfig, told: str) -> None:
     with pytest.raises(InputError, match=told):
-        compare(mesh, mesh, config)
+        compared(mesh, mesh, config)
 
 
-def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, tmp_path: Path) -> None:
+def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, session: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no truth"):
-        compare(mesh, tmp_path)
+        compared(mesh, tmp_path)
     with pytest.raises(InputError, match="as for a simulated session"):
-        compare(mesh, tmp_path, CompareConfig(with_scale=True))
+        compared(mesh, session, CompareConfig(with_scale=True))
     thin = write_cloud(tmp_path / "thin.ply", on_ball(20))
     with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few to align by"):
-        compare(thin, mesh, CompareConfig(points=500))
+        compared(thin, mesh, CompareConfig(points=500))

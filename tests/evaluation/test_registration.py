@@ -5,10 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.evaluation.closest_points import plane_step, robust_radius
 from hsi_sc_nerf.evaluation.registration import (
     align_by_features,
+    plane_step,
     refine,
+    robust_radius,
 )
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.similarity import Similarity

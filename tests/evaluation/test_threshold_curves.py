@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from hsi_sc_nerf.evaluation.spatial import f_score, precision_recall_f_score
-from hsi_sc_nerf.evaluation.threshold_curves import (
-    Shape,
+from hsi_sc_nerf.evaluation.spatial import (
+    Surface,
     ThresholdCurves,
     best_threshold_m,
     distance_statistics,
+    f_score,
+    precision_recall_f_score,
     score_at,
     threshold_curves,
     threshold_for_m,
@@ -25,13 +26,13 @@ def on_square(count: int, seed: int = 0) -> np.ndarray:
     return places
 
 
-def distances(cloud: Shape, reference: Shape) -> tuple[np.ndarray, np.ndarray]:
+def distances(cloud: Surface, reference: Surface) -> tuple[np.ndarray, np.ndarray]:
     return reference.distances_m(cloud.points_m), cloud.distances_m(reference.points_m)
 
 
 def test_curves_are_the_papers_formulas_at_each_threshold() -> None:
     rng = np.random.default_rng(2)
-    cloud, reference = Shape(rng.random((300, 3))), Shape(rng.random((200, 3)))
+    cloud, reference = Surface(rng.random((300, 3))), Surface(rng.random((200, 3)))
     thresholds = np.array([0.0, 0.02, 0.1, 0.3])
     curves = threshold_curves(*distances(cloud, reference), thresholds)
     for i, threshold in enumerate(thresholds):
@@ -51,7 +52,7 @@ def test_the_threshold_itself_counts() -> None:
 def test_a_tenth_of_outliers_leaves_nine_tenths_of_precision() -> None:
     good = on_square(9000)
     far = on_square(1000) + np.array([0, 0, 0.05])
-    forth, back = distances(Shape(np.concatenate([good, far])), Shape(on_square(5000, 1), SQUARE, TRIANGLES))
+    forth, back = distances(Surface(np.concatenate([good, far])), Surface(on_square(5000, 1), SQUARE, TRIANGLES))
     score = score_at(forth, back, 0.002)
     assert (score.precision, score.recall) == pytest.approx((90, 100), abs=0.05)
     assert score.f_score == pytest.approx(2 * 90 * 100 / 190, abs=0.05)
@@ -59,7 +60,7 @@ def test_a_tenth_of_outliers_leaves_nine_tenths_of_precision() -> None:
 
 def test_a_missing_half_halves_recall() -> None:
     reference = on_square(20_000)
-    forth, back = distances(Shape(reference[reference[:, 0] < 0.05]), Shape(reference))
+    forth, back = distances(Surface(reference[reference[:, 0] < 0.05]), Surface(reference))
     # The points within the threshold of the cut, 2 mm of 80 mm, still count.
     score = score_at(forth, back, 0.002)
     assert (score.precision, score.recall) == pytest.approx((100, 52.5), abs=0.8)
@@ -70,7 +71,7 @@ def test_noise_along_the_normal_is_within_a_threshold_as_the_normal_distribution
     sigma_m = 0.001
     noisy = on_square(40_000)
     noisy[:, 2] = np.random.default_rng(0).normal(0, sigma_m, len(noisy))
-    to_surface = Shape(on_square(10), SQUARE, TRIANGLES).distances_m(noisy)
+    to_surface = Surface(on_square(10), SQUARE, TRIANGLES).distances_m(noisy)
     curves = threshold_curves(to_surface, np.zeros(1), np.array([threshold_m]))
     assert curves.precision[0] == pytest.approx(100 * (2 * norm.cdf(threshold_m / sigma_m) - 1), abs=0.8)
     statistics = distance_statistics(to_surface)
@@ -83,8 +84,8 @@ def test_noise_along_the_normal_is_within_a_threshold_as_the_normal_distribution
 def test_points_overstate_the_distance_to_a_surface() -> None:
     above = np.array([[0.05, 0.05, 0.003]])
     sampled = np.array([[0.05, 0.054, 0.0]])
-    assert Shape(sampled, SQUARE, TRIANGLES).distances_m(above) == pytest.approx(0.003)
-    assert Shape(sampled).distances_m(above) == pytest.approx(0.005)
+    assert Surface(sampled, SQUARE, TRIANGLES).distances_m(above) == pytest.approx(0.003)
+    assert Surface(sampled).distances_m(above) == pytest.approx(0.005)
 
 
 def test_the_knee_is_where_a_broken_line_breaks() -> None:

@@ -42,7 +42,7 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["cloud.las"]
 
 
-def test_las_says_how_many_bands_it_holds(tmp_path: Path) -> None:
+def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     fits = cloud(2, 336)
     write_cloud(tmp_path / "fits", stream(fits), "las")

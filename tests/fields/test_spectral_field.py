@@ -6,11 +6,9 @@ from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
-from hsi_sc_nerf.fields.band_groups import BandGroupField, composite_band_groups, group_sizes, weights_of_depths
-from hsi_sc_nerf.fields.basis_decoder import BasisDecoder
-from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+from hsi_sc_nerf.fields.spectral_field import BandGroupField, SpectralField, SpectralProposalField, group_sizes
+from hsi_sc_nerf.models.renderers import composite_band_groups, weights_of_depths
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])
 SIZE = {
     "num_images": 3,
@@ -80,27 +78,6 @@ def test_coefficients_start_at_the_mean_and_are_not_bounded():
     assert coefficients.std(dim=(0, 1)).min() > 0
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_decoding_commutes_with_compositing(device):
-    generator = torch.Generator().manual_seed(0)
-    decoder = BasisDecoder(
-        torch.randn(204, 8, generator=generator),
-    ).to(device)
-    coefficients = torch.randn(16, 24, 8, generator=generator).to(device)
-    weights = torch.rand(16, 24, 1, generator=generator).softmax(1).to(device)
-    once = decoder((weights * coefficients).sum(-2))
-    torch.testing.assert_close(once, (weights * decoder(coefficients)).sum(-2), rtol=1e-5, atol=2e-6)
-
-
-def test_only_a_learnable_basis_learns():
-    basis = torch.rand(4, 2)
-    fixed, learnable = BasisDecoder(basis), BasisDecoder(basis, learnable=True)
-    assert not list(fixed.parameters())
-    learnable(torch.ones(2)).sum().backward()
-    torch.testing.assert_close(learnable.basis.grad, torch.ones(4, 2))
-    learnable.load_state_dict(fixed.state_dict())
-
-
 @pytest.mark.parametrize("distortion", [None, contraction()])
 @pytest.mark.parametrize("kind", ["one density", "band groups"])
 def test_density_gradient_is_that_of_the_log_density(distortion, kind):
@@ -141,19 +118,6 @@ def test_groups_are_neighbours_and_even():
     for groups in (0, 8):
         with pytest.raises(ValueError, match="7 bands"):
             group_sizes(7, groups)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_two_densities_give_the_slab_its_two_transmittances(device):
-    # A slab of reflectance r in front of nothing sends r (1 - exp(-sigma d)), however it is sampled.
-    density, reflectance, thickness, samples = torch.tensor([0.7, 9.0]), torch.tensor([0.2, 0.6, 0.9]), 0.5, 40
-    lengths = torch.rand(4, samples, 1, generator=torch.Generator().manual_seed(0))
-    lengths *= thickness / lengths.sum(1, keepdim=True)
-    channels = torch.cat([reflectance.expand(4, samples, 3), lengths * density], -1).to(device)
-    spectra, opacity = composite_band_groups(channels, (1, 2))
-    stopped = (1 - torch.exp(-density * thickness))[[0, 1, 1]]
-    torch.testing.assert_close(opacity.cpu(), stopped.expand(4, 3), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(spectra.cpu(), (reflectance * stopped).expand(4, 3), rtol=1e-5, atol=1e-6)
 
 
 def test_weights_are_nerfstudios():

@@ -7,15 +7,13 @@ import pytest
 import torch
 
 from hsi_sc_nerf.models.losses import (
-    CHARBONNIER_SCALE,
     DIRECTION_FLOOR,
     angle_loss,
     angular_loss,
-    charbonnier_loss,
     hsi_loss,
 )
 
-LOSSES = [hsi_loss, angular_loss, charbonnier_loss, angle_loss]
+LOSSES = [hsi_loss, angular_loss, angle_loss]
 
 
 def pair(shape: tuple[int, ...] = (5, 6, 31)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -219,29 +217,8 @@ def test_a_validity_that_does_not_fit_is_refused(loss) -> None:
             loss(predicted, target, None, valid)
 
 
-def test_charbonnier_is_the_square_of_small_errors_and_linear_in_large_ones() -> None:
-    target = torch.full((4, 9), 0.5)
-    small, large = 1e-5, 0.4
-    assert charbonnier_loss(target + small, target).item() == pytest.approx(small**2, rel=2e-3)
-    expected = 2 * CHARBONNIER_SCALE**2 * (math.sqrt(1 + (large / CHARBONNIER_SCALE) ** 2) - 1)
-    assert charbonnier_loss(target + large, target).item() == pytest.approx(expected, rel=1e-6)
-    predicted = (target + large).requires_grad_()
-    charbonnier_loss(predicted, target).backward()
-    assert predicted.grad.sum().item() == pytest.approx(2 * CHARBONNIER_SCALE, rel=2e-3)
-
-
 def test_the_angle_loss_is_the_angle() -> None:
     angles = torch.tensor([0.0, 1e-5, 0.3, 2.0], dtype=torch.float64)
     predicted = torch.stack([torch.cos(angles), torch.sin(angles)], dim=-1)
     target = torch.tensor([3.0, 0.0], dtype=torch.float64).expand(4, 2)
     assert angle_loss(predicted, target).item() == pytest.approx(angles.mean().item(), rel=1e-12)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_band_weights_count_a_band_as_often_as_they_say(loss) -> None:
-    """Whole weights are the loss of spectra in which each band stands that many times."""
-    predicted, target = pair((5, 6, 4))
-    weights = torch.tensor([0, 1, 3, 2])
-    repeated = (values.repeat_interleave(weights, dim=-1) for values in (predicted, target))
-    weighted = loss(predicted, target, half_mask(), None, weights / weights.float().mean())
-    assert weighted.item() == pytest.approx(loss(*repeated, half_mask()).item(), rel=1e-5)

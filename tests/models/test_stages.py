@@ -24,12 +24,12 @@ def test_defaults_are_the_papers_iterations():
 
 
 @pytest.mark.parametrize("total", [1, 2, 7, 301])
-def test_shares_always_add_up_to_the_total(total):
+def test_fractions_add_up_to_the_total(total):
     plan = plan_stages((StageConfig("a", 0.3), StageConfig("b", 0.7)), total)
     assert plan.num_iterations == total == sum(lengths(plan))
 
 
-def test_own_lengths_go_before_shares():
+def test_lengths_replace_fractions():
     configs = (StageConfig("a", 0.5), StageConfig("b", 0.5, num_iterations=30))
     assert lengths(plan_stages(configs, 100)) == [70, 30]
     both = (StageConfig("a", 0.5, num_iterations=10), StageConfig("b", 0.5, num_iterations=30))
@@ -45,7 +45,7 @@ def test_a_stage_of_no_steps_is_left_out():
 def test_impossible_plans_are_refused():
     with pytest.raises(ValueError, match="exceed"):
         plan_stages((StageConfig("a", 0.5, num_iterations=10), StageConfig("b", 0.5)), 5)
-    with pytest.raises(ValueError, match="shares add up to 0"):
+    with pytest.raises(ValueError, match="fractions add up to 0"):
         plan_stages((StageConfig("a", 0.0), StageConfig("b", 0.0)), 5)
     with pytest.raises(ValueError, match="no iterations"):
         plan_stages((StageConfig("a", 1.0),), 0)
@@ -76,11 +76,6 @@ def test_released_schedule_hardly_decays_over_the_stages():
     assert exponential_decay(0.01, 200_000, 300_000) == 0.01
 
 
-def test_warm_up_rises_from_nearly_nothing():
-    stage = Stage(StageConfig("a", 1.0, lr_end=1.0, warmup_iterations=4), start=0, end=100)
-    assert [stage.lr_factor(step, "fields") for step in (0, 1, 4, 50)] == pytest.approx([0.2, 0.4, 1.0, 1.0])
-
-
 def test_poses_move_once_the_scene_has_a_shape():
     first = Stage(StageConfig("a", 1.0, learn_after={"camera_opt": 0.25}), start=10, end=30)
     assert [step for step in range(10, 30) if first.learns("camera_opt", step)] == list(range(15, 30))
@@ -90,8 +85,9 @@ def test_poses_move_once_the_scene_has_a_shape():
 
 
 def test_any_group_can_be_frozen():
-    stage = Stage(StageConfig("b", 1.0, frozen_groups=("camera_opt", "background")), start=30, end=50)
-    assert [stage.learns(group, 49) for group in ("camera_opt", "background", "fields")] == [False, False, True]
+    groups = ("camera_opt", "proposal_networks", "fields")
+    stage = Stage(StageConfig("b", 1.0, frozen_groups=groups[:2]), start=30, end=50)
+    assert [stage.learns(group, 49) for group in groups] == [False, False, True]
     assert Stage(masked_stage(), 0, 2).learns("camera_opt", 1) is False
 
 
@@ -103,9 +99,9 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"foreground_share": 1.2}, "foreground-share 1.2"),
-        ({"rim_share": -0.1}, "rim-share -0.1"),
-        ({"share": -0.5}, "share -0.5 is below 0"),
+        ({"foreground_ray_fraction": 1.2}, "foreground-ray-fraction 1.2"),
+        ({"boundary_ray_fraction": -0.1}, "boundary-ray-fraction -0.1"),
+        ({"fraction": -0.5}, "fraction -0.5 is below 0"),
         ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
         ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
         ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),
@@ -114,8 +110,8 @@ def test_a_stage_sets_the_loss_weights_that_it_names():
 )
 def test_impossible_stages_are_refused(fields, sentence):
     with pytest.raises(ValueError, match=f"late: .*{sentence}"):
-        StageConfig("late", **({"share": 1.0, "learn_after": {}} | fields)).check(("fields", "camera_opt"))
-    StageConfig("late", 1.0, foreground_share=1.0).check(("fields", "camera_opt"))
+        StageConfig("late", **({"fraction": 1.0, "learn_after": {}} | fields)).check(("fields", "camera_opt"))
+    StageConfig("late", 1.0, foreground_ray_fraction=1.0).check(("fields", "camera_opt"))
 
 
 def test_a_completed_stage_is_followed_by_the_next_however_long_it_was():

@@ -17,12 +17,12 @@ from hsi_sc_nerf.packed.cube import (
     LARGEST_REFLECTANCE,
     REFLECTANCE_SCALE,
     PixelFlag,
+    ReflectanceUncertainty,
     pack,
     unpack,
     write_packed_cube,
 )
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
-from hsi_sc_nerf.packed.uncertainty import ReflectanceUncertainty
 
 WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
 
@@ -111,7 +111,7 @@ def test_flags(dataset):
     assert flags.dtype == np.uint8
     np.testing.assert_array_equal(flags == PixelFlag.SATURATED, np.eye(4, 5, dtype=bool))
     dataset.frames[0].flags_path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture of flags"):
+    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture"):
         dataset.frames[0].flags()
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.packed.pixels import RIM_PX, PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PixelReader, PixelSampler, spread_over
 
 SHAPE = (5, 7, 4)
 INDICES = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
@@ -46,10 +46,7 @@ def sampler(tmp_path, counts, masks):
     return make
 
 
-@pytest.mark.parametrize("by_position", [True, False])
-def test_reading_equals_indexing_one_by_one(tmp_path, counts, monkeypatch, by_position):
-    if not by_position:  # as on Windows
-        monkeypatch.delattr("os.pread")
+def test_reading_equals_indexing_one_by_one(tmp_path, counts):
     read = reader_of(tmp_path, counts).read(INDICES)
     np.testing.assert_array_equal(read, [counts[f, line, sample] for f, line, sample in INDICES])
 
@@ -140,51 +137,51 @@ def test_a_step_always_gives_the_same_batch_and_another_step_another(sampler):
     assert (first["indices"] != other["indices"]).any()
 
 
-def test_foreground_share_is_kept(sampler, masks):
-    batch = sampler(200).sample(0, foreground_share=0.75)
+def test_foreground_fraction_is_kept(sampler, masks):
+    batch = sampler(200).sample(0, foreground_ray_fraction=0.75)
     frame, line, sample = batch["indices"].T
     np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
     assert batch["mask"].sum() == 150
 
 
-def test_a_share_of_the_rest_lies_on_the_rim(tmp_path):
+def test_a_fraction_of_the_background_lies_on_the_boundary(tmp_path):
     masks = np.zeros((2, 20, 30), bool)
     masks[0, 8:12, 10:15] = masks[1, 0, 0] = True
     counts = np.zeros((*masks.shape, 4), np.uint16)
     pixels = PixelSampler(reader_of(tmp_path, counts), masks, 4000, 0, has_flagged=False)
     from_object = np.stack([distance_transform_edt(~mask) for mask in masks])
-    frame, line, sample = pixels.sample(0, foreground_share=0.5, rim_share=0.75)["indices"].T
+    frame, line, sample = pixels.sample(0, foreground_ray_fraction=0.5, boundary_ray_fraction=0.75)["indices"].T
     distances = from_object[frame, line, sample]
     assert (distances == 0).sum() == 2000
-    rim, rest = distances[2500:], distances[2000:2500]
-    assert rim.min() >= 1.0
-    assert rim.max() < RIM_PX + 1.0
+    boundary, rest = distances[2500:], distances[2000:2500]
+    assert boundary.min() >= 1.0
+    assert boundary.max() < BOUNDARY_PX + 1.0
     assert rest.max() > 10.0
-    # Every pixel within the rim's width.
+    # Every pixel within the boundary's width.
     drawn = np.unique(np.stack([frame, line, sample])[:, 2500:], axis=1).shape[1]
-    assert drawn >= ((from_object > 0) & (from_object <= RIM_PX)).sum()
+    assert drawn >= ((from_object > 0) & (from_object <= BOUNDARY_PX)).sum()
 
 
-@pytest.mark.parametrize("share", [None, 0.0, 0.5, 1.0])
-def test_pixels_are_drawn_evenly(sampler, masks, share):
+@pytest.mark.parametrize("fraction", [None, 0.0, 0.5, 1.0])
+def test_pixels_are_drawn_evenly(sampler, masks, fraction):
     drawn = 20_000
-    batch = sampler(drawn).sample(0, share)
+    batch = sampler(drawn).sample(0, fraction)
     counts = np.zeros(masks.shape)
     np.add.at(counts, tuple(batch["indices"].T), 1)
-    if share is None:
+    if fraction is None:
         expected = np.full(masks.shape, drawn / masks.size)
     else:
-        expected = drawn * np.where(masks, share / masks.sum(), (1.0 - share) / (~masks).sum())
+        expected = drawn * np.where(masks, fraction / masks.sum(), (1.0 - fraction) / (~masks).sum())
     assert (abs(counts - expected) <= 6 * np.sqrt(expected)).all()
 
 
-def test_the_rest_is_found_without_a_list_of_it(sampler, masks):
+def test_the_background_is_found_without_a_list_of_it(sampler, masks):
     rest = np.flatnonzero(~masks)
-    np.testing.assert_array_equal(sampler(1)._rest(np.arange(len(rest))), rest)
+    np.testing.assert_array_equal(sampler(1)._background(np.arange(len(rest))), rest)
 
 
 @pytest.mark.parametrize(
-    ("share", "covered", "sentence"),
+    ("fraction", "covered", "sentence"),
     [
         (0.75, False, "are empty"),
         (1.0, False, "are empty"),
@@ -193,11 +190,11 @@ def test_the_rest_is_found_without_a_list_of_it(sampler, masks):
     ],
 )
 def test_without_an_object_or_anything_else_there_is_nothing_to_train_on(
-    tmp_path, counts, masks, share, covered, sentence
+    tmp_path, counts, masks, fraction, covered, sentence
 ):
     pixels = PixelSampler(reader_of(tmp_path, counts), np.full_like(masks, covered), 8, 0, has_flagged=False)
     with pytest.raises(InputError, match=f"masks of all training frames {sentence}"):
-        pixels.sample(0, share, rim_share=0.5)
+        pixels.sample(0, fraction, boundary_ray_fraction=0.5)
     assert (pixels.sample(0, float(covered))["mask"] == covered).all()
 
 

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.pixel_counts import Tally
-from hsi_sc_nerf.calibration.reflectance import FrameCalibration
+from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PixelCounts
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
@@ -67,8 +66,8 @@ def test_everything_is_written_upright(cube, tmp_path):
     np.testing.assert_allclose(cache.gray / 255.0, expected[..., 1:5].mean(axis=-1), atol=0.5 / 255 + 1e-4)
     bins = np.moveaxis(expected, -1, 0).astype(np.float32)
     np.testing.assert_allclose(cache.score, foreground_score(bins), atol=1e-4)
-    assert cache.tally.saturated.tolist() == [0, 0, 1, 0, 0]
-    assert cache.tally.clipped_low.min() > 0
+    assert cache.pixel_counts.saturated.tolist() == [0, 0, 1, 0, 0]
+    assert cache.pixel_counts.clipped_low.min() > 0
     assert not list((tmp_path / "data").rglob("*partial*"))
 
 
@@ -90,7 +89,7 @@ def test_finished_reflectance_goes_the_same_way(tmp_path):
     reflectance, valid = unpack(open_cube(paths.cube).read())
     np.testing.assert_array_equal(valid, stored != -9999.0)
     np.testing.assert_allclose(reflectance[valid], stored[valid] / 10_000, atol=1e-5)
-    assert cache.tally.no_data.tolist() == [25] * BANDS
+    assert cache.pixel_counts.no_data.tolist() == [25] * BANDS
     assert cache.score[2, 2] < 1e-6
 
 
@@ -100,8 +99,10 @@ def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
     assert again.fingerprint == "made"
     np.testing.assert_array_equal(again.gray, cache.gray)
     np.testing.assert_array_equal(again.score, cache.score)
-    for field in fields(Tally):
-        np.testing.assert_array_equal(getattr(again.tally, field.name), getattr(cache.tally, field.name))
+    for field in fields(PixelCounts):
+        np.testing.assert_array_equal(
+            getattr(again.pixel_counts, field.name), getattr(cache.pixel_counts, field.name)
+        )
     assert read_cache(paths, "other files") is None
 
 

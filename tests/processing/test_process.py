@@ -26,7 +26,7 @@ from capture_factory import (
     write_session,
 )
 
-from hsi_sc_nerf.calibration.config import CalibrationConfig, LampDriftConfig
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
@@ -184,7 +184,7 @@ def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
 
 def test_a_changed_capture_is_done_again_alone(session, tmp_path):
     # All of that frame gets darker, which would be taken for the lamps.
-    config = ProcessConfig(calibration=CalibrationConfig(lamp_drift=LampDriftConfig(correct="never")))
+    config = ProcessConfig(calibration=CalibrationConfig(lamp_drift="never"))
     output = run(session, tmp_path / "data", config)
     before = written(output)
     write_capture(session, "ball_3", expose(frame_reflectance(180.0) * 0.9))

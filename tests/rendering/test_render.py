@@ -12,12 +12,11 @@ from PIL import Image
 from hsi_sc_nerf.cli.render import RenderCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import pixel_rays
+from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
 from hsi_sc_nerf.models import trained_run
-from hsi_sc_nerf.models.camera_background import in_camera_frame
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.cubes import RenderedView, write_view
-from hsi_sc_nerf.rendering.pictures import find_look
-from hsi_sc_nerf.rendering.video import open_video
+from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import orbit_poses, views_of_orbit, views_of_path
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.spectra.indices import INDICES
@@ -62,31 +61,31 @@ def test_an_orbit_is_one_turn_before_a_chamber_that_stands_still():
     np.testing.assert_allclose(poses, [factory.true_pose(angle) for angle in (0.0, 90.0, 180.0, 270.0)], atol=1e-12)
 
 
-def test_looks_are_the_viewers_pictures():
+def test_false_colours_are_the_viewers():
     wavelengths_nm = np.arange(400.0, 1001.0, 10.0)
     values = torch.rand(3, 4, len(wavelengths_nm), generator=torch.Generator().manual_seed(0))
     opacity = torch.ones(3, 4)
     opacity[0] = 0.2
     view = RenderedView(values, opacity)
     bands = [int(np.abs(wavelengths_nm - nm).argmin()) for nm in COMPOSITES["CIR"].wavelengths_nm]
-    look = find_look("cir", wavelengths_nm)
-    assert look.name == "CIR"
-    torch.testing.assert_close(look.paint(view), values[..., bands])
-    painted = find_look("ndvi", wavelengths_nm).paint(view)
+    cir = find_false_colour("cir", wavelengths_nm)
+    assert cir.name == "CIR"
+    torch.testing.assert_close(cir.colours(view), values[..., bands])
+    painted = find_false_colour("ndvi", wavelengths_nm).colours(view)
     assert (painted[0] == 0.25).all()
     assert (painted[1:] != 0.25).any(dim=-1).all()
     with pytest.raises(InputError, match=f"choose from .*{next(iter(INDICES))}"):
-        find_look("beauty", wavelengths_nm)
+        find_false_colour("beauty", wavelengths_nm)
     with pytest.raises(InputError, match="needs a band near"):
-        find_look("NDVI", wavelengths_nm[wavelengths_nm < 650.0])
+        find_false_colour("NDVI", wavelengths_nm[wavelengths_nm < 650.0])
 
 
 def test_a_video_holds_its_frames(tmp_path):
     path = tmp_path / "video.mp4"
     shades = (20, 120, 220)
-    with open_video(path, 5) as add:
+    with open_video(path, 5) as add_frame:
         for shade in shades:
-            add(np.full((33, 47, 3), shade, np.uint8))
+            add_frame(np.full((33, 47, 3), shade, np.uint8))
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.average_rate) == ("h264", 5)
@@ -162,7 +161,7 @@ def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
     assert Image.open(tmp_path / "out" / f"{HELD_OUT}.png").width > 1000
 
 
-def test_an_orbit_of_another_size_has_no_truth_and_no_cubes_if_so_wished(tmp_path, run, monkeypatch):
+def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
     monkeypatch.setattr(trained_run, "open_run", lambda _: run)
     RenderCommand(
         tmp_path,

@@ -17,12 +17,9 @@ from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report import build
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.comparison_section import comparison_section
-from hsi_sc_nerf.report.places import inner_places, place_spectra
-from hsi_sc_nerf.report.rendering import HeldOutView
-from hsi_sc_nerf.report.scores import score_view
-from hsi_sc_nerf.report.settings import settings_section
-from hsi_sc_nerf.report.traits_section import trait_rows, traits_section
+from hsi_sc_nerf.report.held_out_views import HeldOutView, inner_places, place_spectra, score_view
+from hsi_sc_nerf.report.result_sections import comparison_section, trait_rows, traits_section
+from hsi_sc_nerf.report.run_sections import settings_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 SECTIONS = ["object", "views", "bands", "spectra", "comparison", "traits", "training"]
@@ -75,10 +72,7 @@ def ball(wavelengths_nm, count=4000):
 def run(flagged_dataset, tmp_path, monkeypatch):
     """A run's folder with a cloud; its model is not opened, its views are not rendered."""
     dataset = replace(open_packed(flagged_dataset), object_name=HOSTILE)
-    cloud = ball(dataset.wavelengths_nm)
-    write_spectral_ply(
-        tmp_path / "point_cloud.ply", cloud.points, cloud.normals, cloud.colours, cloud.spectra, cloud.wavelengths_nm
-    )
+    write_spectral_ply(tmp_path / "point_cloud.ply", ball(dataset.wavelengths_nm))
     views = [held_out_view(dataset, index) for index in (2, 7)]
     opened = SimpleNamespace(dataset=dataset, manager=SimpleNamespace(eval_dataset=views))
     monkeypatch.setattr(build, "_opened", lambda folder: opened)

@@ -11,7 +11,7 @@ from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.rendering import PLACES, render_held_out
+from hsi_sc_nerf.report.held_out_views import PLACES, render_held_out
 
 
 @pytest.fixture(scope="module")

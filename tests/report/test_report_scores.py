@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from hsi_sc_nerf.report.logs import read_scalars, shortened, stage_ends
-from hsi_sc_nerf.report.places import inner_places, place_spectra
-from hsi_sc_nerf.report.scores import object_angles, over_views, score_view, spread_of_views
-from hsi_sc_nerf.report.settings import changed_settings, flat_settings
+from hsi_sc_nerf.report.held_out_views import (
+    inner_places,
+    object_angles,
+    over_views,
+    place_spectra,
+    score_view,
+    spread_of_views,
+)
+from hsi_sc_nerf.report.run_sections import changed_settings, flat_settings, read_scalars, shortened, stage_ends
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 

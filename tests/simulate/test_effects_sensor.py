@@ -11,7 +11,6 @@ import pytest
 from scipy import stats
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.config import CalibrationConfig
 from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import open_session
@@ -125,7 +124,7 @@ def test_calibration_of_a_noisy_white_sphere_is_unbiased(tmp_path):
     noisy = dataclasses.replace(quiet_scene, effects=read_effects(["photon_noise", "read_noise", "dark_pattern"], ""))
     simulate_session(noisy, tmp_path / "s", False)
     session, truth = open_session(tmp_path / "s"), load_truth(tmp_path / "s")
-    white = white_reference(session.white, CalibrationConfig(smoothing_bands=1)).spectrum
+    white = white_reference(session.white).measured
     for capture in session.frames:
         dark = capture.dark.read().mean(axis=0)
         # Without the clip to [0, 1], which halves the noise of what is white and so moves its mean.

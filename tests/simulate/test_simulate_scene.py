@@ -125,7 +125,7 @@ def test_layout_is_square_planar_distinct_and_faces_outwards():
 
 
 def test_every_effect_and_strength_is_documented():
-    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "development" / "effects.md").read_text(encoding="utf-8")
     for name, effect in EFFECTS.items():
         (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
         for strength in dataclasses.fields(effect):

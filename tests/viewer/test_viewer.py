@@ -15,12 +15,12 @@ from viser.transforms import SO3
 from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.plotting.false_colour import BLANK, angle_to_measured, coloured, frame_pixels
+from hsi_sc_nerf.plotting.false_colour import BLANK, coloured
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.panel import SpectralPanel
 from hsi_sc_nerf.viewer.picking import pick
-from hsi_sc_nerf.viewer.training_views import TrainingViews
+from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 LENS = PinholeIntrinsics(w=40, h=30, fl_x=50.0, fl_y=60.0, cx=19.0, cy=16.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.lamp_drift import LampDrift
+from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import Session
@@ -64,7 +64,7 @@ def score_calibration(
         flagged += int((~valid).sum())
         values += valid.size
     drift_rms = float("nan")
-    if isinstance(calibration.drift, LampDrift):
+    if isinstance(calibration.drift, LampDriftEstimate):
         light = np.stack([lamp_output(truth, capture.name) for capture in session.frames])
         drift_rms = float(np.sqrt(np.mean((calibration.drift.factor / (light / light[0]) - 1.0) ** 2)))
     return CalibrationScore(

@@ -3,19 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.meshes.mesh import ray_scene
-from hsi_sc_nerf.simulate.truth import Truth
+from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
 COVERED = 0.5
 """Share of a pixel that the object must cover for the pixel to show it."""
 LIFT_M = 1e-5
 """How far above its own surface a point's line of sight starts."""
+
+
+def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:
+    """The true surface of a simulated session, for `hsi_sc_nerf.evaluation.comparison.compare`.
+
+    Args:
+        session_dir: folder of the session.
+        config: settings of the comparison.
+        track: shows progress.
+
+    Raises:
+        InputError: the session has no truth, no view shows its object, or the unit is not metres.
+    """
+    if config.reference_unit != "m":
+        raise InputError(f"{session_dir}: a simulated session's truth is in metres; leave out --reference-unit.")
+    truth = load_truth(session_dir)
+    surface, seen = surface_of(truth.mesh_path, config), None
+    if not config.whole_reference:
+        assert surface.vertices_m is not None
+        assert surface.triangles is not None
+        mesh = surface.vertices_m, surface.triangles
+        seen = seen_points(
+            truth, surface.points_m, *mesh, lambda captures: track(captures, "Finding what the views see")
+        )
+        if not seen.any():
+            raise InputError(f"{session_dir}: no view shows the object; simulate the session again.")
+    return Reference(str(session_dir), surface, seen, align="none")
 
 
 def seen_points(

@@ -1,0 +1,168 @@
+"""What `mkdocs build` makes from the code and from the CSV files of the benchmarks.
+
+A page says ``{{ results("pose_hard_cases") }}`` where the table of ``benchmarks/results/pose_hard_cases.csv`` stands.
+The pages on commands and settings are made from the code's own help texts.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import csv
+import dataclasses
+import inspect
+import io
+import os
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import tyro
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+from hsi_sc_nerf.cli.main import Commands
+
+RESULTS = Path(__file__).parent / "results"
+SOURCE_COLUMNS = ("commit", "seed", "machine")
+TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Put the results' tables into a page."""
+    return TABLE.sub(lambda match: results_table(match.group(1)), markdown)
+
+
+def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
+    """Add the pages that are made from the code."""
+    for name, content in (("commands", commands_page()), ("settings", settings_page())):
+        files.append(File.generated(config, f"reference/{name}.md", content=content))
+    return files
+
+
+def results_table(name: str, folder: Path = RESULTS) -> str:
+    """A results file as a Markdown table, and a line that says where its figures come from.
+
+    Raises:
+        PluginError: there is no such file, or it does not say where its figures come from.
+    """
+    path = folder / f"{name}.csv"
+    if not path.is_file():
+        raise PluginError(f"{path}: a page asks for this table, but there is no such file.")
+    with path.open(encoding="utf-8", newline="") as file:
+        columns, *rows = list(csv.reader(file))
+    if tuple(columns[-len(SOURCE_COLUMNS) :]) != SOURCE_COLUMNS or not rows:
+        raise PluginError(f"{path}: needs rows, and {', '.join(SOURCE_COLUMNS)} as its last columns.")
+    shown = [columns, ["---"] * len(columns), *rows]
+    lines = [f"| {' | '.join(cell.strip() for cell in row[: -len(SOURCE_COLUMNS)])} |" for row in shown]
+    sources = {tuple(row[-len(SOURCE_COLUMNS) :]) for row in rows}
+    told = "; ".join(f"commit {commit}, seed {seed}, {machine}" for commit, seed, machine in sorted(sources))
+    return "\n".join([*lines, "", f"*`benchmarks/results/{name}.csv`: {told}.*"])
+
+
+def readme_table(folder: Path = RESULTS) -> str:
+    """The README's table: held-out views by ours and the published method in equal time; the paper's figures."""
+    with (folder / "beyond_the_paper.csv").open(encoding="utf-8", newline="") as file:
+        _, *rows = list(csv.reader(file))
+    titles = ["object", "method", "SAM, rad", "RMSE", "SSIM", "PSNR, dB", "F-score of what is seen at 2 mm, %"]
+    methods = {
+        "paper, its own fruit": "printed in the paper, real fruit",
+        "paper": "published method",
+        "ours": "ours",
+    }
+    lines = [titles, ["---"] * len(titles)]
+    lines += [[row[0], methods[row[1]], *row[3:7], row[11]] for row in rows if row[1] in methods]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def commands_page() -> str:
+    """The help texts of all commands."""
+    parts = [
+        "# Commands",
+        "Each text is what the command's `--help` prints. The commands `ns-...` are nerfstudio's.",
+    ]
+    for command in ("", *command_names()):
+        title = f"hsi-sc-nerf {command}".strip()
+        parts.append(f"## `{title}`\n\n```text\n{help_text(command)}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def command_names() -> list[str]:
+    """The commands, in the order in which the help lists them."""
+    return [get_args(command)[1].name for command in get_args(Commands)]
+
+
+def help_text(command: str) -> str:
+    """What ``hsi-sc-nerf COMMAND --help`` prints, 110 characters wide and without colours."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit), _plain_terminal():
+        tyro.cli(Commands, prog="hsi-sc-nerf", args=[*([command] if command else []), "--help"])  # type: ignore[call-overload]
+    return re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
+
+
+@contextlib.contextmanager
+def _plain_terminal() -> Iterator[None]:
+    before = dict(os.environ)
+    os.environ.update(COLUMNS="110", NO_COLOR="1", TERM="dumb")
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def settings_page() -> str:
+    """The settings of `ns-train hsi-sc-nerf` that this package adds or whose default it changes."""
+    from hsi_sc_nerf.config import hsi_sc_nerf
+
+    config = hsi_sc_nerf.config
+    parts = [
+        "# Training settings",
+        "Settings of `ns-train hsi-sc-nerf` that this package defines; its `--help` lists nerfstudio's as well.",
+    ]
+    groups = {
+        "": config,
+        "full-frame": config.full_frame,
+        "masked": config.masked,
+        "pipeline.datamanager": config.pipeline.datamanager,
+        "pipeline.datamanager.dataparser": config.pipeline.datamanager.dataparser,
+        "pipeline.model": config.pipeline.model,
+        "pipeline.model.camera-optimizer": config.pipeline.model.camera_optimizer,
+    }
+    for prefix, settings in groups.items():
+        dotted = f"{prefix}." if prefix else ""
+        rows = [
+            f"| `--{dotted}{name.replace('_', '-')}` | `{_short(getattr(settings, name))}` | {text} |"
+            for name, text in documented_fields(type(settings)).items()
+        ]
+        if rows:
+            title = f"`--{prefix}`" if prefix else "The run"
+            parts += [f"## {title}", "\n".join(["| setting | default | meaning |", "| --- | --- | --- |", *rows])]
+    return "\n\n".join(parts) + "\n"
+
+
+def documented_fields(settings: type) -> dict[str, str]:
+    """Fields that a dataclass itself defines, with the text below each."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(settings))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    names = {field.name for field in dataclasses.fields(settings)}
+    texts: dict[str, str] = {}
+    for field, text in zip(body.body, body.body[1:], strict=False):
+        if (
+            isinstance(field, ast.AnnAssign)
+            and isinstance(field.target, ast.Name)
+            and field.target.id in names
+            and isinstance(text, ast.Expr)
+            and isinstance(text.value, ast.Constant)
+        ):
+            texts[field.target.id] = " ".join(str(text.value.value).split()).replace("|", "\\|")
+    return texts
+
+
+def _short(value: object) -> str:
+    text = str(value).replace("|", "\\|")
+    return text if len(text) < 60 else f"{text[:57]}..."

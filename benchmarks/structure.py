@@ -1,0 +1,144 @@
+"""The package's structure in figures and as a picture: folders, their lines, who imports whom, import circles.
+
+uv run python benchmarks/structure.py --picture docs/images/structure.png
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import networkx
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+PACKAGE = "hsi_sc_nerf"
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Count files, lines and import circles of a checkout; draw its folders and their imports."""
+
+    root: Path = Path(__file__).parents[1]
+    """The checkout."""
+    picture: Path | None = None
+    """PNG file for the picture."""
+
+    def main(self) -> None:
+        """Print the table, draw the picture."""
+        lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in python_files(self.root)}
+        imports = module_imports(self.root)
+        circles = [circle for circle in networkx.strongly_connected_components(imports) if len(circle) > 1]
+        tests = list((self.root / "tests").rglob("*.py"))
+        table = Table("what", "number")
+        table.add_row("files", str(len(lines)))
+        table.add_row("lines", f"{sum(lines.values())}")
+        table.add_row("lines of benchmarks", f"{count_lines(self.root / 'benchmarks')}")
+        table.add_row(
+            "lines of tests", f"{sum(len(path.read_text(encoding='utf-8').splitlines()) for path in tests)}"
+        )
+        table.add_row("largest folder, files", str(max(Counter(path.parent for path in lines).values())))
+        table.add_row("files in import circles", str(sum(map(len, circles))))
+        table.add_row("import circles", str(len(circles)))
+        Console().print(table)
+        if self.picture is not None:
+            sizes = Counter[str]()
+            for path, count in lines.items():
+                sizes[folder_of(".".join(path.relative_to(self.root).with_suffix("").parts))] += count
+            draw(folder_imports(imports), sizes, self.picture)
+
+
+def python_files(root: Path) -> list[Path]:
+    """The package's modules."""
+    return sorted((root / PACKAGE).rglob("*.py"))
+
+
+def count_lines(folder: Path) -> int:
+    """Lines of all Python files below a folder."""
+    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob("*.py"))
+
+
+def module_imports(root: Path) -> networkx.DiGraph:
+    """Edges from importing to imported modules, imports inside functions and for type checking included."""
+    modules = {".".join(path.relative_to(root).with_suffix("").parts): path for path in python_files(root)}
+    graph = networkx.DiGraph()
+    for name, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(PACKAGE):
+                for alias in node.names:
+                    whole = f"{node.module}.{alias.name}"
+                    target = whole if whole in modules else node.module
+                    if target in modules:
+                        graph.add_edge(name, target)
+    return graph
+
+
+def folder_of(module: str) -> str:
+    """Folder of a module below the package; a top-level module's own name."""
+    return module.split(".")[1]
+
+
+def folder_imports(imports: networkx.DiGraph) -> networkx.DiGraph:
+    """Imports between folders, with the number of importing pairs of modules as ``weight``."""
+    graph = networkx.DiGraph()
+    pairs = Counter(
+        (folder_of(source), folder_of(target))
+        for source, target in imports.edges
+        if source.count(".") and target.count(".") and folder_of(source) != folder_of(target)
+    )
+    graph.add_weighted_edges_from((source, target, count) for (source, target), count in pairs.items())
+    return graph
+
+
+def draw(graph: networkx.DiGraph, sizes: Mapping[str, int], path: Path) -> None:
+    """Folders on the floor above all that they import; imports within a circle of folders in red."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    order = networkx.condensation(graph)
+    floor_of: dict[str, int] = {}
+    for number in reversed(list(networkx.topological_sort(order))):
+        below = [floor_of[member] for after in order.successors(number) for member in order.nodes[after]["members"]]
+        floor_of |= {member: max(below, default=-1) + 1 for member in order.nodes[number]["members"]}
+    floors: dict[int, list[str]] = {}
+    for name in sorted(floor_of, key=lambda folder: -sizes[folder]):
+        floors.setdefault(floor_of[name], []).append(name)
+    centre = {
+        name: ((place - (len(names) - 1) / 2) * 2.6, 1.4 * floor)
+        for floor, names in floors.items()
+        for place, name in enumerate(names)
+    }
+    together = {member: number for number in order for member in order.nodes[number]["members"]}
+    figure, axes = plt.subplots(figsize=(11, 0.9 * len(floors) + 1))
+    for source, target in graph.edges:
+        circular = together[source] == together[target]
+        axes.annotate(
+            "",
+            centre[target],
+            centre[source],
+            arrowprops={
+                "arrowstyle": "-|>",
+                "color": "#c0392b" if circular else "#9aa5b1",
+                "lw": 1.4 if circular else 0.7,
+                "shrinkA": 14,
+                "shrinkB": 14,
+                "connectionstyle": "arc3,rad=0.06",
+            },
+        )
+    for name, (x, y) in centre.items():
+        text = f"{name}\n{sizes[name]:,} lines"
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, bbox={"boxstyle": "round", "fc": "#e8f3f1"})
+    axes.set_xlim(min(x for x, _ in centre.values()) - 1.5, max(x for x, _ in centre.values()) + 1.5)
+    axes.set_ylim(-0.8, max(y for _, y in centre.values()) + 0.8)
+    axes.axis("off")
+    figure.savefig(path, dpi=130, bbox_inches="tight")
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(Structure).main()

@@ -1,0 +1,253 @@
+"""The detector: counts without light or without data, saturation, and elements and bands that do not work.
+
+An element is one position (sample, band) of the detector, which sees one sample of every line. Its reading is one
+number of a cube.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Num
+from scipy import ndimage
+
+NEIGHBOURS = 11
+"""Width of the median window along the line that an element is compared with."""
+LEAST_RESPONSE, LARGEST_RESPONSE = 0.5, 2.0
+"""Range of a live element's counts, relative to its neighbours."""
+LEAST_BRIGHTNESS = 0.02
+"""A sample darker than this fraction of its neighbours in all bands is dead, and not in a shadow."""
+CERTAINTY = 6.0
+"""Differences count from this many standard deviations, which noise reaches in none of 10^8 elements."""
+DEAD_BAND_FRACTION = 0.5
+"""A band with a larger fraction of dead elements is bad."""
+MIN_LIGHT = 0.001
+"""A band in which the white counts less than this fraction of its brightest band is unlit."""
+MIN_AT_LIMIT = 3
+"""Fewest readings at the limit of a digitiser that are taken for saturation."""
+BELOW_TOP = 10
+"""Readings pile up at the largest count if it has more of them than this many counts below it together."""
+MIN_TOP_PAIRS = 20
+"""Fewest readings, and fewest pairs of neighbours, that can be a pile at the largest count."""
+BRIGHT = 0.5
+"""Fraction of the largest count above which readings are bright."""
+
+
+@dataclass(frozen=True, eq=False)
+class Defects:
+    """Defects of the detector.
+
+    Attributes:
+        saturation_counts: counts from which a reading is saturated; None if nothing saturates.
+        dead: elements that do not follow the light (dead, hot or stuck), outside of the bad bands.
+        bad_bands: bands without measurements: listed as bad, unlit, or with most of their elements dead.
+    """
+
+    saturation_counts: float | None
+    dead: Bool[np.ndarray, "samples bands"]
+    bad_bands: Bool[np.ndarray, "bands"]
+
+    def summary(self) -> str:
+        """One line for people."""
+        samples, bands = self.dead.shape
+        saturation = "nothing is saturated"
+        if self.saturation_counts is not None:
+            saturation = f"readings saturate at {self.saturation_counts:g} counts"
+        dead = np.count_nonzero(self.dead[:, ~self.bad_bands])
+        return (
+            f"{saturation}; {dead} of {samples * bands} detector elements are dead; "
+            f"{np.count_nonzero(self.bad_bands)} of {bands} bands are bad"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Some lines of a capture, and its dark cube."""
+
+    counts: Num[np.ndarray, "lines samples bands"]
+    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None = None
+
+    def light(self) -> Float[np.ndarray, "samples bands"]:
+        """Mean counts above dark over the lines."""
+        return self.counts.mean(axis=0, dtype=np.float64) - dark_columns(self.dark, *self.counts.shape[1:])
+
+    def resolution(self) -> float:
+        """Step between counts: 1 for integers, 0 for other numbers."""
+        return 1.0 if np.issubdtype(self.counts.dtype, np.integer) else 0.0
+
+
+def find_defects(
+    white: Readings, frames: Sequence[Readings] = (), *, good_bands: Bool[np.ndarray, "bands"] | None = None
+) -> Defects:
+    """Find the detector's defects on lines of the white and of some frames.
+
+    Args:
+        white: the lines that cross the white, over their whole width.
+        frames: a few lines of each of some frames. They show elements that the white does not cover, and saturation.
+        good_bands: the header's bad-band list ``bbl``.
+    """
+    white_light = white.light()
+    images = [(white_light, white.resolution())]
+    if frames:
+        frame_light = np.mean([readings.light() for readings in frames], axis=0)
+        images.append((frame_light, max(readings.resolution() for readings in frames)))
+    dead = elements_without_response(images)
+    bad = unlit_bands(np.where(dead, np.nan, white_light))
+    bad |= dead.mean(axis=0) > DEAD_BAND_FRACTION
+    if good_bands is not None:
+        bad |= ~good_bands
+    counts = [readings.counts for readings in (white, *frames)]
+    live = ~dead & ~bad
+    if live.any():
+        # An element whose dark counts leave no room for light.
+        top = max(float(cube.max(axis=0)[live].max()) for cube in counts)
+        dead |= dark_columns(white.dark, *white.counts.shape[1:]) >= top
+    return Defects(saturation_counts(counts, ~dead & ~bad), dead & ~bad, bad)
+
+
+def elements_without_response(
+    images: Sequence[tuple[Float[np.ndarray, "samples bands"], float]],
+) -> Bool[np.ndarray, "samples bands"]:
+    """Elements that follow the light in none of the images, and fail to in at least one.
+
+    An element is expected to count as the median of its neighbours along the line, after each sample is divided by
+    its brightness over all bands: an edge of the white, or of the object, is no defect. The element follows the light
+    if it counts between ``LEAST_RESPONSE`` and ``LARGEST_RESPONSE`` of that. Images that are too dark there, relative
+    to the spread over the band, are not used. A warm element, which only has a higher dark level, is not dead.
+
+    Args:
+        images: mean counts above dark over an image's lines, and the step of its counts (0 for no integers).
+    """
+    shape = images[0][0].shape
+    follows, fails = np.zeros(shape, bool), np.zeros(shape, bool)
+    for light, step in images:
+        typical = np.median(light, axis=0)
+        lit = typical > 0.0
+        if not lit.any():
+            continue
+        brightness = np.median(light[:, lit] / typical[lit], axis=1)
+        around = ndimage.median_filter(brightness, size=NEIGHBOURS, mode="mirror")
+        brightness = np.where(brightness < LEAST_BRIGHTNESS * around, around, brightness)
+        brightness = np.maximum(brightness, LEAST_BRIGHTNESS)[:, None]
+        expected = ndimage.median_filter(light / brightness, size=(NEIGHBOURS, 1), mode="mirror") * brightness
+        spread = np.hypot(1.4826 * np.median(np.abs(light - expected), axis=0), step / np.sqrt(12.0))
+        # Even the least response must exceed the noise.
+        conclusive = (expected > 0.0) & (LEAST_RESPONSE * expected >= CERTAINTY * spread)
+        as_expected = (light > LEAST_RESPONSE * expected) & (light < LARGEST_RESPONSE * expected)
+        follows |= conclusive & as_expected
+        fails |= conclusive & ~as_expected
+    return fails & ~follows
+
+
+def unlit_bands(light: Float[np.ndarray, "columns bands"], min_light: float = MIN_LIGHT) -> Bool[np.ndarray, "bands"]:
+    """Bands whose median over the columns is below ``min_light`` times that of the brightest; nan counts as 0."""
+    typical = np.median(np.where(np.isfinite(light), light, 0.0), axis=0)
+    return ~((typical > 0.0) & (typical >= min_light * typical.max()))
+
+
+def dark_columns(
+    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int, bands: int
+) -> Float[np.ndarray, "columns bands"]:
+    """Counts without light of each sample: the mean over the dark cube's lines; 0 without a dark cube.
+
+    A dark cube of another width cannot be matched by sample and gives one spectrum (columns = 1).
+    """
+    if dark is None:
+        return np.zeros((1, bands))
+    columns = dark.mean(axis=0, dtype=np.float64)
+    return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
+
+
+def no_data(counts: Num[np.ndarray, "*shape"], ignore_value: float | None) -> Bool[np.ndarray, "*shape"] | None:
+    """Counts that are no data: the header's ``data ignore value``, and floats that are not finite; None if all are.
+
+    None saves memory of the counts' size, and integers without an ignore value are not even read.
+    """
+    missing = ~np.isfinite(counts) if counts.dtype.kind == "f" else None
+    if ignore_value is not None:
+        ignored = counts == ignore_value
+        missing = ignored if missing is None else missing | ignored
+    return missing if missing is not None and missing.any() else None
+
+
+def fill_no_data(
+    counts: Num[np.ndarray, "lines samples bands"], ignore_value: float | None
+) -> Num[np.ndarray, "lines samples bands"]:
+    """The counts with no data replaced by the mean of the element's other lines, or by 0 if it has none."""
+    missing = no_data(counts, ignore_value)
+    if missing is None:
+        return counts
+    total = counts.sum(axis=0, dtype=np.float64, where=~missing)
+    mean = total / np.maximum((~missing).sum(axis=0), 1)
+    return np.where(missing, mean.astype(counts.dtype), counts)
+
+
+def saturation_counts(
+    cubes: Sequence[Num[np.ndarray, "lines samples bands"]], live: Bool[np.ndarray, "samples bands"]
+) -> float | None:
+    """The count from which readings of the live elements are saturated; None if nothing saturates.
+
+    The candidate is the largest reading T. It may also be just the brightest pixel, or shared by many pixels of an
+    even background without noise. T is the saturation level in two cases:
+
+    1. T is the limit of a digitiser (2^k - 1, the same shifted up to 16 bits, or the data type's largest), and at
+       least ``MIN_AT_LIMIT`` readings have it, and more than have the next lower value.
+    2. Readings pile up at T: more than at the ``BELOW_TOP`` counts under it together. Where one of two neighbours is
+       at T, usually both are, while equal neighbours are rare among other bright readings, because of noise.
+    """
+    if not live.any():
+        return None
+    top = max(float(cube.max(axis=0)[live].max()) for cube in cubes)
+    at_top = sum(int(np.count_nonzero(line[live] == top)) for cube in cubes for line in cube)
+    if top in _digital_limits(cubes[0].dtype):
+        return top if at_top >= MIN_AT_LIMIT and at_top > _count_of_next_lower(cubes, live, top) else None
+    return top if at_top >= MIN_TOP_PAIRS and _piles_up(cubes, live, top, at_top) else None
+
+
+def _digital_limits(dtype: np.dtype) -> set[float]:
+    """Largest counts of digitisers."""
+    limits = {float(2**bits - 1) for bits in range(8, 33)}
+    limits |= {float((2**bits - 1) << (16 - bits)) for bits in (10, 12, 14)}
+    return limits | ({float(np.iinfo(dtype).max)} if np.issubdtype(dtype, np.integer) else set())
+
+
+def _count_of_next_lower(
+    cubes: Sequence[Num[np.ndarray, "lines samples bands"]], live: Bool[np.ndarray, "samples bands"], top: float
+) -> int:
+    """How many readings have the largest value below ``top``."""
+    largest, number = -np.inf, 0
+    for cube in cubes:
+        for line in cube:
+            below = line[live]
+            below = below[below < top]
+            if len(below) and below.max() >= largest:
+                number = int(np.count_nonzero(below == below.max())) + (number if below.max() == largest else 0)
+                largest = float(below.max())
+    return number
+
+
+def _piles_up(
+    cubes: Sequence[Num[np.ndarray, "lines samples bands"]],
+    live: Bool[np.ndarray, "samples bands"],
+    top: float,
+    at_top: int,
+) -> bool:
+    """Case 2 of `saturation_counts`."""
+    live_pairs = live[1:] & live[:-1]
+    just_below = top_pairs = both_at_top = bright_pairs = equal_pairs = 0
+    for cube in cubes:
+        for line in cube:
+            just_below += int(np.count_nonzero(live & (line < top) & (line >= top - BELOW_TOP)))
+            one, other = line[1:][live_pairs], line[:-1][live_pairs]
+            either = (one == top) | (other == top)
+            top_pairs += int(np.count_nonzero(either))
+            both_at_top += int(np.count_nonzero((one == top) & (other == top)))
+            bright = ~either & (np.minimum(one, other) > BRIGHT * top)
+            bright_pairs += int(np.count_nonzero(bright))
+            equal_pairs += int(np.count_nonzero(bright & (one == other)))
+    if at_top <= just_below or both_at_top < MIN_TOP_PAIRS or 4 * bright_pairs < top_pairs:
+        return False
+    fraction_both, fraction_equal = both_at_top / top_pairs, equal_pairs / bright_pairs
+    return fraction_both > 0.5 and fraction_both > 3.0 * fraction_equal

@@ -1,0 +1,128 @@
+"""What a ray sees where the object lets light through: the chamber, which stands still with the camera.
+
+The object turns before a fixed camera, so the chamber behind it is at the same pixels of every frame. In the object's
+frame, in which the field lives, the chamber moves with the camera, and no field of the object can represent it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hsi_sc_nerf.data.background_image import estimate_static_background
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+
+BackgroundKind = Literal["last-sample", "spectrum", "image"]
+
+
+def make_background(
+    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]
+) -> BackgroundSpectrum | BackgroundImage | None:
+    """The background of a dataset; None for "last-sample", which has none.
+
+    Args:
+        kind: how the chamber is represented.
+        dataset: camera, and the chamber's median spectrum.
+        frames: training frames, from which the picture of the chamber is taken.
+    """
+    if kind == "last-sample":
+        return None
+    spectrum = torch.from_numpy(dataset.background_reflectance).float()
+    if kind == "spectrum":
+        return BackgroundSpectrum(spectrum)
+    picture = estimate_static_background(dataset, frames)
+    k1, k2, p1, p2 = dataset.distortion.tolist()
+    return BackgroundImage(
+        torch.from_numpy(picture.image),
+        cell_px=picture.cell_px,
+        intrinsics=dataset.intrinsics,
+        distortion=(k1, k2, p1, p2),
+        spectrum=spectrum,
+    )
+
+
+class BackgroundSpectrum(nn.Module):
+    """One spectrum behind every ray.
+
+    Args:
+        spectrum: reflectance.
+    """
+
+    spectrum: Tensor
+
+    def __init__(self, spectrum: Float[Tensor, "bands"]) -> None:
+        super().__init__()
+        self.register_buffer("spectrum", spectrum)
+
+    def forward(
+        self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
+    ) -> Float[Tensor, "*rays bands"]:
+        """Reflectance behind rays; ``rotations`` are not used."""
+        return self.spectrum.expand(*directions.shape[:-1], -1)
+
+
+class BackgroundImage(nn.Module):
+    """A picture of the chamber, looked up by the rays' directions in the camera's frame.
+
+    Args:
+        image: reflectance.
+        cell_px: side of the picture's cells, pixels of the camera's image.
+        intrinsics: of the camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        spectrum: background of rays without a camera (a viewer's), and of those that point backwards.
+    """
+
+    image: Tensor
+    spectrum: Tensor
+
+    def __init__(
+        self,
+        image: Float[Tensor, "lines samples bands"],
+        cell_px: float,
+        intrinsics: PinholeIntrinsics,
+        distortion: tuple[float, float, float, float],
+        spectrum: Float[Tensor, "bands"],
+    ) -> None:
+        super().__init__()
+        self.cell_px = cell_px
+        self.intrinsics = intrinsics
+        self.distortion = distortion
+        self.register_buffer("image", image)
+        self.register_buffer("spectrum", spectrum)
+
+    def forward(
+        self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
+    ) -> Float[Tensor, "*rays bands"]:
+        """Reflectance of the chamber behind rays.
+
+        Args:
+            directions: of the rays as measured, before the pose refinement.
+            rotations: camera-to-world rotations as measured, row by row; None for rays without a camera.
+        """
+        if rotations is None:
+            return self.spectrum.expand(*directions.shape[:-1], -1)
+        pixels, forward = image_coordinates(in_camera_frame(directions, rotations), self.intrinsics, self.distortion)
+        return torch.where(forward[..., None], interpolate_image(self.image, pixels / self.cell_px), self.spectrum)
+
+
+def interpolate_image(
+    image: Float[Tensor, "lines samples bands"], positions: Float[Tensor, "*rays 2"]
+) -> Float[Tensor, "*rays bands"]:
+    """Spectra of an image at positions (x, y; cells from its corner), bilinear between the cells' centres.
+
+    Beyond the centres of the outermost cells, the image is continued by their values.
+    """
+    lines, samples, bands = image.shape
+    # grid_sample counts from -1 to 1 from border to border.
+    grid = 2.0 * positions.reshape(1, 1, -1, 2) / positions.new_tensor([samples, lines]) - 1.0
+    spectra = functional.grid_sample(
+        image.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return spectra[0, :, 0].T.reshape(*positions.shape[:-1], bands)

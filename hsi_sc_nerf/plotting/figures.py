@@ -1,0 +1,73 @@
+"""Figure set-up shared by all pictures: size, style, colours, saving.
+
+Figures are drawn without a display and without pyplot's global state.
+
+Example:
+    >>> with rc_context(STYLE):
+    ...     figure = new_figure(4.0, 3.0)
+    ...     figure.subplots().plot([0, 1], color=COLOURS[0])
+    ...     save_figure(figure, Path("line.png"))
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from hsi_sc_nerf.files import atomic_write
+
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "0.4",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "xtick.color": "0.3",
+    "ytick.color": "0.3",
+    "legend.frameon": False,
+}
+"""Settings for `matplotlib.rc_context`."""
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which colour-blind readers can distinguish; without yellow, which is faint on white."""
+DPI = 160
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure of this size (inches) with constrained layout."""
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write the figure completely, or leave what is at ``path`` as it is.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    with atomic_write(Path(path)) as (temporary,):
+        figure.savefig(temporary)
+
+
+def show_image(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
+    """Show an image without ticks; its pixel coordinates start at its upper left corner.
+
+    Args:
+        axes: to draw in.
+        image: (h, w), or (h, w, 3) as 8 bit or as floats, which are clipped to [0, 1].
+        **options: of ``Axes.imshow``.
+    """
+    height, width = image.shape[:2]
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.grid(False)
+    if image.ndim == 3 and image.dtype != np.uint8:
+        image = np.clip(image, 0, 1)
+    return axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **options)

@@ -1,0 +1,178 @@
+"""Sections on the run itself: training curves, settings, versions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.report.charts import Curve, line_chart
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Paragraph, Section, Table
+
+_LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
+_CORRECTIONS = {
+    "Train Metrics Dict/camera_opt_rotation_deg": "rotation of the camera",
+    "Train Metrics Dict/camera_opt_angle_max_deg": "largest of the table's angles",
+}
+# Terms of the loss that never reach this fraction of the largest are not drawn.
+_SMALLEST_FRACTION = 1e-5
+_PSNR = {
+    "Train Metrics Dict/psnr": "training rays",
+    "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
+    "Eval Images Metrics/psnr": "one held-out view",
+}
+PACKAGES = (
+    *("hsi-sc-nerf", "nerfstudio", "torch", "numpy", "scipy", "spectral", "opencv-contrib-python-headless"),
+    *("open3d", "pycolmap", "numba", "matplotlib", "tyro"),
+)
+_NO_SETTINGS = ("_target",)
+Scalars = dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
+"""Steps and values by TensorBoard's tag."""
+_CHECKPOINT = re.compile(r"step-(\d+)\.ckpt")
+MOST_POINTS = 400
+"""Longer curves are drawn as means over as many pieces: more would not be seen, and would make the page large."""
+
+
+def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section:
+    """Curves of whatever was logged, with the ends of the stages.
+
+    Args:
+        scalars: `read_scalars` of the run.
+        stage_ends: steps done at the end of each stage, by name.
+    """
+    if not scalars:
+        missing = Missing("The run has no TensorBoard events.", "ns-train hsi-sc-nerf --vis viewer+tensorboard")
+        return Section("training", "Training", [missing])
+    marks = {f"end of {name}": float(end) for name, end in stage_ends.items()}
+
+    def named(prefix: str) -> dict[str, str]:
+        return {tag: tag.removeprefix(prefix).replace("_", " ") for tag in scalars if tag.startswith(prefix)}
+
+    charts, titles = [], []
+    for title, y_label, tags, logarithmic in (
+        ("Loss of training batches", "weighted loss", {"Train Loss": "sum"} | named(_LOSSES), True),
+        ("Peak signal-to-noise ratio", "PSNR (dB)", _PSNR, False),
+        ("Learning rates", "learning rate", named(_RATES), True),
+        ("Corrections of the poses", "correction (degrees)", _CORRECTIONS, False),
+    ):
+        curves = _curves(scalars, tags)
+        if curves:
+            charts.append(
+                line_chart(
+                    curves,
+                    x_label="step",
+                    y_label=y_label,
+                    alt=f"{title} over the training steps",
+                    logarithmic=logarithmic,
+                    marks=marks,
+                )
+            )
+            titles.append(title)
+    caption = (
+        "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage "
+        "most training rays are the object's: its loss and PSNR do not compare with those of whole frames."
+    )
+    return Section("training", "Training", [Figure(charts, caption, titles, columns=2)])
+
+
+def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
+    """Curves of the tags that were logged, but for those that stay tiny beside the largest."""
+    found = {name: scalars[tag] for tag, name in tags.items() if tag in scalars}
+    heights = {name: np.nanmax(np.abs(values), initial=0.0) for name, (_, values) in found.items()}
+    least = _SMALLEST_FRACTION * max(heights.values(), default=0.0)
+    return [Curve(name, *shortened(*curve)) for name, curve in found.items() if heights[name] > least]
+
+
+def flat_settings(config: Any, prefix: str = "") -> dict[str, str]:
+    """Settings of nested dataclasses and mappings as text, by their dotted names."""
+    if is_dataclass(config) and not isinstance(config, type):
+        parts = {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _NO_SETTINGS}
+    elif isinstance(config, Mapping) and config:
+        parts = {str(key): value for key, value in config.items()}
+    else:
+        return {prefix: str(config)}
+    flat: dict[str, str] = {}
+    for name, value in parts.items():
+        flat |= flat_settings(value, f"{prefix}.{name}" if prefix else name)
+    return flat
+
+
+def changed_settings(settings: Mapping[str, str], defaults: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Settings that differ from the defaults: what they are, and the default (``-`` where there is none)."""
+    return {name: (value, defaults.get(name, "-")) for name, value in settings.items() if defaults.get(name) != value}
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that a result depends on; those that are not installed are left out."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], machine: Mapping[str, str]) -> Section:
+    """What the run was made with.
+
+    Args:
+        settings: of the run (`flat_settings`).
+        defaults: of its method.
+        machine: facts of the machine that makes the report, and versions of its packages.
+    """
+    changed = changed_settings(settings, defaults)
+    first: Block = Paragraph("All settings are the method's defaults.")
+    if changed:
+        rows = [(name, value, default) for name, (value, default) in changed.items()]
+        first = Table("Settings that are not the method's defaults.", ("", "this run", "default"), rows)
+    everything = Table("All settings of the run.", ("", "value"), list(settings.items()))
+    caption = "Machine and packages that made this report; the run itself does not record its own."
+    return Section(
+        "settings",
+        "Versions and settings",
+        [first, Folded("All settings", [everything]), Table(caption, ("", ""), list(machine.items()))],
+    )
+
+
+def read_scalars(run: Path) -> Scalars:
+    """All scalars that the run logged, by tag; empty where it has no events. Of a resumed run, one value a step."""
+    if not any(run.glob("events.out.tfevents.*")):
+        return {}
+    from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
+
+    events = EventAccumulator(str(run), size_guidance={SCALARS: 0})
+    events.Reload()
+    scalars = {}
+    for tag in events.Tags()[SCALARS]:
+        last = {event.step: event.value for event in events.Scalars(tag)}
+        steps = np.array(sorted(last), dtype=float)
+        scalars[tag] = steps, np.array([last[int(step)] for step in steps], dtype=float)
+    return scalars
+
+
+def shortened(
+    steps: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"], most: int = MOST_POINTS
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+    """Means of at most ``most`` pieces of equal length, the curve itself where it is no longer."""
+    if len(steps) <= most:
+        return steps, values
+    starts = np.arange(most) * len(steps) // most
+    lengths = np.diff(np.append(starts, len(steps)))
+    return np.add.reduceat(steps, starts) / lengths, np.add.reduceat(values, starts) / lengths
+
+
+def stage_ends(run: Path) -> dict[str, int]:
+    """How many steps were done when each finished stage ended, by the stage's name, the first one first."""
+    ends = {}
+    for folder in run.glob("stage-*"):
+        steps = [int(match[1]) for path in folder.iterdir() if (match := _CHECKPOINT.fullmatch(path.name))]
+        if steps:
+            ends[folder.name.removeprefix("stage-")] = max(steps) + 1
+    return dict(sorted(ends.items(), key=lambda item: item[1]))

@@ -1,0 +1,142 @@
+"""Rays through a trained model: the depth of the surface that they meet, and the object's spectrum along them.
+
+Lengths are in scene units. Depths are distances from a ray's origin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+from torch.nn import functional
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.numerics import safe_ratio
+
+MIN_OPACITY = 0.5
+"""Rays that collect less opacity than this hit no surface (released settings of the paper)."""
+SURFACE_OPACITY = 0.07
+"""Opacity that a ray along the surface's normal has collected at the surface. Density begins at the true surface, for
+other views keep the space outside empty; how deep a ray gets before it is half absorbed depends on the length of the
+training (benchmarks/surface_depth.py)."""
+INTERIOR_OPACITY = 0.25
+"""Opacity at which the density gradient is read. Further out the gradient is noise."""
+SEARCH_DEPTH = 0.1
+"""The surface is searched within this distance of the given depth (about a centimetre)."""
+SEARCH_STEPS = 40
+MIN_COSINE = 0.17
+"""Smallest cosine between a ray and the surface normal: pixels smear faces seen at more than 80 degrees."""
+_MIN_RATIO_OPACITY = 1e-3
+
+
+@torch.no_grad()
+def surface_depth(
+    model: SpectralModel,
+    origins: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    initial_depth: Float[Tensor, "n 1"],
+    cosines: Float[Tensor, "n 1"] | None = None,
+) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
+    """Depth of the surface along rays, searched in fine steps around an initial depth.
+
+    The surface is where a ray along the normal would have collected ``SURFACE_OPACITY``. Oblique rays cross more of
+    the density shell, so the density is multiplied by the cosine of their angle.
+
+    Args:
+        model: trained model, in evaluation mode.
+        origins: origins of the rays.
+        directions: unit vectors.
+        initial_depth: depth within ``SEARCH_DEPTH`` of the surface.
+        cosines: cosine of the angle between each ray and the surface's inward normal. By default the normal is the
+            density gradient at ``INTERIOR_OPACITY``.
+
+    Returns:
+        The depth, and the opacity collected over the searched interval.
+    """
+    offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=initial_depth.device)
+    edges = (initial_depth + offsets).clamp_min(0.0)
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
+    densities = model.field.density_fn(origins[:, None] + directions[:, None] * middles[..., None])[..., 0]
+    opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
+    if cosines is None:
+        interior = origins + directions * opacity_crossing_depth(edges, densities, INTERIOR_OPACITY)[:, None]
+        inward_normals = functional.normalize(model.field.density_gradient(interior), dim=-1)
+        cosines = (inward_normals * directions).sum(dim=-1, keepdim=True).clamp_min(MIN_COSINE)
+    return opacity_crossing_depth(edges, densities * cosines, SURFACE_OPACITY)[:, None], opacity
+
+
+def opacity_crossing_depth(
+    edges: Float[Tensor, "rays samples_and_1"], densities: Float[Tensor, "rays samples"], level: float
+) -> Float[Tensor, "rays"]:
+    """Depth at which the opacity collected along each ray first reaches ``level``.
+
+    The density is constant between edges, so the optical depth is linear there and the crossing is exact.
+
+    Args:
+        edges: depths that bound the samples, ascending.
+        densities: density in each interval, per unit of depth, not negative.
+        level: opacity, in (0, 1).
+
+    Returns:
+        The depth; the last edge for a ray that never reaches the level.
+
+    Example:
+        >>> edges = torch.tensor([[0.0, 1.0, 2.0]])
+        >>> opacity_crossing_depth(edges, torch.tensor([[0.0, 1.0]]), level=0.5)
+        tensor([1.6931])
+    """
+    optical_depth = functional.pad(torch.cumsum(densities * edges.diff(dim=-1), dim=-1), (1, 0))
+    target = -torch.log1p(torch.tensor(-level, dtype=densities.dtype, device=densities.device))
+    after = (optical_depth < target).sum(dim=-1, keepdim=True).clamp(1, densities.shape[-1])
+    before = after - 1
+    collected = optical_depth.gather(1, before)
+    fraction = (target - collected) / (optical_depth.gather(1, after) - collected).clamp_min(1e-12)
+    near, far = edges.gather(1, before), edges.gather(1, after)
+    return (near + fraction.clamp(0.0, 1.0) * (far - near))[:, 0]
+
+
+def camera_rays(
+    cameras: Cameras, frames: Int[np.ndarray, "n"], xy_px: Float[np.ndarray, "n 2"], device: torch.device | str
+) -> RayBundle:
+    """Rays of the measured cameras, which the model corrects, through image points (x, y) from the upper left corner.
+
+    Args:
+        cameras: one camera a frame.
+        frames: camera of each ray.
+        xy_px: image point of each ray, pixels.
+        device: device of the rays.
+    """
+    return cameras.generate_rays(
+        camera_indices=torch.from_numpy(np.asarray(frames)[:, None]),
+        coords=torch.from_numpy(np.asarray(xy_px)[:, ::-1].copy()).float(),
+    ).to(device)
+
+
+@torch.no_grad()
+def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tensor], Float[Tensor, "n bands"]]:
+    """Render measured rays: the model's outputs, and the object's reflectance without the background's part.
+
+    A model without a background extends the object's spectrum over the rest of a ray, so nothing is removed.
+    """
+    background = model.background_spectrum(rays)  # before the model corrects the rays
+    outputs = model(rays)
+    spectra, opacity = outputs["spectral"], outputs["accumulation"]
+    if model.background is not None:
+        spectra = safe_ratio(spectra - background * (1.0 - opacity), opacity, minimum=_MIN_RATIO_OPACITY)
+    return outputs, spectra.clamp(0.0, 1.0)
+
+
+def model_output(outputs: dict[str, Tensor], name: str, option: str) -> Tensor:
+    """The model's output of a name, chosen by ``--OPTION-output-name``.
+
+    Raises:
+        InputError: the model has no such output.
+    """
+    if name not in outputs:
+        known = ", ".join(sorted(key for key in outputs if torch.is_tensor(outputs[key])))
+        raise InputError(f"--{option}-output-name {name}: the model has no such output; choose one of {known}.")
+    return outputs[name]

@@ -1,0 +1,193 @@
+"""Points spread evenly over the surface of a trained model (scene units).
+
+The depth maps of the training frames are fused into a mesh. Points are spread evenly over its area, and each is moved
+along the ray of the frame that sees it most from the front to the model's surface. Points that no frame sees are left
+out. The ray gives the point's spectrum too: seen from the front, as the white reference was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.progress import progress_bar
+from hsi_sc_nerf.surface.depth_renders import DepthRenders
+from hsi_sc_nerf.surface.regions import EVERYWHERE, Region, in_box
+from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, SEARCH_DEPTH, SEARCH_STEPS, surface_depth
+from hsi_sc_nerf.surface.tsdf_fusion import SurfaceMesh, tsdf_fusion
+
+MAX_SHIFT = 0.02
+"""Points of the mesh are moved by at most this along their normal (about 2 mm)."""
+_PILOT_POINTS = (1_000, 20_000)
+_MARGIN = 1.02
+"""Factor on the number of candidates, so that one more batch is rarely needed."""
+_MAX_BATCH = 2_000_000
+"""Candidates at a time, which take 200 bytes each."""
+_MAX_CANDIDATES = 50
+"""Candidates in all, as a multiple of the points to find, or of the largest batch where that is more."""
+
+
+@dataclass(eq=False)
+class SurfacePoints:
+    """Points of the surface, and the training frames that see them most from the front.
+
+    Attributes:
+        points: positions.
+        mesh_normals: outward unit normals of the fused mesh.
+        frames: index of the training frame.
+        xy_px: image coordinates (x, y) in that frame, from the upper left corner.
+        incidence_deg: angle between the normal and the direction to that frame's camera.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    mesh_normals: Float[np.ndarray, "n 3"]
+    frames: Int[np.ndarray, "n"]
+    xy_px: Float[np.ndarray, "n 2"]
+    incidence_deg: Float[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, rows: np.ndarray | slice) -> SurfacePoints:
+        """The points that a slice, an index or a boolean array selects."""
+        return SurfacePoints(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @staticmethod
+    def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
+        """The points of all parts, in their order."""
+        return SurfacePoints(
+            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(SurfacePoints))
+        )
+
+
+def sample_surface_points(
+    model: SpectralModel,
+    renders: DepthRenders,
+    num_points: int,
+    rays_per_batch: int,
+    box: Float[np.ndarray, "2 3"],
+    region: Region = EVERYWHERE,
+    seed: int = 0,
+) -> SurfacePoints:
+    """Points spread evenly over the surface that at least one training frame sees.
+
+    Args:
+        model: trained model, in evaluation mode.
+        renders: depth maps of its training cameras.
+        num_points: points to return; there are fewer if the region holds hardly any surface.
+        rays_per_batch: rays searched at a time.
+        box: minimum and maximum of the object, which exclude the container.
+        region: the points to keep.
+        seed: of the random positions.
+
+    Raises:
+        InputError: the model holds no object, or the region holds none of it.
+
+    Example:
+        >>> dataset = run.manager.train_dataset
+        >>> renders = render_depth_maps(run.model, dataset.cameras, masks, rays_per_batch=4096)
+        >>> box = run.to_scene(run.dataset.object_box_m)
+        >>> points = sample_surface_points(run.model, renders, 100_000, rays_per_batch=4096, box=box)
+    """
+    mesh = tsdf_fusion(renders, box)
+    if mesh is None:
+        raise InputError(
+            f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
+            "longer, and look at the masks in the dataset's report folder."
+        )
+    found = 0
+
+    def keep(candidates: Float[np.ndarray, "n 3"]) -> SurfacePoints:
+        nonlocal found
+        parts = []
+        for start in range(0, len(candidates), rays_per_batch):
+            moved = _move_to_surface(model, renders, mesh, candidates[start : start + rays_per_batch])
+            kept = in_box(moved.points, box) & region.contains(moved.points, moved.mesh_normals)
+            parts.append(moved.select(kept))
+            found += len(parts[-1])
+            update(found)
+        return SurfacePoints.concatenate(parts)
+
+    with progress_bar("spreading points", "points", num_points) as update:
+        # An oblique ray moves a point by more than MAX_SHIFT, but no further than the surface is searched.
+        triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
+        parts = even_points(mesh.vertices, triangles, num_points, keep, seed)
+    if not parts:
+        raise InputError("no point of the object lies in the region that was asked for; make it larger.")
+    return SurfacePoints.concatenate(parts)
+
+
+def even_points(
+    vertices: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    count: int,
+    keep: Callable[[Float[np.ndarray, "n 3"]], SurfacePoints],
+    seed: int = 0,
+) -> list[SurfacePoints]:
+    """``count`` points spread evenly over a mesh's area, after ``keep`` has rejected some candidates.
+
+    A small first sample gives the fraction that is kept, and so the number of candidates to try. Surplus points are
+    left out at random.
+
+    Args:
+        vertices: of the mesh.
+        triangles: of the mesh.
+        count: points to return, all parts together.
+        keep: turns candidates on the mesh into as many or fewer points.
+        seed: of the random positions.
+
+    Returns:
+        The points, in parts. They are fewer than ``count`` if hardly any candidate is kept; the list is empty if none
+        is.
+    """
+    if not len(triangles):
+        return []
+    rng = np.random.default_rng(seed)
+    tried = int(np.clip(count, *_PILOT_POINTS))
+    kept = len(keep(sample_surface(vertices, triangles, tried, seed=int(rng.integers(2**31)))))
+    parts: list[SurfacePoints] = []
+    found = 0
+    limit = _MAX_CANDIDATES * max(count, _MAX_BATCH)
+    while found < count and tried < (limit if kept else _MAX_BATCH):
+        needed = (count - found) * tried / kept * _MARGIN if kept else 10 * tried
+        batch = min(int(needed) + 1, _MAX_BATCH)
+        part = keep(sample_surface(vertices, triangles, batch, seed=int(rng.integers(2**31))))
+        tried, kept = tried + batch, kept + len(part)
+        surplus = found + len(part) - count
+        if surplus > 0:
+            part = part.select(np.sort(rng.permutation(len(part))[surplus:]))
+        if len(part):
+            parts.append(part)
+        found += len(part)
+    return parts
+
+
+@torch.no_grad()
+def _move_to_surface(
+    model: SpectralModel, renders: DepthRenders, mesh: SurfaceMesh, candidates: Float[np.ndarray, "n 3"]
+) -> SurfacePoints:
+    """Points of the mesh, moved to the surface along their most frontal rays, if these hit it."""
+    points = torch.from_numpy(candidates).float().to(model.device)
+    normals = torch.from_numpy(mesh.normals_at(candidates)).to(points)
+    frames, xy_px, cosines = renders.most_frontal(points, normals)
+    seen = frames >= 0
+    points, normals, frames, xy_px, cosines = (t[seen] for t in (points, normals, frames, xy_px, cosines[:, None]))
+    origins = renders.camera_to_world[frames, :3, 3]
+    distances = (points - origins).norm(dim=-1, keepdim=True)
+    directions = (points - origins) / distances
+    depth, opacity = surface_depth(model, origins, directions, distances, cosines)
+    shift = (depth - distances).abs()
+    # Further away is another part of the surface, which has its own candidates. A hit at the very start of the
+    # searched interval has its surface before it.
+    near = (shift * cosines < MAX_SHIFT) & (shift < SEARCH_DEPTH * (1.0 - 2.0 / SEARCH_STEPS))
+    hit = ((opacity > MIN_OPACITY) & near)[:, 0]
+    incidence_deg = torch.rad2deg(cosines[:, 0].clamp_max(1.0).arccos())
+    columns = (origins + directions * depth, normals, frames, xy_px, incidence_deg)
+    return SurfacePoints(*(column[hit].cpu().numpy() for column in columns))

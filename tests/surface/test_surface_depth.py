@@ -1,0 +1,50 @@
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from hsi_sc_nerf.surface.surface_depth import SURFACE_OPACITY, opacity_crossing_depth, surface_depth
+
+
+@pytest.mark.parametrize("level", [0.1, 0.25, 0.5, 0.9])
+@pytest.mark.parametrize("density", [0.7, 30.0, 5000.0])
+def test_constant_density_crosses_where_beer_and_lambert_say(level, density):
+    edges = torch.linspace(1.0, 9.0, 33, dtype=torch.float64)[None]
+    depth = opacity_crossing_depth(edges, torch.full((1, 32), density, dtype=torch.float64), level)
+    assert depth.item() == pytest.approx(min(9.0, 1.0 - math.log(1 - level) / density), abs=1e-9)
+
+
+def test_a_hard_surface_is_found_at_its_front():
+    edges = torch.linspace(0.0, 1.0, 11)[None]
+    densities = torch.zeros(1, 10)
+    densities[0, 6:] = 1e6
+    assert opacity_crossing_depth(edges, densities, 0.25).item() == pytest.approx(0.6, abs=1e-4)
+
+
+def test_an_empty_ray_ends_at_its_last_edge():
+    edges = torch.linspace(0.0, 1.0, 11)[None].expand(3, -1)
+    assert opacity_crossing_depth(edges, torch.zeros(3, 10), 0.25).tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize("normal_is_known", [True, False])
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 60.0, 75.0])
+def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, normal_is_known):
+    rise = 4000.0  # of the density with the depth below z = 0: a quarter of a unit is opaque
+    soft_ground = SimpleNamespace(
+        field=SimpleNamespace(
+            density_fn=lambda p: -rise * p[..., 2:].clamp_max(0.0),
+            density_gradient=lambda p: torch.tensor([0.0, 0.0, -rise]) * (p[..., 2:] < 0.0),
+        )
+    )
+    angle = math.radians(angle_deg)
+    directions = torch.tensor([[math.sin(angle), 0.0, -math.cos(angle)]])
+    origins, cosines = -2.0 * directions, -directions[:, 2:]
+    depth, opacity = surface_depth(
+        soft_ground, origins, directions, torch.full((1, 1), 2.02), cosines if normal_is_known else None
+    )
+    below = -(origins + depth * directions)[0, 2].item()
+    # The optical depth of a frontal ray is rise * z^2 / 2; steps of the search are 5e-3 units of a ray.
+    expected = math.sqrt(-2.0 * math.log1p(-SURFACE_OPACITY) / rise)
+    assert below == pytest.approx(expected, abs=1e-3)
+    assert opacity.item() > 0.99

@@ -1,0 +1,74 @@
+"""The pages agree with the code and with the files that their figures come from."""
+
+import csv
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+documentation = pytest.importorskip("documentation", reason="the documentation's packages are not installed")
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+COMMANDS = documentation.command_names()
+
+
+def test_tables_say_where_their_figures_come_from():
+    tables = {name for page in PAGES for name in documentation.TABLE.findall(page.read_text(encoding="utf-8"))}
+    assert tables == {path.stem for path in documentation.RESULTS.glob("*.csv")}
+    for name in tables:
+        with (documentation.RESULTS / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+            columns, *rows = list(csv.reader(file))
+        assert tuple(columns[-3:]) == documentation.SOURCE_COLUMNS
+        assert all(len(row) == len(columns) and all(row[-3:]) for row in rows), name
+
+
+def test_a_table_without_sources_is_refused(tmp_path):
+    (tmp_path / "table.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    with pytest.raises(documentation.PluginError, match="commit"):
+        documentation.results_table("table", tmp_path)
+    with pytest.raises(documentation.PluginError, match="no such file"):
+        documentation.results_table("missing", tmp_path)
+
+
+def test_the_readme_shows_the_committed_results():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    between = readme.split("<!-- results -->\n")[1].split("\n<!-- end of results -->")[0]
+    assert between == documentation.readme_table()
+    assert len(readme.splitlines()) <= 120
+
+
+def test_every_option_in_a_page_exists():
+    """Options beside `hsi-sc-nerf COMMAND` are options of that command."""
+    found = 0
+    helps = {command: documentation.help_text(command) for command in COMMANDS}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        for command, words in re.findall(r"hsi-sc-nerf ([a-z]+) ([^\n`#]*)", text):
+            if command not in helps:
+                continue
+            for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9.-]*)", words.split("--common")[0].split("--sets")[0]):
+                found += 1
+                assert option in helps[command], f"{page.name}: {command} has no {option}"
+    assert found > 20
+
+
+def test_every_setting_of_training_in_a_page_exists():
+    settings = documentation.settings_page()
+    nerfstudio = {
+        "--data",
+        "--load-config",
+        "--load-dir",
+        "--max-num-iterations",
+        "--output-dir",
+        "--output-path",
+        "--help",
+    }
+    for page in PAGES:
+        for option in re.findall(
+            r"--(?:pipeline|full-frame|masked)\.[a-z0-9.-]+[a-z0-9]", page.read_text(encoding="utf-8")
+        ):
+            inherited = option.endswith(("max-res", "train-num-rays-per-batch"))
+            assert f"`{option}`" in settings or option in nerfstudio or inherited, f"{page.name}: {option}"
