@@ -5,7 +5,7 @@ A. Laurentini, "The visual hull concept for silhouette-based image understanding
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -54,7 +54,7 @@ def visual_hull(
     return points[in_image >= MIN_VIEWS_FRACTION * len(masks) - 1e-9]
 
 
-def silhouette_counts(points: Any, masks: Sequence[Any], pixels_of: Callable[[int, Any], Any]) -> tuple[Any, Any]:
+def silhouette_counts(points: Any, masks: Iterable[Any], pixels_of: Callable[[int, Any], Any]) -> tuple[Any, Any]:
     """Count the frames that have each point in their image, and those that have it in the object's mask.
 
     Occlusion is ignored: a point of the object projects into the mask whether the object hides it or not. NumPy

@@ -10,13 +10,12 @@ import hashlib
 import threading
 import zipfile
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Num, UInt8, UInt16
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
@@ -28,6 +27,7 @@ from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
 from hsi_sc_nerf.processing.fingerprint import capture_files, fingerprint
 from hsi_sc_nerf.processing.masks import brightness, foreground_score, spectral_bin_width
+from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 
 MARKER_RANGE_NM = (450.0, 700.0)
@@ -129,17 +129,14 @@ def pack_frames(
             buffer=own.buffer,
         )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        Progress(*columns, console=Console(stderr=True), disable=not progress) as bar,
-        ThreadPoolExecutor(workers) as pool,
-    ):
-        task = bar.add_task("Calibrating frames", total=len(session.frames))
-        futures = [pool.submit(pack, index) for index in range(len(session.frames))]
+    num_frames = len(session.frames)
+    bar = progress_bar("calibrating", "frames", num_frames) if progress else nullcontext(lambda amount: None)
+    with bar as update, ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(pack, index) for index in range(num_frames)]
         try:
-            for future in as_completed(futures):
+            for done, future in enumerate(as_completed(futures), start=1):
                 future.result()
-                bar.advance(task)
+                update(done)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
