@@ -80,7 +80,7 @@ class FramePictures:
         return clipped if self.flagged is None else clipped | self.flagged
 
 
-class MadeWhenAsked(Mapping[str, UInt8[np.ndarray, "h w"]]):
+class LazyMapping(Mapping[str, UInt8[np.ndarray, "h w"]]):
     """Pictures that are made, once, when somebody asks for them; from several threads too."""
 
     def __init__(
@@ -192,7 +192,7 @@ def frame_pictures(
     best_first = sorted(scores, key=lambda name: -scores[name] * (_CLEARLY_BETTER if name == GRAY else 1.0))
     for name, nm in extra_nm.items():
         members[name] = np.arange(len(wavelengths_nm)) == nearest_bands(wavelengths_nm, [nm])[0]
-    pictures = MadeWhenAsked(
+    pictures = LazyMapping(
         tuple(members), lambda name: _picture(cube.memmap(), flags_path, members[name]), {GRAY: gray}
     )
     best_well = well[best_first[0]]

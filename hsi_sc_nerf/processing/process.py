@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +37,9 @@ from hsi_sc_nerf.packed.dataset import (
     write_transforms,
 )
 from hsi_sc_nerf.packed.uncertainty import typical_uncertainty
-from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.ways import PoseWay, find_poses
+from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.calibrated_frames import pack_frames
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import FrameNotes, border_spectrum, object_spectrum
@@ -48,9 +48,9 @@ from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
     check_scale,
     container_under,
+    known_camera,
     pose_frames,
     posed_frames,
-    session_facts,
 )
 from hsi_sc_nerf.processing.report import mask_picture
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
@@ -69,7 +69,7 @@ class ProcessConfig:
     """Foreground masks."""
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
     """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
-    poses: PoseWay = "auto"
+    poses: PoseMethod = "auto"
     """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
     angles that session.json gives (angles); or by the first of these that works (auto)."""
     features: FeatureConfig = field(default_factory=FeatureConfig)
@@ -116,9 +116,9 @@ def process_session(
     if _is_done(output_dir, stamp):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
-    earlier = None if config.camera is None else open_packed(config.camera)
-    facts = session_facts(session, config.marker_side_m, earlier)
-    check_scale(session, facts, config.poses)
+    camera = None if config.camera is None else known_camera(open_packed(config.camera))
+    info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
+    check_scale(session, info, camera, config.poses)
     _clear_transforms(output_dir)
 
     with console.status("measuring white, noise and lamps"):
@@ -145,7 +145,8 @@ def process_session(
     poses = pose_frames(
         session,
         images,
-        facts,
+        info,
+        camera,
         config.poses,
         config.features,
         output_dir,

@@ -19,12 +19,10 @@ from jaxtyping import Float, UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
-from hsi_sc_nerf.poses.adjust import reproject
-from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
-from hsi_sc_nerf.poses.frame import layout
-from hsi_sc_nerf.poses.initialise import Observations, Rejected, Turntable
-from hsi_sc_nerf.poses.markers import Detections, detect_markers
+from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers
+from hsi_sc_nerf.poses.marker_fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.session_pictures import FramePictures, SessionPictures
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
 # Frames that are searched at the same time: OpenCV and NumPy let other threads work meanwhile.
 _WORKERS = 2
@@ -50,10 +48,20 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
+class Rejected:
+    """A marker in a frame that is not used: its error where it was measured, and the reason."""
+
+    frame: int
+    marker: int
+    error_px: float | None
+    why: str
+
+
+@dataclass(frozen=True)
 class Observed:
     """Markers of all frames, the blur of each frame's best picture, and markers whose pattern was not fitted."""
 
-    observations: Observations
+    observations: MarkerObservations
     blur_px: Float[np.ndarray, "frames"]
     unexplained: tuple[Rejected, ...]
 
@@ -149,12 +157,10 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
 def observe_expected(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     dictionary: str,
-    turntable: Turntable,
-    seen: Observations,
-    centre_px: tuple[float, float],
-    side_m: float,
+    turntable: MarkerTurntable,
+    seen: MarkerObservations,
     blur_px: Float[np.ndarray, "frames"],
-) -> Observations:
+) -> MarkerObservations:
     """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones.
 
     Args:
@@ -162,18 +168,16 @@ def observe_expected(
         dictionary: of the markers.
         turntable: adjusted to the seen markers.
         seen: markers so far.
-        centre_px: the principal point.
-        side_m: of the markers.
         blur_px: of each frame's best picture; what the other pictures' is, is found.
     """
     session = SessionPictures.of(images)
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
-    missing = [pair for pair in _facing(turntable, side_m) if pair not in have]
+    missing = [pair for pair in _facing(turntable) if pair not in have]
     if not missing:
         return seen
     frame, marker = np.array(missing).T
-    blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
-    expected = dict(zip(missing, reproject(turntable, blank, centre_px, side_m), strict=True))
+    blank = MarkerObservations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
+    expected = dict(zip(missing, turntable.reproject(blank), strict=True))
     found: dict[tuple[int, int], FittedMarker] = {}
     blurs_px: dict[str, float] = {}
     for rank in range(max(len(frame.ranking) for frame in session.frames)):
@@ -201,9 +205,7 @@ def observe_expected(
             fitted = zip(missing, pool.map(look, missing), strict=True)
             found |= {pair: fit for pair, fit in fitted if fit is not None}
     more = _observations([(*pair, found[pair]) for pair in expected if pair in found])
-    return Observations(
-        *(np.concatenate([getattr(seen, k), getattr(more, k)]) for k in Observations.__dataclass_fields__)
-    )
+    return seen.append(more)
 
 
 def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> bool:
@@ -214,32 +216,28 @@ def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> 
     return bool(inside.any()) and float(ill[inside].mean()) > _MOST_ILL_EXPOSED
 
 
-def _by_frame(seen: Observations, frames: int) -> list[Detections]:
+def _by_frame(seen: MarkerObservations, frames: int) -> list[Detections]:
     by_frame: list[Detections] = [{} for _ in range(frames)]
     for i, marker, corners in zip(seen.frame.tolist(), seen.marker.tolist(), seen.corners_px, strict=True):
         by_frame[i][marker] = corners
     return by_frame
 
 
-def _facing(turntable, side_m):
+def _facing(turntable: MarkerTurntable) -> list[tuple[int, int]]:
     """Pairs of frame and marker where the marker's front faces the camera."""
-    centres = layout(turntable, side_m).mean(1)
-    normals = turntable.marker_poses[:, :3, 2]
-    pairs = []
-    for frame, rotation, shift in zip(turntable.frames.tolist(), *turntable.motions(), strict=True):
-        camera = ([turntable.distance_m, 0.0, 0.0] - shift) @ rotation
-        view = camera - centres
-        cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
-        pairs += [(frame, int(m)) for m in turntable.markers[cosine > _STEEPEST_COSINE]]
-    return pairs
+    centres, normals = turntable.marker_poses[:, :3, 3], turntable.marker_poses[:, :3, 2]
+    view = turntable.camera_positions()[:, None] - centres
+    cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
+    frame, marker = np.nonzero(cosine > _STEEPEST_COSINE)
+    return list(zip(turntable.frames[frame].tolist(), turntable.markers[marker].tolist(), strict=True))
 
 
 def _all(work: Iterable[_T], what: str, total: int, progress: bool) -> list[_T]:
     return list(track(work, what, total=total, disable=not progress, transient=True))
 
 
-def _observations(rows: list[tuple[int, int, FittedMarker]]) -> Observations:
-    return Observations(
+def _observations(rows: list[tuple[int, int, FittedMarker]]) -> MarkerObservations:
+    return MarkerObservations(
         np.array([i for i, _, _ in rows], dtype=int),
         np.array([m for _, m, _ in rows], dtype=int),
         np.array([f.corners_px for _, _, f in rows]).reshape(-1, 4, 2),

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from hsi_sc_nerf.poses.markers import marker_pattern
+from hsi_sc_nerf.poses.marker_detection import marker_pattern
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7

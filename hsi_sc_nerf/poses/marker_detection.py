@@ -64,8 +64,8 @@ def marker_pattern(dictionary: str, marker: int) -> UInt8[np.ndarray, "cells cel
 def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detections:
     """Markers seen at any of several magnifications of the image.
 
-    Their corners are good to about half a pixel, and a marker can be a misreading: ``fit.fit_marker`` refines the
-    ones and weeds out the others.
+    Their corners are good to about half a pixel, and some markers are misread: ``fit_marker`` refines the ones and
+    rejects the others.
     """
     detector = _detector(dictionary)
     found: Detections = {}
