@@ -170,14 +170,15 @@ def pose_errors(found: Poses, true: Poses, has_scale: bool) -> tuple[float, floa
     if len(found) < 3:
         return np.nan, np.nan
     rotations = Rotation.from_matrix(true[:, :3, :3]) * Rotation.from_matrix(found[:, :3, :3]).inv()
-    places, wanted = found[:, :3, 3], true[:, :3, 3]
+    positions, true_positions = found[:, :3, 3], true[:, :3, 3]
     if not has_scale:
         turn = rotations.mean()
         rotations = rotations * turn.inv()
-        places, wanted = turn.apply(places - places.mean(axis=0)), wanted - wanted.mean(axis=0)
-        places = places * (places * wanted).sum() / max(float((places**2).sum()), 1e-12)
+        positions = turn.apply(positions - positions.mean(axis=0))
+        true_positions = true_positions - true_positions.mean(axis=0)
+        positions = positions * (positions * true_positions).sum() / max(float((positions**2).sum()), 1e-12)
     rotation_deg = float(np.rad2deg(rotations.magnitude().max()))
-    return rotation_deg, 1e3 * float(np.linalg.norm(places - wanted, axis=-1).max())
+    return rotation_deg, 1e3 * float(np.linalg.norm(positions - true_positions, axis=-1).max())
 
 
 if __name__ == "__main__":

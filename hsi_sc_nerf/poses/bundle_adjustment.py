@@ -24,8 +24,6 @@ from hsi_sc_nerf.poses.turntable import (
     Jacobian,
     MarkerObservations,
     MarkerTurntable,
-    PointTurntable,
-    Tracks,
     Turntable,
     project,
     projection_jacobian,
@@ -34,7 +32,6 @@ from hsi_sc_nerf.poses.turntable import (
 _MOST_STEPS = 100
 _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
 _DAMPING_RANGE = (1e-12, 1e8)
-_NEAREST_DEPTH = 1e-3  # in distances of the camera
 
 T = TypeVar("T", bound=Turntable)
 
@@ -60,7 +57,7 @@ class FreeParameters:
 class ParameterLayout:
     """Columns of the parameters: camera, radial terms, angles, motions; behind these p come the landmarks."""
 
-    machine_size: int
+    motion_size: int
     """p, the number of parameters without the landmarks'."""
     camera: Int[np.ndarray, "c"]
     """Log focal length, rotation (3), and for markers the log distance."""
@@ -73,7 +70,7 @@ class ParameterLayout:
     @property
     def size(self) -> int:
         """Number of all parameters."""
-        return self.machine_size + self.landmark.size
+        return self.motion_size + self.landmark.size
 
     @staticmethod
     def of(
@@ -86,7 +83,7 @@ class ParameterLayout:
         angle = radial + frames - held
         size = angle + (5 * frames if free.motion_sigmas else 0)
         return ParameterLayout(
-            machine_size=size,
+            motion_size=size,
             camera=np.arange(camera),
             radial=np.arange(camera, radial),
             angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
@@ -97,10 +94,10 @@ class ParameterLayout:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Gauss-Newton equations, the landmarks' parts apart, for they are coupled by the other parameters alone."""
+    """Gauss-Newton equations of camera and motion, of the landmarks, and the coupling of both."""
 
-    machine: Float[np.ndarray, "p p"]
-    machine_gradient: Float[np.ndarray, "p"]
+    motion: Float[np.ndarray, "p p"]
+    motion_gradient: Float[np.ndarray, "p"]
     landmark: Float[np.ndarray, "l d d"]
     landmark_gradient: Float[np.ndarray, "l d"]
     coupling: Float[np.ndarray, "l d p"]
@@ -115,18 +112,18 @@ class NormalEquations:
         floor = 1e-12 * (1.0 + diagonal.max(axis=0, initial=0.0))
         inverse = np.linalg.inv(self.landmark + (damping * diagonal + floor)[:, :, None] * np.eye(diagonal.shape[1]))
         through = inverse @ self.coupling
-        p = len(self.machine)
-        reduced = self.machine - self.coupling.reshape(-1, p).T @ through.reshape(-1, p)
-        right = self.machine_gradient - through.reshape(-1, p).T @ self.landmark_gradient.ravel()
-        reduced[np.diag_indices(p)] += damping * np.maximum(self.machine.diagonal(), 1e-12)
+        p = len(self.motion)
+        reduced = self.motion - self.coupling.reshape(-1, p).T @ through.reshape(-1, p)
+        right = self.motion_gradient - through.reshape(-1, p).T @ self.landmark_gradient.ravel()
+        reduced[np.diag_indices(p)] += damping * np.maximum(self.motion.diagonal(), 1e-12)
         step = -cho_solve(cho_factor(reduced), right)
         return step, -np.einsum("lij,lj->li", inverse, self.landmark_gradient) - through @ step
 
     def dense(self) -> tuple[Float[np.ndarray, "p+l*d p+l*d"], Float[np.ndarray, "p+l*d"]]:
         """Normal matrix and gradient of all parameters, in the order of ``ParameterLayout``."""
-        coupling = self.coupling.reshape(-1, len(self.machine))
-        normal = np.block([[self.machine, coupling.T], [coupling, block_diag(*self.landmark)]])
-        return normal, np.concatenate([self.machine_gradient, self.landmark_gradient.ravel()])
+        coupling = self.coupling.reshape(-1, len(self.motion))
+        normal = np.block([[self.motion, coupling.T], [coupling, block_diag(*self.landmark)]])
+        return normal, np.concatenate([self.motion_gradient, self.landmark_gradient.ravel()])
 
 
 class Problem(ABC, Generic[T]):
@@ -155,7 +152,7 @@ class Problem(ABC, Generic[T]):
 
     @abstractmethod
     def jacobian(self, turntable: T) -> tuple[Jacobian, Float[np.ndarray, "n g*r d"]]:
-        """Derivatives of the residuals by the parameters of the machine and by those of the row's own landmark."""
+        """Derivatives of the residuals by camera and motion, and by the parameters of the row's own landmark."""
 
     @abstractmethod
     def with_landmark_step(self, turntable: T, step: Float[np.ndarray, "l d"]) -> T:
@@ -175,7 +172,7 @@ class Problem(ABC, Generic[T]):
             return np.zeros((0, 5))
         return turntable.tilts_and_shifts() / self.motion_sigmas
 
-    def machine_jacobian(self, jacobian: Jacobian) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
+    def motion_jacobian(self, jacobian: Jacobian) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
         """The columns that a row depends on, and its derivatives by them."""
         c, n = self.layout, len(self.frame)
         shared = np.concatenate([c.camera, c.radial])
@@ -193,26 +190,26 @@ class Problem(ABC, Generic[T]):
         """The normal equations with each residual weighted by its loss: 1 / sqrt(1 + r^2 / s^2)."""
         residual = self.residuals(turntable)
         jacobian, by_landmark = self.jacobian(turntable)
-        columns, values = self.machine_jacobian(jacobian)
+        columns, values = self.motion_jacobian(jacobian)
         weight = np.broadcast_to(self._weight(np.linalg.norm(residual, axis=-1))[..., None], residual.shape)
         residual, weight = residual.reshape(len(values), -1, 1), weight.reshape(len(values), -1, 1)
         weighted = np.swapaxes(weight * values, 1, 2)
-        width, (size, d) = self.layout.machine_size + 1, self.layout.landmark.shape
-        place = columns[:, :, None] * width + columns[:, None, :]
-        machine = np.bincount(place.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
+        width, (size, d) = self.layout.motion_size + 1, self.layout.landmark.shape
+        cell = columns[:, :, None] * width + columns[:, None, :]
+        motion = np.bincount(cell.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
         gradient = np.bincount(columns.ravel(), (weighted @ residual).ravel(), width)
         weighted_landmark = np.swapaxes(weight * by_landmark, 1, 2)
-        cell = (self.landmark[:, None] * width + columns).ravel()
+        pair = (self.landmark[:, None] * width + columns).ravel()
         products = weighted_landmark @ values
-        coupling = [np.bincount(cell, products[:, k].ravel(), size * width) for k in range(d)]
+        coupling = [np.bincount(pair, products[:, k].ravel(), size * width) for k in range(d)]
         if self.motion_sigmas is not None:
             at, motions = self.layout.motion, self.scaled_motions(turntable)
             weight = self._weight(motions)
-            machine[at, at] += weight / self.motion_sigmas**2
+            motion[at, at] += weight / self.motion_sigmas**2
             gradient[at] += weight * motions / self.motion_sigmas
         return NormalEquations(
-            machine=machine[:-1, :-1],
-            machine_gradient=gradient[:-1],
+            motion=motion[:-1, :-1],
+            motion_gradient=gradient[:-1],
             landmark=_summed(weighted_landmark @ by_landmark, self.landmark, size),
             landmark_gradient=_summed((weighted_landmark @ residual)[..., 0], self.landmark, size),
             coupling=np.array(coupling).reshape(d, size, width).swapaxes(0, 1)[..., :-1],
@@ -342,41 +339,6 @@ class MarkerProblem(Problem[MarkerTurntable]):
 
     def _whiten(self, values: Float[np.ndarray, "4*n 2 k"]) -> Float[np.ndarray, "n 8 k"]:
         return self.weights @ values.reshape(len(self.frame), 8, values.shape[-1])
-
-
-class PointProblem(Problem[PointTurntable]):
-    """Points of the object, in pixels. The loss is that of a residual's length. The distance to the axis is held."""
-
-    def __init__(
-        self, start: PointTurntable, tracks: Tracks, loss_px: float, free: FreeParameters | None = None
-    ) -> None:
-        """Args:
-        start: a turntable that has the frames and points of the tracks.
-        tracks: observed points.
-        loss_px: residuals well above this count by their length, not its square.
-        free: parameters to adjust; by default camera, angles and landmarks.
-        """
-        free = free or FreeParameters()
-        frame, point = start.rows(tracks)
-        layout = ParameterLayout.of(free, len(start.frames), len(start.points), 4, 3)
-        super().__init__(layout, frame, point, free, loss_px)
-        self.tracks = tracks
-
-    def residuals(self, turntable: PointTurntable) -> Float[np.ndarray, "n 1 2"]:
-        """Reprojection errors, infinite for a point behind the camera."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
-        return np.where(behind, np.inf, projection.pixels - self.tracks.pixels)[:, None]
-
-    def jacobian(self, turntable: PointTurntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
-        """By the point's coordinates."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        jacobian = projection_jacobian(turntable, self.frame, projection)
-        return jacobian, jacobian.point
-
-    def with_landmark_step(self, turntable: PointTurntable, step: Float[np.ndarray, "p 3"]) -> PointTurntable:
-        """The turntable with its points shifted."""
-        return replace(turntable, points_3d=turntable.points_3d + step)
 
 
 def loop_closure_deg(problem: Problem[T], turntable: T) -> float | None:

@@ -1,8 +1,8 @@
-"""A first guess of camera, axis, angles and marker layout, from each marker's pose in each frame alone.
+"""Initialisation of camera, axis, angles and marker layout, from each marker's pose in each frame.
 
-Centres of markers run on circles about one axis. A wrong focal length stretches these circles along the viewing
-direction, so the focal length is the one that leaves them round; and centres hardly suffer from the two-fold
-ambiguity of a small square's pose, which the layout then resolves: one pose on the object must suit all frames.
+Centres of markers move on circles about one axis. A wrong focal length stretches these circles along the viewing
+direction; the right one leaves them round. The two-fold ambiguity of a small square's pose hardly moves its centre.
+The layout resolves it: one pose on the object must fit all frames.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HORIZONTAL_COSINE = 0.95
 def initialise(
     observations: MarkerObservations, centre_px: tuple[float, float], width_px: int, side_m: float
 ) -> MarkerTurntable:
-    """First guess from linked observations (``linked_rows``) of markers that each are in two or more frames."""
+    """Initial turntable from linked observations (``linked_rows``) of markers that each are in two or more frames."""
     fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
     focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
     errors = [_Circles(observations, f, centre_px, side_m).error_px for f in focals]
@@ -84,7 +84,7 @@ class _Circles:
         self.predicted = ideal @ self.basis
 
     def turntable(self) -> MarkerTurntable:
-        """The guess in the adjustment's frame."""
+        """The circles as a turntable."""
         foot = self.basis[:2].T @ self.on_axis
         distance = np.linalg.norm(foot)
         z = self.basis[2]
@@ -104,7 +104,7 @@ class _Circles:
             points = np.einsum("cij,kj->cki", candidates, self.square) + poses[k, :3, 3]
             in_camera = (np.einsum("nij,ckj->cnki", turn[rows], points) - camera) @ camera_rotation.T
             error = self.focal_px * in_camera[..., :2] / in_camera[..., 2:] - self.corners_px[rows]
-            # Of all frames' two candidates the one that suits all frames best.
+            # Each frame gives two candidates; the one that fits all frames best is taken.
             size = np.linalg.norm(error, axis=-1).mean(-1)
             poses[k, :3, :3] = candidates[np.argmin(np.median(size, axis=-1))]
         start = MarkerTurntable(

@@ -1,6 +1,6 @@
 """The object frame and its scale: origin on the disc, x towards the first frame's camera, z along the axis, metres.
 
-Markers tell where the disc is. The scale comes from the markers' side, or from the container that carries markers.
+Markers determine the disc. The scale comes from the markers' side, or from the container that carries markers.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _LEAST_EIGENVALUE = 1e-3
 
 @dataclass(frozen=True)
 class Scale:
-    """What gives the scale, and how well it is known. Shares are of a length on the turntable."""
+    """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
 
     source: Literal["markers", "container"]
     marker_side_m: float
     """As given; as measured against the container where that gives the scale."""
     uncertainty: float
-    """Standard deviation of the scale as a share: by the fit of the corners, and by the markers' own spread."""
+    """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
     marker_sides: dict[int, float]
     """Each marker's apparent side over the mean of all; empty for a single marker."""
     marker_side_sigmas: dict[int, float]
@@ -120,8 +120,8 @@ def container_diameter(
 ) -> float | None:
     """Diameter of the upright cylinder whose wall the markers around the container touch; any unit of length.
 
-    The container need not stand on the axis: three or more markers tell its centre. Fewer are taken to stand around
-    the axis. None where no upright marker faces outwards, or their planes touch no common circle.
+    The container need not stand on the axis: three or more markers determine its centre. Fewer are taken to stand
+    around the axis. None where no upright marker faces outwards, or their planes touch no common circle.
 
     Args:
         normals: of the markers, unit vectors out of their faces; z is the axis.
@@ -134,15 +134,15 @@ def container_diameter(
     if container_height is not None:
         upright &= centres[:, 2] - disc < container_height
     normals = normals[upright, :2] / np.linalg.norm(normals[upright, :2], axis=-1, keepdims=True)
-    away = (normals * centres[upright, :2]).sum(-1)
-    if len(away) == 0:
+    distance = (normals * centres[upright, :2]).sum(-1)
+    if len(distance) == 0:
         return None
     # n.p = n.centre + radius
     design = np.column_stack([normals, np.ones(len(normals))])
-    if len(away) < _FEWEST_TO_FIND_THE_CENTRE or np.linalg.cond(design) > 20.0:
+    if len(distance) < _FEWEST_TO_FIND_THE_CENTRE or np.linalg.cond(design) > 20.0:
         design[:, :2] = 0.0
-    solution = np.linalg.lstsq(design, away, rcond=None)[0]
-    if np.abs(design @ solution - away).max() > _ON_CONTAINER_SIDES * side or solution[2] <= 0.0:
+    solution = np.linalg.lstsq(design, distance, rcond=None)[0]
+    if np.abs(design @ solution - distance).max() > _ON_CONTAINER_SIDES * side or solution[2] <= 0.0:
         return None
     return 2.0 * float(solution[2])
 

@@ -20,9 +20,9 @@ _STEPS_SHORT_OF_A_TURN = 1.5
 _LARGEST_DISAGREEMENT_PERCENT = 2.0
 # Warn of a marker that is this much larger or smaller than the others, if by so many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
-# Warn where the focal length, or the camera's distance, is known worse than this share.
+# Warn where the focal length, or the camera's distance, is known worse than this fraction.
 _LARGEST_SIGMA = 0.005
-# Of the frames that are left out for one reason so many are named; the report has all.
+# So many frames that are left out for one reason are named in the warning; the report has all.
 _MOST_NAMES = 8
 # Length of an arrow over the camera's distance, and of the error axis over the largest error.
 _ARROW_FRACTION = 0.15

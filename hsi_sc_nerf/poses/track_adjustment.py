@@ -13,8 +13,15 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, PointProblem, loop_closure_deg
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable, Tracks, project
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, ParameterLayout, Problem, loop_closure_deg
+from hsi_sc_nerf.poses.turntable import (
+    FEWEST_FRAMES,
+    Jacobian,
+    PointTurntable,
+    Tracks,
+    project,
+    projection_jacobian,
+)
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
@@ -22,6 +29,8 @@ _LOSS_PX = 0.1
 # Far from the solution a small loss scale holds on to what fits by chance.
 _FIRST_LOSS_PX = 1.0
 _SMALLEST_GAIN = 1e-6
+# Points nearer to the camera's plane than this, in distances of the camera, are behind it.
+_NEAREST_DEPTH = 1e-3
 # Outliers are farther than this many standard deviations, measured on the residuals, and than this, pixels.
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
@@ -133,6 +142,41 @@ def with_lost_frames(turntable: PointTurntable, tracks: Tracks) -> PointTurntabl
             at = int(np.searchsorted(frames, frame))
             frames, angles = np.insert(frames, at, frame), np.insert(angles, at, angle)
     return replace(turntable, frames=frames, angles_rad=angles[0] + np.unwrap(angles - angles[0]))
+
+
+class PointProblem(Problem[PointTurntable]):
+    """Points of the object, in pixels. The loss is that of a residual's length. The distance to the axis is held."""
+
+    def __init__(
+        self, start: PointTurntable, tracks: Tracks, loss_px: float, free: FreeParameters | None = None
+    ) -> None:
+        """Args:
+        start: a turntable that has the frames and points of the tracks.
+        tracks: observed points.
+        loss_px: residuals well above this count by their length, not its square.
+        free: parameters to adjust; by default camera, angles and landmarks.
+        """
+        free = free or FreeParameters()
+        frame, point = start.rows(tracks)
+        layout = ParameterLayout.of(free, len(start.frames), len(start.points), 4, 3)
+        super().__init__(layout, frame, point, free, loss_px)
+        self.tracks = tracks
+
+    def residuals(self, turntable: PointTurntable) -> Float[np.ndarray, "n 1 2"]:
+        """Reprojection errors, infinite for a point behind the camera."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
+        return np.where(behind, np.inf, projection.pixels - self.tracks.pixels)[:, None]
+
+    def jacobian(self, turntable: PointTurntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
+        """By the point's coordinates."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        jacobian = projection_jacobian(turntable, self.frame, projection)
+        return jacobian, jacobian.point
+
+    def with_landmark_step(self, turntable: PointTurntable, step: Float[np.ndarray, "p 3"]) -> PointTurntable:
+        """The turntable with its points shifted."""
+        return replace(turntable, points_3d=turntable.points_3d + step)
 
 
 def _search_angle(turntable: PointTurntable, seen: Tracks) -> float | None:

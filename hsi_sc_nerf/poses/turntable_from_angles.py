@@ -1,7 +1,7 @@
 """The camera before a turntable whose angles are known, from points seen in several frames alone.
 
-With the angles known, only the camera's rotation before the axis and its focal length are not: four numbers, for the
-distance is the unit of length. A point seen in two frames gives one equation for them, for its two rays meet.
+The unknowns are the camera's rotation and its focal length, four numbers, for the distance is the unit of length. A
+point seen in two frames gives one equation for them, for its two rays meet.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from hsi_sc_nerf.geometry.camera import closest_point_to_rays
 from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, with_lost_frames
 from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project, rotations_about_z
 
-# Cameras that are tried: how far they look down, and their focal lengths in image widths.
+# Starts of the search: the camera's elevation, and its focal length in image widths.
 _ELEVATIONS_DEG = (5.0, 25.0, 50.0)
 _FOCAL_FACTORS = (1.0, 1.8, 3.5)
-# A longer lens is hardly told from one that is infinitely long: each start keeps near its own, by this in logarithms.
+# A long lens hardly differs from an infinitely long one: each start keeps near its own focal length, by this in
+# logarithms.
 _FOCAL_REACH = 0.35
 # Pairs of rays that are looked at, and the turn between them.
 _MOST_PAIRS = 2000
 _PAIR_TURN_DEG = (8.0, 90.0)
-# Misses well above this hardly count (Cauchy): of raw matches a good part is wrong.
+# Errors well above this hardly count (Cauchy): many raw matches are wrong.
 _LOSS_PX = 0.3
 # Of a wrong camera's points about half lie behind it.
 _IN_FRONT_FRACTION = 0.75
@@ -41,7 +42,7 @@ def turntable_from_angles(
     *,
     direction_known: bool = True,
 ) -> PointTurntable:
-    """The camera that makes the rays of equal points meet, and these points: a start for ``adjust_tracks``.
+    """The camera for which the rays of each point meet, and these points: a start for ``adjust_tracks``.
 
     The axis is taken up in the image, to within 90 degrees, and the principal point in the image's middle.
 
@@ -50,10 +51,10 @@ def turntable_from_angles(
         frames: the tracks' frames with known angles, ascending.
         angles_rad: their angles, counter-clockwise seen from above.
         size_px: width and height of the images.
-        direction_known: otherwise the angles are turned over where that suits the tracks better.
+        direction_known: otherwise the angles' sign is the one that fits the tracks better.
 
     Raises:
-        InputError: the tracks do not tell the camera, or contradict the angles.
+        InputError: the tracks do not determine the camera, or contradict the angles.
     """
     width, height = size_px
     centre = (width / 2, height / 2)
@@ -92,7 +93,7 @@ def turntable_from_angles(
             best, best_cost = turntable, found.cost
     if best is None:
         raise InputError(
-            "the features do not suit the turntable's known angles; check the nominal step and the direction, or "
+            "the features do not fit the turntable's known angles; check the nominal step and the direction, or "
             "take markers"
         )
     return best
@@ -127,7 +128,7 @@ def adjusted_from_angles(
     if not free_angles:
         return held
     freed = adjust_tracks(held.turntable, tracks)
-    # Frames that the held angles made useless come back by the angle that suits their points.
+    # Frames that the held angles made useless come back at the angle that fits their points.
     return adjust_tracks(with_lost_frames(freed.turntable, tracks), tracks)
 
 

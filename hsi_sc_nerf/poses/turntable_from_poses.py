@@ -1,12 +1,12 @@
-"""From free poses of single frames to the machine that made them: one axis, one angle a frame, a fixed camera.
+"""Fit of a turntable (one axis, one angle per frame, a fixed camera) to free poses of single frames.
 
-Structure from motion gives each frame six numbers, where the machine has one. In its world the object lies still and
+Structure from motion gives each frame six numbers, where a turntable has one. In its world the object lies still and
 the camera goes round: with B the camera's rotation in the first frame and u the axis, frame i has
 
     R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
 
 for the axis stands still before the camera. Both are linear in what is looked for (u, then p and q). The object lies
-about the axis, so q is known well even where a frame's rotation and place are wrong together, as they are where a
+about the axis, so q is known well even where a frame's rotation and position are wrong together, as they are where a
 small object is seen from far away.
 """
 
@@ -22,7 +22,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable
 
-# A frame contradicts the machine if a misfit is above this and above so many times the median misfit.
+# A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
 _CONTRADICTS_DEG = 3.0
 _CONTRADICTS_DISTANCES = 0.02
 _CONTRADICTS_MEDIANS = 6.0
@@ -33,7 +33,7 @@ _ROUNDS = 10
 
 @dataclass(frozen=True)
 class TurntableFit:
-    """The machine nearest to free poses, in the poses' own unit of length.
+    """The turntable nearest to free poses, in the poses' own unit of length.
 
     The turntable's frame: z is the axis, up; the camera sits at (``distance``, 0, 0) at the angle 0. Angles are
     counter-clockwise seen from above, relative to the first frame that was fitted, unwrapped over the frames. Rows of
@@ -74,10 +74,10 @@ class TurntableFit:
 
 
 def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> TurntableFit:
-    """The axis, the camera before it and one angle a frame that suit free poses best.
+    """The axis, the camera before it and one angle per frame that fit free poses best.
 
     The axis comes from the frames that most pairs of frames agree with; single wrong poses do no harm. Poses alone
-    do not tell which end of an axis is up: it is taken up in the image, to within 90 degrees.
+    do not determine which end of an axis is up: it is taken up in the image, to within 90 degrees.
 
     Args:
         world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
@@ -94,7 +94,7 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     good = _agreeing(rotations)
     while good.sum() >= FEWEST_FRAMES:
         axis, base, angles = _about_one_axis(rotations, good)
-        on_axis, before_camera = _axis_place(rotations, shifts, axis, good)
+        on_axis, before_camera = _axis_position(rotations, shifts, axis, good)
         distance = float(np.linalg.norm(_perpendicular(base.T @ before_camera, axis)))
         misfit_deg = np.rad2deg(_angle_between(rotations, base @ _rotations_about(axis, angles)))
         misfit = np.linalg.norm(rotations @ on_axis + shifts - before_camera, axis=-1) / max(distance, 1e-12)
@@ -110,9 +110,9 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
 
     if (base @ axis)[1] > 0.0:  # the image's y points down
         axis, angles = -axis, -angles
-    place = -base.T @ before_camera
-    across = _perpendicular(place, axis)
-    x = across / np.linalg.norm(across)
+    camera = -base.T @ before_camera
+    horizontal = _perpendicular(camera, axis)
+    x = horizontal / np.linalg.norm(horizontal)
     first = int(np.flatnonzero(good)[0])
     # The frame's x belongs to the angle 0 of `base`; turn both to the first fitted frame.
     to_turntable = Rotation.from_rotvec([0.0, 0.0, angles[first]]).as_matrix() @ np.stack(
@@ -127,7 +127,7 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     contradicts[posed] = ~good
     return TurntableFit(
         to_turntable=to_turntable,
-        origin=on_axis + (place @ axis) * axis,
+        origin=on_axis + (camera @ axis) * axis,
         distance=distance,
         camera_rotation=camera_rotation,
         angles_rad=rows[0],
@@ -170,10 +170,10 @@ def _about_one_axis(rotations, good):
     return axis, base, angles
 
 
-def _axis_place(rotations, shifts, axis, good):
-    """R_i p + t_i = q: p in the world, at the height of what the camera looks at, q in the camera.
+def _axis_position(rotations, shifts, axis, good):
+    """R_i p + t_i = q: p in the world, at the height of the object, q in the camera.
 
-    The sum of distances is made least, not of their squares, by reweighting: one wrong place must not pull.
+    Reweighting minimises the sum of the distances, not of their squares, for robustness to single wrong poses.
     """
     rotations, shifts = rotations[good], shifts[good]
     n = len(rotations)

@@ -1,4 +1,4 @@
-"""Poses of a session's frames: what the session tells about them, how they are found, and what is reported."""
+"""Poses of a session's frames: the checks before, the search, the report, and the frames of the dataset."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _read_pictures(
 
 
 def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: TurntablePoses) -> dict:
-    """Where features were looked for, and of each frame how well each picture tells its edges, best first."""
+    """The picture of the features, and the edge precision of each frame's pictures, best first."""
     return {
         "features": None if poses.method == "markers" else pictures.features,
         "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},

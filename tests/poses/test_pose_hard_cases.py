@@ -184,7 +184,7 @@ def displaced(machine, frames, tilt_deg, shift_m, seed=0):
     ("frames", "which", "tilt_deg", "shift_m"),
     [(14, [6], 0.2, 0.0002), (14, [0], 8.0, 0.015), (30, [4, 5, 19], 0.3, 0.0003), (30, [0, 11, 29], 2.0, 0.003)],
 )
-def test_a_few_knocked_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
+def test_a_few_displaced_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
     machine = true_machine(MarkerScene(size_px=256, frames=frames))
     observations = observed(displaced(machine, which, tilt_deg, shift_m))
     adjusted, kept, rejected = adjust_without_outliers(machine, observations)
@@ -202,7 +202,7 @@ def test_a_few_knocked_frames_are_left_out_and_the_table_keeps_still(frames, whi
 
 
 @pytest.mark.parametrize("which", [[], [5]])
-def test_a_table_that_wobbles_is_not_taken_for_knocked_frames(which):
+def test_a_table_that_wobbles_is_not_taken_for_displaced_frames(which):
     machine = displaced(wobbling(0.1, frames=24), which, 2.0, 0.003)
     adjusted, _, rejected = adjust_without_outliers(machine, observed(machine))
     assert adjusted.turntable.tilts_rad is not None
@@ -210,12 +210,12 @@ def test_a_table_that_wobbles_is_not_taken_for_knocked_frames(which):
     assert rejected == []
 
 
-def test_more_knocks_than_a_few_are_a_wobble():
+def test_many_displaced_frames_are_a_wobble():
     machine = displaced(true_machine(MarkerScene(size_px=256, frames=20)), range(1, 20, 5), 1.0, 0.001)
     assert solved(machine, observed(machine)).turntable.tilts_rad is not None
 
 
-def test_one_displaced_marker_is_no_knocked_frame():
+def test_one_displaced_marker_is_no_displaced_frame():
     machine = true_machine(MarkerScene(size_px=256, frames=14))
     observations = observed(machine)
     corners = observations.corners_px + np.where(np.arange(len(observations)) == 33, 2.0, 0.0)[:, None, None]
@@ -229,8 +229,8 @@ def test_one_displaced_marker_is_no_knocked_frame():
 
 
 @pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
-def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames, which):
-    scene = MarkerScene(size_px=128, frames=frames, knocked=which)
+def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(frames, which):
+    scene = MarkerScene(size_px=128, frames=frames, displaced=which)
     names = scene.names()
     poses = poses_from_markers(scene.render(), names, SessionInfo(marker_side_m=SIDE_M), progress=False)
     assert poses.model == "turntable"

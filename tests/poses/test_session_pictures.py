@@ -58,12 +58,12 @@ def test_group_means_count_what_was_measured():
     packed[40:, 2] = FLAGGED
     members = rng.random((4, 9)) < 0.4
     members[:, 3] = True
-    means, flagged_share = group_means(packed, members)
+    means, flagged_fraction = group_means(packed, members)
     for k, inside in enumerate(members):
         values, valid = (part[..., inside] for part in unpack(packed))
         with np.errstate(invalid="ignore"):
             np.testing.assert_allclose(means[k], values.sum(-1) / valid.sum(-1), rtol=1e-5)
-        np.testing.assert_allclose(flagged_share[k], 1.0 - valid.mean(-1), atol=1e-6)
+        np.testing.assert_allclose(flagged_fraction[k], 1.0 - valid.mean(-1), atol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, PointProblem
-from hsi_sc_nerf.poses.track_adjustment import adjust_tracks, split_half_error_deg, with_lost_frames
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
+from hsi_sc_nerf.poses.track_adjustment import PointProblem, adjust_tracks, split_half_error_deg, with_lost_frames
 from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project
 from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
 
@@ -81,14 +81,14 @@ def test_derivatives_are_those_of_the_projection():
     problem = PointProblem(true, tracks, 1.0, FreeParameters(radial_terms=2))
     layout = problem.layout
     jacobian, by_point = problem.jacobian(true)
-    columns, values = problem.machine_jacobian(jacobian)
+    columns, values = problem.motion_jacobian(jacobian)
     for k in range(layout.size):
         step = 1e-6 * np.eye(layout.size)[k]
         there, back = (
-            problem.moved(true, sign * step[: layout.machine_size], sign * step[layout.landmark]).reproject(tracks)
+            problem.moved(true, sign * step[: layout.motion_size], sign * step[layout.landmark]).reproject(tracks)
             for sign in (1.0, -1.0)
         )
-        if k < layout.machine_size:
+        if k < layout.motion_size:
             expected = (values * (columns == k)[:, None]).sum(-1)
         else:
             expected = (by_point * (layout.landmark[problem.landmark] == k)[:, None]).sum(-1)

@@ -114,14 +114,14 @@ def test_derivatives_are_those_of_the_residuals(free):
     layout = problem.layout
 
     def moved(turntable, step):
-        return problem.moved(turntable, step[: layout.machine_size], step[layout.landmark])
+        return problem.moved(turntable, step[: layout.motion_size], step[layout.landmark])
 
     here = moved(start, 0.05 * rng.normal(size=layout.size))
     jacobian, by_marker = problem.jacobian(here)
-    columns, values = problem.machine_jacobian(jacobian)
+    columns, values = problem.motion_jacobian(jacobian)
     dense = np.zeros((len(observations), 8, layout.size + 1))
     for row in range(len(observations)):
-        own = np.where(columns[row] == layout.machine_size, layout.size, columns[row])
+        own = np.where(columns[row] == layout.motion_size, layout.size, columns[row])
         dense[row, :, own] += values[row].T
         dense[row, :, layout.landmark[problem.marker[row]]] += by_marker[row].T
     dense = dense[..., :-1]
