@@ -314,7 +314,13 @@ class MarkerProblem(Problem[MarkerTurntable]):
     def jacobian(self, turntable: MarkerTurntable) -> tuple[Jacobian, Float[np.ndarray, "n 8 d"]]:
         """By a marker's parameters: a small rotation in the object's axes, a shift (m), and the log of its side."""
         pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
-        whole = Jacobian(*(None if part is None else self._whiten(part) for part in vars(pixel).values()))
+        whole = Jacobian(
+            camera=self._whiten(pixel.camera),
+            radial=self._whiten(pixel.radial),
+            angle=self._whiten(pixel.angle),
+            motion=None if pixel.motion is None else self._whiten(pixel.motion),
+            point=self._whiten(pixel.point),
+        )
         offset = turntable.corner_offsets()[self.marker].reshape(-1, 3)
         parts = [pixel.point @ -cross_matrix(offset), pixel.point] if self.free.landmarks else []
         if self.free.marker_sides:
