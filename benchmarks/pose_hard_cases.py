@@ -22,11 +22,12 @@ from page import write_table
 from rich.console import Console
 from rich.table import Table
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
@@ -186,7 +187,7 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
     images = grey_images(simulation)
     if case.alter is not None:
         images = case.alter(images)
-    facts = SessionFacts(
+    info = SessionInfo(
         marker_dictionary=scene.markers.dictionary,
         marker_side_m=scene.markers.side_m,
         nominal_step_deg=simulation.plan.nominal_step_deg,
@@ -195,7 +196,7 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
         container_height_m=scene.container.height_m,
     )
     started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, facts, "markers", FeatureConfig(), progress=False)
+    poses = find_poses(images, simulation.captures, info, "markers", progress=False)
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
@@ -253,7 +254,7 @@ class PoseHardCases:
             f"{posed.focal_percent:+.3f}",
             f"{poses.overall_error_px:.3f}",
             f"{posed.seconds:.0f}",
-            "; ".join([poses.model, *poses.report()["warnings"]]),
+            "; ".join([poses.model, *pose_report(poses)["warnings"]]),
         )
 
 

@@ -22,15 +22,16 @@ from poses_speed import pose_errors
 from rich.console import Console
 from rich.table import Table
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.from_features import FeatureConfig
-from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
+from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.simulate.frames import Simulation
 
 TABLE = "by object table"
 COLUMNS = (
     "object",
-    "way",
+    "method",
     "frames",
     "rotation, deg",
     "place, mm",
@@ -50,7 +51,7 @@ class PosesByObject:
 
     objects: tuple[str, ...] = ("pear", "apple", "maize")
     """What stands on the turntable: scenes of the simulator."""
-    ways: tuple[Literal["colmap", "angles"], ...] = ("colmap", "angles")
+    methods: tuple[Literal["colmap", "angles"], ...] = ("colmap", "angles")
     """How poses are found."""
     frames: int = 60
     """Frames in the turn."""
@@ -67,8 +68,8 @@ class PosesByObject:
         for name in self.objects:
             simulation = Simulation(scene_of(Case(self.effects, name, self.frames, changes=NO_MARKERS), self.size))
             images = grey_images(simulation)
-            for way in self.ways:
-                rows.append((name, way, *measured(way, images, simulation)))
+            for method in self.methods:
+                rows.append((name, method, *measured(method, images, simulation)))
                 console.print(" | ".join(rows[-1]), highlight=False)
         shown = Table(*COLUMNS)
         for cells in rows:
@@ -78,21 +79,21 @@ class PosesByObject:
             write_table(self.page, TABLE, COLUMNS, rows)
 
 
-def measured(way: Literal["colmap", "angles"], images, simulation: Simulation) -> tuple[str, ...]:
-    """The cells of a row behind its object and way."""
+def measured(method: Literal["colmap", "angles"], images, simulation: Simulation) -> tuple[str, ...]:
+    """The cells of a row behind its object and method."""
     plan = simulation.plan
-    facts = SessionFacts()
-    if way == "angles":
-        facts = SessionFacts(nominal_step_deg=plan.nominal_step_deg, direction=plan.direction)
+    info = SessionInfo()
+    if method == "angles":
+        info = SessionInfo(nominal_step_deg=plan.nominal_step_deg, direction=plan.direction)
     started = time.perf_counter()
     try:
-        poses = find_poses(images, simulation.captures, facts, way, FeatureConfig(), progress=False)
+        poses = find_poses(images, simulation.captures, info, method, progress=False)
     except InputError as error:
         return "0", "", "", "", "", f"{time.perf_counter() - started:.0f}", f"refused: {error}"
     seconds = time.perf_counter() - started
     used = poses.used
     rotation_deg, place_mm = pose_errors(poses.camera_to_world[used], simulation.camera_to_world[used], False)
-    warnings = [w for w in poses.report()["warnings"] if not w.startswith(SAID_ANYWAY)]
+    warnings = [w for w in pose_report(poses)["warnings"] if not w.startswith(SAID_ANYWAY)]
     return (
         f"{used.sum()} of {len(used)}",
         f"{rotation_deg:.3f}",

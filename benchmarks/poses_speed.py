@@ -2,7 +2,7 @@
 
     uv run python benchmarks/poses_speed.py --output-dir /tmp/poses
 
-A turn is simulated twice, before an even wall and before a patterned one, and every way gets the same gray images.
+A turn is simulated twice, before an even wall and before a patterned one, and every method gets the same gray images.
 COLMAP's defaults are exhaustive matching, no masks, and every frame a pose of its own.
 """
 
@@ -25,10 +25,10 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
-from hsi_sc_nerf.poses.from_features import FeatureConfig
-from hsi_sc_nerf.poses.ways import PoseWay, SessionFacts, find_poses
+from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -64,18 +64,22 @@ class PosesSpeed:
     """Its mapping is told to stop after this many seconds."""
 
     def main(self) -> None:
-        """Simulate what is missing, estimate poses in every way, print the table and write table.json."""
+        """Simulate what is missing, estimate poses by every method, print the table and write table.json."""
         self.output_dir.mkdir(parents=True, exist_ok=True)
         sessions = (
             {"given": self.session} if self.session else {"even": self._made(()), "patterned": self._made(WALL)}
         )
-        table = Table("background", "way", "wall, s", "CPU, s", "frames", "rotation, °", "position, mm", "right")
+        table = Table("background", "method", "wall, s", "CPU, s", "frames", "rotation, °", "position, mm", "right")
         rows = []
         for background, path in sessions.items():
             session, truth = open_session(path), load_truth(path)
             images, names = gray_images(session), [frame.name for frame in session.frames]
-            for way, (estimate, has_scale) in self._ways(truth).items():
-                row = {"background": background, "way": way, **measured(estimate, images, names, truth, has_scale)}
+            for method, (estimate, has_scale) in self._methods(truth).items():
+                row = {
+                    "background": background,
+                    "method": method,
+                    **measured(estimate, images, names, truth, has_scale),
+                }
                 rows.append(row)
                 (self.output_dir / "table.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
                 table.add_row(*(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()))
@@ -88,18 +92,16 @@ class PosesSpeed:
         )
         return simulate_session(scene, path)
 
-    def _ways(self, truth: Truth) -> dict[str, tuple[Callable[[Images, list[str]], Poses], bool]]:
+    def _methods(self, truth: Truth) -> dict[str, tuple[Callable[[Images, list[str]], Poses], bool]]:
         side_m = float(np.linalg.norm(np.diff(next(iter(truth.marker_layout.values()))[:2], axis=0)))
-        facts = SessionFacts(marker_side_m=side_m)
+        info = SessionInfo(marker_side_m=side_m)
 
-        def by(way: PoseWay) -> Callable[[Images, list[str]], Poses]:
-            return lambda images, names: find_poses(
-                images, names, facts, way, FeatureConfig(), progress=False
-            ).camera_to_world
+        def by(method: PoseMethod) -> Callable[[Images, list[str]], Poses]:
+            return lambda images, names: find_poses(images, names, info, method, progress=False).camera_to_world
 
-        ways = {"markers": (by("markers"), True), "features": (by("colmap"), False)}
+        methods = {"markers": (by("markers"), True), "features": (by("colmap"), False)}
         plain = partial(from_colmap_defaults, limit_s=self.plain_limit_s)
-        return {**ways, "COLMAP's defaults": (plain, False)} if self.plain else ways
+        return {**methods, "COLMAP's defaults": (plain, False)} if self.plain else methods
 
 
 def gray_images(session: Session) -> list[UInt8[np.ndarray, "h w"]]:
@@ -168,14 +170,15 @@ def pose_errors(found: Poses, true: Poses, has_scale: bool) -> tuple[float, floa
     if len(found) < 3:
         return np.nan, np.nan
     rotations = Rotation.from_matrix(true[:, :3, :3]) * Rotation.from_matrix(found[:, :3, :3]).inv()
-    places, wanted = found[:, :3, 3], true[:, :3, 3]
+    positions, true_positions = found[:, :3, 3], true[:, :3, 3]
     if not has_scale:
         turn = rotations.mean()
         rotations = rotations * turn.inv()
-        places, wanted = turn.apply(places - places.mean(axis=0)), wanted - wanted.mean(axis=0)
-        places = places * (places * wanted).sum() / max(float((places**2).sum()), 1e-12)
+        positions = turn.apply(positions - positions.mean(axis=0))
+        true_positions = true_positions - true_positions.mean(axis=0)
+        positions = positions * (positions * true_positions).sum() / max(float((positions**2).sum()), 1e-12)
     rotation_deg = float(np.rad2deg(rotations.magnitude().max()))
-    return rotation_deg, 1e3 * float(np.linalg.norm(places - wanted, axis=-1).max())
+    return rotation_deg, 1e3 * float(np.linalg.norm(positions - true_positions, axis=-1).max())
 
 
 if __name__ == "__main__":

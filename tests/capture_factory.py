@@ -12,7 +12,7 @@ import numpy as np
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.poses.estimate import TurntablePoses
+from hsi_sc_nerf.poses.result import TurntablePoses
 
 BANDS = 12
 WAVELENGTHS_NM = np.linspace(400.0, 1000.0, BANDS)

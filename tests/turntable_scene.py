@@ -34,7 +34,7 @@ class MarkerScene:
     side_markers: int = 6
     disc_markers: int = 8
     turn_deg: float = 360.0
-    knocked: tuple[int, ...] = ()
+    displaced: tuple[int, ...] = ()
     wobble_deg: float = 0.0
     seed: int = 0
     dictionary: int = cv2.aruco.DICT_5X5_50
@@ -58,7 +58,7 @@ class MarkerScene:
             phase = np.deg2rad(2.0 * self.angles_deg[i])
             lean_deg = self.wobble_deg * np.array([np.cos(phase), np.sin(phase)])
             shift_m = np.zeros(3)
-            if i in self.knocked:
+            if i in self.displaced:
                 lean_deg, shift_m = lean_deg + np.array([0.8, -0.5]), np.array([0.0005, 0.0015, -0.0005])
             self.camera_to_world[i] = self._moved(i, lean_deg, shift_m)
         self.corners_m = {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 # Multiplying a camera-to-world pose by this on the right turns OpenCV axes (y down, looking along +z) into
 # OpenGL axes (y up, looking along -z), and back.
@@ -95,6 +95,46 @@ def pixel_rays(
     )
     directions = in_camera @ camera_to_world[:3, :3].T
     return camera_to_world[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def closest_point_to_rays(
+    origins: Float[np.ndarray, "*n 3"],
+    directions: Float[np.ndarray, "*n 3"],
+    index: Int[np.ndarray, "*n"] | None = None,
+    *,
+    regularisation: float = 0.0,
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p"]]:
+    """Triangulate points: minimise the sum of squared distances to the rays of each point.
+
+    Args:
+        origins: a point on each ray, metres or any other unit; broadcast against ``directions``.
+        directions: unit directions.
+        index: the point that each ray belongs to, 0 to p - 1; one point for all rays if not given.
+        regularisation: weight that pulls every point to the origin, for rays that are nearly parallel.
+
+    Returns:
+        The points, and the smallest eigenvalue of each normal matrix: 0 for parallel rays, at most 2/3 per ray.
+    """
+    perpendicular = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+    vectors = (perpendicular @ origins[..., None])[..., 0]
+    index = np.zeros(directions.shape[:-1], int) if index is None else index
+    size = int(index.max(initial=-1)) + 1
+    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
+    np.add.at(normal, index, perpendicular)
+    np.add.at(right, index, vectors)
+    eigenvalues, axes = np.linalg.eigh(normal + regularisation * np.eye(3))
+    along_axes = np.einsum("pij,pi->pj", axes, right)
+    # The pseudo-inverse leaves out directions that the rays do not determine.
+    known = eigenvalues > 1e-12 * eigenvalues[:, 2:]
+    coordinates = np.where(known, along_axes / np.where(known, eigenvalues, 1.0), 0.0)
+    return np.einsum("pij,pj->pi", axes, coordinates), eigenvalues[:, 0]
+
+
+def cross_matrix(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Matrices [v]x with [v]x w = v x w."""
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return matrix - np.swapaxes(matrix, -1, -2)
 
 
 def rotation_angle_deg(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:

@@ -1,14 +1,16 @@
-"""The pose report: what was found, how well it fits, and what to be wary of, ready for JSON."""
+"""The pose report: results, goodness of fit and warnings, ready for JSON; and a figure of the poses."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-if TYPE_CHECKING:
-    from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.poses.result import TurntablePoses
 
 # The paper's target for the reprojection error (section "Pose Estimation").
 REPROJECTION_TARGET_PX = 1.0
@@ -18,10 +20,13 @@ _STEPS_SHORT_OF_A_TURN = 1.5
 _LARGEST_DISAGREEMENT_PERCENT = 2.0
 # Warn of a marker that is this much larger or smaller than the others, if by so many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
-# Warn where the focal length, or the camera's distance, is known worse than this share.
+# Warn where the focal length, or the camera's distance, is known worse than this fraction.
 _LARGEST_SIGMA = 0.005
-# Of the frames that are left out for one reason so many are named; the report has all.
+# So many frames that are left out for one reason are named in the warning; the report has all.
 _MOST_NAMES = 8
+# Length of an arrow over the camera's distance, and of the error axis over the largest error.
+_ARROW_FRACTION = 0.15
+_AXIS_OVER_LARGEST = 1.4
 
 
 def pose_report(poses: TurntablePoses) -> dict:
@@ -111,20 +116,76 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
         parts.append(f"axis tilts {report['axis_tilt_to_disc_deg']:.2f}° to the disc")
     if report["loop_closure_deg"] is not None:
         parts.append(f"loop closes to {abs(report['loop_closure_deg']):.3f}°")
-    parts += [_scale_in_words(poses)]
+    parts += [_describe_scale(poses)]
     if poses.outliers:
         parts.append(f"{len(poses.outliers)} sightings of markers thrown out")
     return parts
 
 
-def _scale_in_words(poses: TurntablePoses) -> str:
-    scale = poses.scale
-    if scale is None:
-        return "scale as given" if poses.metric else "no scale"
-    words = f"scale by the {scale.source} ± {100.0 * scale.uncertainty:.2f} %"
-    if scale.source == "markers" and scale.disagreement_percent is not None:
-        words += f" (by it the container is {scale.disagreement_percent:+.1f} % off its given diameter)"
-    return words
+def draw_poses(poses: TurntablePoses, path: Path) -> None:
+    """Draw cameras and markers in space and from above, and errors and steps by frame, into a picture file.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    figure = Figure(figsize=(16, 6))
+    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.1, top=0.86, wspace=0.2, hspace=0.35)
+    figure.suptitle(_summary(poses), fontsize=10)
+    FigureCanvasAgg(figure)
+    eyes = poses.camera_to_world[poses.used, :3, 3]
+    arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_FRACTION * np.linalg.norm(eyes[0])
+    squares = [np.vstack([corners, corners[:1]]) for corners in poses.marker_corners_m.values()]
+
+    space = figure.add_subplot(1, 3, 1, projection="3d")
+    space.scatter(*eyes.T, c=np.arange(len(eyes)), cmap="viridis", s=12)
+    space.quiver(*eyes.T, *arrows.T, color="tab:red", linewidth=0.8)
+    for square in squares:
+        space.plot(*square.T, color="black", linewidth=0.8)
+    space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="Cameras in the object frame")
+    space.set_aspect("equal")
+
+    top = figure.add_subplot(1, 3, 2)
+    top.scatter(eyes[:, 0], eyes[:, 1], c=np.arange(len(eyes)), cmap="viridis", s=12)
+    top.quiver(
+        eyes[:, 0], eyes[:, 1], arrows[:, 0], arrows[:, 1],
+        angles="xy", scale_units="xy", scale=1, color="tab:red", width=0.003,
+    )  # fmt: skip
+    for square in squares:
+        top.plot(square[:, 0], square[:, 1], color="black", linewidth=0.8)
+    top.annotate(poses.names[int(np.flatnonzero(poses.used)[0])], (eyes[0, 0], eyes[0, 1]), fontsize=8)
+    top.set(xlabel="x (m)", ylabel="y (m)", title="From above")
+    top.set_aspect("equal")
+
+    error = figure.add_subplot(2, 3, 3)
+    index = np.arange(len(poses.names))
+    error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color="tab:blue")
+    left_out = index[~poses.used]
+    error.plot(left_out, np.zeros(len(left_out)), "x", color="tab:red", label="left out", clip_on=False)
+    error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
+    if np.isfinite(poses.overall_error_px):
+        # Far below the target, the frames are compared with each other.
+        error.set_ylim(0.0, _AXIS_OVER_LARGEST * float(np.nanmax(poses.reprojection_error_px)))
+        title = f"Overall {poses.overall_error_px:.3f} px (target {REPROJECTION_TARGET_PX:g} px)"
+    else:
+        title = "Poses as given: nothing was measured"
+    error.set(ylabel="reprojection error (px)", title=title)
+    error.legend(loc="upper right", fontsize=8)
+
+    turn = figure.add_subplot(2, 3, 6, sharex=error)
+    used = index[poses.used]
+    steps = np.diff(poses.angles_deg[used])
+    turn.plot(used[1:], steps, ".", color="tab:blue", label="found")
+    if poses.nominal_step_deg is not None:
+        nominal = np.copysign(poses.nominal_step_deg, np.median(steps))
+        turn.axhline(nominal, color="black", linestyle="--", label="nominal")
+        # Steps that agree to a thousandth of a degree would fill the axis with noise.
+        turn.set_ylim(*(np.array([-1.0, 1.0]) * max(0.05, 1.2 * np.abs(steps - nominal).max()) + nominal))
+    turn.ticklabel_format(axis="y", useOffset=False)
+    turn.set(xlabel="frame", ylabel="step since the last (degrees)")
+    turn.legend(loc="upper right", fontsize=8)
+
+    with atomic_write(path) as (temporary,):
+        figure.savefig(temporary, dpi=110)
 
 
 def is_full_turn(angles_deg: np.ndarray) -> bool:
@@ -225,3 +286,20 @@ def _step_deviation(poses: TurntablePoses) -> float | None:
 
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def _describe_scale(poses: TurntablePoses) -> str:
+    scale = poses.scale
+    if scale is None:
+        return "scale as given" if poses.metric else "no scale"
+    words = f"scale by the {scale.source} ± {100.0 * scale.uncertainty:.2f} %"
+    if scale.source == "markers" and scale.disagreement_percent is not None:
+        words += f" (by it the container is {scale.disagreement_percent:+.1f} % off its given diameter)"
+    return words
+
+
+def _summary(poses: TurntablePoses) -> str:
+    """The figures that are not drawn, in two lines."""
+    report = pose_report(poses)
+    words = ", ".join(describe_poses(poses, report))
+    return f"By {poses.method}: {words}\n{len(report['warnings'])} warnings (see poses.json)"

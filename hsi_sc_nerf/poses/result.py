@@ -1,4 +1,4 @@
-"""The result of every way to poses: by markers, by features, by known angles."""
+"""The result of every pose method: markers, features, known angles."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.poses.report import pose_report
-from hsi_sc_nerf.poses.scale import Scale
+from hsi_sc_nerf.poses.object_frame import Scale
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,9 @@ class Uncertainty:
     """Standard deviations that follow from the fit of the corners, by the covariance of the adjustment."""
 
     focal: float
-    """A share of the focal length."""
+    """Of the focal length, as a fraction of it."""
     distance: float
-    """A share of the camera's distance from the axis, the scale taken for exact."""
+    """Of the camera's distance from the axis, as a fraction of it; the scale is taken for exact."""
     angle_deg: Float[np.ndarray, "n"]
     """Of each frame's angle, relative to the first used frame; nan where a frame is not used."""
 
@@ -69,7 +68,7 @@ class TurntablePoses:
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
     chosen: str = ""
-    """Which way was taken, and why not another."""
+    """Which method was taken, and why not another."""
     metric: bool = True
     """Whether lengths are metres; otherwise they are in units of the camera's distance from the axis."""
     model: Literal["turntable", "free poses"] = "turntable"
@@ -80,7 +79,3 @@ class TurntablePoses:
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""
     uncertainty: Uncertainty | None = None
-
-    def report(self) -> dict:
-        """Everything a user needs to judge the poses, ready for JSON (see ``report.pose_report``)."""
-        return pose_report(self)

@@ -1,4 +1,4 @@
-"""The pictures that poses are measured on: of each frame the means of several groups of bands, the best first.
+"""The pictures that poses are measured on: for each frame the means of several groups of bands, the best first.
 
 No group of bands is best in every session: noise, saturation and the lens's blur differ along the spectrum, and many
 inks are transparent beyond 700 nm.
@@ -35,14 +35,14 @@ BAND_GROUPS_NM: Mapping[str, tuple[float, float]] = {
 
 # The broad mean stays unless another picture is better by this factor: many bands quiet what the score does not see.
 _CLEARLY_BETTER = 1.25
-# A pixel with more than this share of its group's values flagged is not exposed well.
+# A pixel with more than this fraction of its group's values flagged is not well exposed.
 _MOST_FLAGGED = 0.1
 # A group is scored by so many of its bands, evenly spread: they do to rank pictures, at a fraction of the cost.
 _BANDS_TO_SCORE = 8
 # Reflectance at which a pixel is as good as black, and as good as clipped.
 _BLACK, _WHITE = 0.004, 0.996
-# The strongest edges of a picture, as a share of its pixels.
-_EDGE_SHARE = 0.02
+# The strongest edges of a picture, as a fraction of its pixels.
+_EDGE_FRACTION = 0.02
 # No pixel of a picture of 8 bits is known better than this.
 _ROUNDING = 1.0 / (255.0 * np.sqrt(12.0))
 # J. Immerkær, "Fast noise variance estimation" (1996): it sees neither steps nor slopes, and lifts noise by 6.
@@ -80,8 +80,8 @@ class FramePictures:
         return clipped if self.flagged is None else clipped | self.flagged
 
 
-class MadeWhenAsked(Mapping[str, UInt8[np.ndarray, "h w"]]):
-    """Pictures that are made, once, when somebody asks for them; from several threads too."""
+class LazyMapping(Mapping[str, UInt8[np.ndarray, "h w"]]):
+    """Pictures that are computed once, at the first access; safe for several threads."""
 
     def __init__(
         self,
@@ -164,14 +164,14 @@ def frame_pictures(
     gray_nm: tuple[float, float],
     extra_nm: Mapping[str, float],
 ) -> FramePictures:
-    """Pictures of a packed frame: scored from a few bands of each group, and made from all of them when asked for.
+    """Pictures of a packed frame: scored from a few bands of each group, computed from all at the first access.
 
     Args:
-        cube_path: header of the packed cube; it must stay while pictures are asked for.
+        cube_path: header of the packed cube; it must exist while pictures are accessed.
         flags_path: its pixels' flags (docs/architecture.md).
         gray: the mean over ``gray_nm``, made when the frame was packed.
         gray_nm: its range.
-        extra_nm: single bands that are wanted too, by name; they are not looked at for markers.
+        extra_nm: further single bands by name; they are not searched for markers.
     """
     cube = open_cube(cube_path)
     wavelengths_nm = cube.wavelengths_nm
@@ -183,8 +183,8 @@ def frame_pictures(
     members[GRAY] = members[GRAY] if members[GRAY].any() else np.ones(len(wavelengths_nm), bool)
     members = {name: inside for name, inside in members.items() if inside.any()}
     few = {name: _evenly_spread(inside) for name, inside in members.items()}
-    means, flagged_share = group_means(cube.memmap(), np.stack(list(few.values())))
-    well = dict(zip(members, flagged_share <= _MOST_FLAGGED, strict=True))
+    means, flagged_fraction = group_means(cube.memmap(), np.stack(list(few.values())))
+    well = dict(zip(members, flagged_fraction <= _MOST_FLAGGED, strict=True))
     scores = {
         name: edge_precision(mean, well[name], bands=members[name].sum() / few[name].sum())
         for name, mean in zip(members, means, strict=True)
@@ -192,7 +192,7 @@ def frame_pictures(
     best_first = sorted(scores, key=lambda name: -scores[name] * (_CLEARLY_BETTER if name == GRAY else 1.0))
     for name, nm in extra_nm.items():
         members[name] = np.arange(len(wavelengths_nm)) == nearest_bands(wavelengths_nm, [nm])[0]
-    pictures = MadeWhenAsked(
+    pictures = LazyMapping(
         tuple(members), lambda name: _picture(cube.memmap(), flags_path, members[name]), {GRAY: gray}
     )
     best_well = well[best_first[0]]
@@ -213,11 +213,11 @@ def _picture(
     packed: UInt16[np.ndarray, "lines samples bands"], flags_path: Path, inside: Bool[np.ndarray, "bands"]
 ) -> UInt8[np.ndarray, "lines samples"]:
     """The mean of the bands inside; where nothing was measured, white if it is saturated and black else."""
-    (mean,), (flagged_share,) = group_means(packed, inside[None])
-    if (flagged_share == 1.0).any():
+    (mean,), (flagged_fraction,) = group_means(packed, inside[None])
+    if (flagged_fraction == 1.0).any():
         flags = np.asarray(cv2.imread(str(flags_path), cv2.IMREAD_UNCHANGED))
         saturated = (flags & np.uint8(PixelFlag.SATURATED)) > 0
-        mean = np.where(flagged_share == 1.0, saturated, mean)
+        mean = np.where(flagged_fraction == 1.0, saturated, mean)
     return to_8_bit(mean)
 
 
@@ -237,7 +237,7 @@ def read_frames(
 def group_means(
     packed: UInt16[np.ndarray, "lines samples bands"], members: Bool[np.ndarray, "groups bands"]
 ) -> tuple[Float[np.ndarray, "groups lines samples"], Float[np.ndarray, "groups lines samples"]]:
-    """Mean reflectance of each group of bands over what was measured (nan where nothing was), and the flagged share.
+    """Mean measured reflectance of each group of bands (nan where there is none), and the flagged fraction.
 
     Args:
         packed: reflectance as 16-bit numbers (``packed_cube``); read a few lines at a time.
@@ -248,7 +248,7 @@ def group_means(
     weights = np.ascontiguousarray(members.T[columns], np.float32)
     size = weights.sum(axis=0)
     means = np.empty((len(members), lines, samples), np.float32)
-    flagged_share = np.zeros_like(means)
+    flagged_fraction = np.zeros_like(means)
     for start in range(0, lines, _BLOCK_LINES):
         stop = min(start + _BLOCK_LINES, lines)
         block = np.take(np.asarray(packed[start:stop]).reshape(-1, bands), columns, axis=1)
@@ -258,22 +258,22 @@ def group_means(
         if flagged.any():
             values[flagged] = 0.0
             measured = size - flagged.astype(np.float32) @ weights
-            flagged_share[:, start:stop] = (1.0 - measured / size).T.reshape(-1, stop - start, samples)
+            flagged_fraction[:, start:stop] = (1.0 - measured / size).T.reshape(-1, stop - start, samples)
         with np.errstate(invalid="ignore"):
             block_means = values @ weights / (measured * REFLECTANCE_SCALE)
         means[:, start:stop] = block_means.T.reshape(-1, stop - start, samples)
-    return means, flagged_share
+    return means, flagged_fraction
 
 
 def edge_precision(
     reflectance: Float[np.ndarray, "h w"], measured: Bool[np.ndarray, "h w"] | None = None, bands: float = 1.0
 ) -> float:
-    """How well a picture tells where its strongest edges are: their mean slope over the noise, 1/px.
+    """Precision of a picture's strongest edges: their mean slope over the noise, 1/px.
 
     Noise of standard deviation s moves an edge of slope g by s/g pixels, so this is one over that error. Blur and
     ink that is hardly visible flatten the slope. An edge does not count where a pixel at it is black, clipped or not
-    ``measured``, for its place is lost there. Noise is that of the brighter half of the pixels, where markers' paper
-    is (J. Immerkær, "Fast noise variance estimation", 1996, with the median), and at least that of 8 bits.
+    ``measured``, for its position is lost there. Noise is that of the brighter half of the pixels, where markers'
+    paper is (J. Immerkær, "Fast noise variance estimation", 1996, with the median), and at least that of 8 bits.
 
     Args:
         reflectance: the picture.
@@ -292,7 +292,7 @@ def edge_precision(
     picture = np.asarray(reflectance, np.float32)
     across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
     slope = np.where(whole, cv2.magnitude(across, down), 0.0)
-    strongest = max(1, round(_EDGE_SHARE * slope.size))
+    strongest = max(1, round(_EDGE_FRACTION * slope.size))
     # Of the negative slopes the first: the many zeros at the other end make partition slow.
     edges = -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())
     bright = whole & (picture >= np.median(picture[whole]))

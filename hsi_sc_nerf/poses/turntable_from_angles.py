@@ -1,7 +1,7 @@
 """The camera before a turntable whose angles are known, from points seen in several frames alone.
 
-With the angles known, only the camera's rotation before the axis and its focal length are not: four numbers, for the
-distance is the unit of length. A point seen in two frames gives one equation for them, for its two rays meet.
+The unknowns are the camera's rotation and its focal length, four numbers, for the distance is the unit of length. A
+point seen in two frames gives one equation for them, for its two rays meet.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.late_frames import with_late_frames
-from hsi_sc_nerf.poses.track_adjust import AdjustedTracks, TrackAdjustConfig, adjust_tracks
-from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project
+from hsi_sc_nerf.geometry.camera import closest_point_to_rays
+from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, with_lost_frames
+from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project, rotations_about_z
 
-# Cameras that are tried: how far they look down, and their focal lengths in image widths.
+# Starts of the search: the camera's elevation, and its focal length in image widths.
 _ELEVATIONS_DEG = (5.0, 25.0, 50.0)
 _FOCAL_FACTORS = (1.0, 1.8, 3.5)
-# A longer lens is hardly told from one that is infinitely long: each start keeps near its own, by this in logarithms.
+# A long lens hardly differs from an infinitely long one: each start keeps near its own focal length, by this in
+# logarithms.
 _FOCAL_REACH = 0.35
 # Pairs of rays that are looked at, and the turn between them.
 _MOST_PAIRS = 2000
 _PAIR_TURN_DEG = (8.0, 90.0)
-# Misses well above this hardly count (Cauchy): of raw matches a good part is wrong.
+# Errors well above this hardly count (Cauchy): many raw matches are wrong.
 _LOSS_PX = 0.3
 # Of a wrong camera's points about half lie behind it.
-_IN_FRONT_SHARE = 0.75
+_IN_FRONT_FRACTION = 0.75
 
 
 def turntable_from_angles(
@@ -40,9 +41,8 @@ def turntable_from_angles(
     size_px: tuple[int, int],
     *,
     direction_known: bool = True,
-    focal_px: float | None = None,
-) -> TrackedTurntable:
-    """The camera that makes the rays of equal points meet, and these points: a start for ``adjust_tracks``.
+) -> PointTurntable:
+    """The camera for which the rays of each point meet, and these points: a start for ``adjust_tracks``.
 
     The axis is taken up in the image, to within 90 degrees, and the principal point in the image's middle.
 
@@ -51,49 +51,49 @@ def turntable_from_angles(
         frames: the tracks' frames with known angles, ascending.
         angles_rad: their angles, counter-clockwise seen from above.
         size_px: width and height of the images.
-        direction_known: otherwise the angles are turned over where that suits the tracks better.
-        focal_px: the focal length, if it is known.
+        direction_known: otherwise the angles' sign is the one that fits the tracks better.
 
     Raises:
-        InputError: the tracks do not tell the camera, or contradict the angles.
+        InputError: the tracks do not determine the camera, or contradict the angles.
     """
     width, height = size_px
     centre = (width / 2, height / 2)
     rows = _pairs(tracks, frames, angles_rad)
-    focals = [factor * width for factor in _FOCAL_FACTORS] if focal_px is None else [focal_px]
+    focals = [factor * width for factor in _FOCAL_FACTORS]
+    reach = np.array([np.inf, np.inf, np.inf, _FOCAL_REACH])
     best, best_cost = None, np.inf
     for sign, elevation_deg, focal in product((1.0,) if direction_known else (1.0, -1.0), _ELEVATIONS_DEG, focals):
         angles = sign * angles_rad
         base = _looking_down(elevation_deg)
-        turns = np.stack([_turn(-angles[np.searchsorted(frames, tracks.frame[r])]) for r in rows])
+        turns = np.stack([rotations_about_z(-angles[np.searchsorted(frames, tracks.frame[r])]) for r in rows])
         rays = np.stack([tracks.pixels[r] - centre for r in rows])
 
-        def gap(x, turns=turns, rays=rays, base=base, focal=focal):
-            return _gaps_px(Rotation.from_rotvec(x[:3]).as_matrix() @ base, focal * np.exp(x[3]), turns, rays)
+        def error_px(x, turns=turns, rays=rays, base=base, focal=focal):
+            return _sampson_error_px(
+                Rotation.from_rotvec(x[:3]).as_matrix() @ base, focal * np.exp(x[3]), turns, rays
+            )
 
-        reach = np.array([np.inf, np.inf, np.inf, _FOCAL_REACH if focal_px is None else 1e-9])
         found = least_squares(
-            gap, np.zeros(4), bounds=(-reach, reach), x_scale="jac", loss="cauchy", f_scale=_LOSS_PX, max_nfev=60
+            error_px, np.zeros(4), bounds=(-reach, reach), x_scale="jac", loss="cauchy", f_scale=_LOSS_PX, max_nfev=60
         )
         rotation = Rotation.from_rotvec(found.x[:3]).as_matrix() @ base
         if found.cost >= best_cost or rotation[1, 2] > 0.0:
             continue
-        machine = TrackedTurntable(
+        turntable = PointTurntable(
             focal_px=float(focal * np.exp(found.x[3])),
             centre_px=centre,
-            radial=(0.0, 0.0),
             camera_rotation=rotation,
             frames=frames,
             angles_rad=angles,
-            points=np.unique(tracks.point),
-            places=np.zeros((0, 3)),
+            points=np.zeros(0, int),
+            points_3d=np.zeros((0, 3)),
         )
-        machine, share = _with_points(machine, tracks)
-        if share >= _IN_FRONT_SHARE:
-            best, best_cost = machine, found.cost
+        turntable, fraction = _with_points(turntable, tracks)
+        if fraction >= _IN_FRONT_FRACTION:
+            best, best_cost = turntable, found.cost
     if best is None:
         raise InputError(
-            "the features do not suit the turntable's known angles; check the nominal step and the direction, or "
+            "the features do not fit the turntable's known angles; check the nominal step and the direction, or "
             "take markers"
         )
     return best
@@ -103,21 +103,19 @@ def adjusted_from_angles(
     tracks: Tracks,
     angles_deg: Float[np.ndarray, "n"],
     size_px: tuple[int, int],
-    config: TrackAdjustConfig,
     *,
+    free_angles: bool,
     direction_known: bool,
 ) -> AdjustedTracks:
-    """The camera before known angles, adjusted; and then the angles too, where ``config.free_angles`` says so.
+    """The camera before known angles, adjusted; and then the angles too, if they are free.
 
-    Free angles make good uneven steps, but what creeps over the object then bends the turn: of a pear of 160 px in 36
-    frames whose steps were uneven by 0.5 degrees (standard deviation) rotations were wrong by up to 1.1 degrees with
-    held and 0.4 with free angles; with even steps by 0.5 and 0.9.
+    Free angles follow uneven steps, but let features that creep over the object bend the turn.
 
     Args:
         tracks: points seen in frames.
         angles_deg: of every frame, also of those without tracks.
         size_px: width and height of the images.
-        config: of the adjustment.
+        free_angles: adjust the angles, which otherwise are held.
         direction_known: as in ``turntable_from_angles``.
 
     Raises:
@@ -126,12 +124,12 @@ def adjusted_from_angles(
     frames = np.unique(tracks.frame)
     angles_rad = np.deg2rad(angles_deg[frames])
     start = turntable_from_angles(tracks, frames, angles_rad, size_px, direction_known=direction_known)
-    held = adjust_tracks(start, tracks, replace(config, free_angles=False))
-    if not config.free_angles:
+    held = adjust_tracks(start, tracks, free_angles=False)
+    if not free_angles:
         return held
-    freed = adjust_tracks(held.turntable, tracks, config)
-    # Frames that the held angles made useless come back by the angle that suits their points.
-    return adjust_tracks(with_late_frames(freed.turntable, tracks), tracks, config)
+    freed = adjust_tracks(held.turntable, tracks)
+    # Frames that the held angles made useless come back at the angle that fits their points.
+    return adjust_tracks(with_lost_frames(freed.turntable, tracks), tracks)
 
 
 def _pairs(tracks, frames, angles_rad):
@@ -154,52 +152,42 @@ def _pairs(tracks, frames, angles_rad):
     return pairs[:, np.linspace(0, pairs.shape[1] - 1, min(_MOST_PAIRS, pairs.shape[1])).astype(int)]
 
 
-def _gaps_px(rotation, focal_px, turns, pixels):
-    """By how far both rays of each pair miss each other, in pixels (Sampson's approximation).
+def _sampson_error_px(rotation, focal_px, turns, pixels):
+    """Distance by which the two rays of each pair miss each other, in pixels (Sampson's approximation).
 
-    Rays of directions r, r' from places c, c' meet if (c' - c) . (r x r') = 0; the slopes of this by the pixels make
-    it a distance in the image (R. Hartley and A. Zisserman, "Multiple view geometry", section 11.4.3).
+    Rays of directions r, r' from origins c, c' meet if (c' - c) . (r x r') = 0; its gradient by the pixels makes it a
+    distance in the image (R. Hartley and A. Zisserman, "Multiple view geometry", section 11.4.3).
     """
     before = np.concatenate([pixels / focal_px, np.ones((*pixels.shape[:2], 1))], axis=-1)
     rays = np.einsum("knij,knj->kni", turns, before @ rotation)
     apart = turns[1, :, :, 0] - turns[0, :, :, 0]
     normals = np.cross(rays[::-1], apart)
     miss = (rays[0] * normals[0]).sum(-1)
-    slopes = np.einsum("knji,knj->kni", turns, normals) @ rotation.T
-    return miss / (np.linalg.norm(slopes[..., :2], axis=-1) ** 2).sum(0) ** 0.5 * focal_px
+    gradient = np.einsum("knji,knj->kni", turns, normals) @ rotation.T
+    return miss / (np.linalg.norm(gradient[..., :2], axis=-1) ** 2).sum(0) ** 0.5 * focal_px
 
 
-def _with_points(machine, tracks):
-    """The machine with every point where its rays come nearest to each other, less those behind the camera.
+def _with_points(turntable, tracks):
+    """The turntable with every point triangulated, less those behind the camera.
 
-    Also returns the share of sightings before the camera.
+    Also returns the fraction of observations before the camera.
     """
-    tracks = tracks.select(np.isin(tracks.frame, machine.frames))
-    machine = replace(machine, points=np.unique(tracks.point))
-    frame, point = machine.rows(tracks)
-    turn = _turn(-machine.angles_rad)[frame]
-    flat = (tracks.pixels - machine.centre_px) / machine.focal_px
-    rays = np.einsum("nij,nj->ni", turn, np.c_[flat, np.ones(len(flat))] @ machine.camera_rotation)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    size = len(machine.points)
-    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
-    np.add.at(normal, point, across)
-    np.add.at(right, point, np.einsum("nij,nj->ni", across, turn[:, :, 0]))
-    # A point seen once, or from one side, stays near the axis.
-    places = np.linalg.solve(normal + 1e-9 * np.eye(3), right[..., None])[..., 0]
-    machine = replace(machine, places=places)
-    behind = project(machine, frame, point)[2][:, 2] <= 0.0
-    wrong = np.zeros(size, bool)
-    wrong[point[behind]] = True
-    return replace(machine, points=machine.points[~wrong], places=places[~wrong]), 1.0 - float(behind.mean())
+    tracks = tracks.select(np.isin(tracks.frame, turntable.frames))
+    points, point = np.unique(tracks.point, return_inverse=True)
+    frame = np.searchsorted(turntable.frames, tracks.frame)
+    to_object = rotations_about_z(-turntable.angles_rad)[frame]
+    normalised = (tracks.pixels - turntable.centre_px) / turntable.focal_px
+    in_room = np.column_stack([normalised, np.ones(len(normalised))]) @ turntable.camera_rotation
+    directions = np.einsum("nij,nj->ni", to_object, in_room)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    # A point seen once, or along parallel rays, stays near the axis.
+    points_3d, _ = closest_point_to_rays(to_object[:, :, 0], directions, point, regularisation=1e-9)
+    behind = project(turntable, frame, points_3d[point]).in_camera[:, 2] <= 0.0
+    wrong = np.isin(np.arange(len(points)), point[behind])
+    return replace(turntable, points=points[~wrong], points_3d=points_3d[~wrong]), 1.0 - float(behind.mean())
 
 
 def _looking_down(elevation_deg):
     """From the turntable's frame to OpenCV's camera axes, of a camera at (1, 0, 0) that looks down at the axis."""
     c, s = np.cos(np.deg2rad(elevation_deg)), np.sin(np.deg2rad(elevation_deg))
     return np.array([[0.0, 1.0, 0.0], [s, 0.0, -c], [-c, 0.0, -s]])
-
-
-def _turn(angles_rad):
-    return Rotation.from_rotvec(np.outer(angles_rad, [0.0, 0.0, 1.0])).as_matrix()

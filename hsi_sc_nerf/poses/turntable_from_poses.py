@@ -1,12 +1,12 @@
-"""From free poses of single frames to the machine that made them: one axis, one angle a frame, a fixed camera.
+"""Fit of a turntable (one axis, one angle per frame, a fixed camera) to free poses of single frames.
 
-Structure from motion gives each frame six numbers, where the machine has one. In its world the object lies still and
+Structure from motion gives each frame six numbers, where a turntable has one. In its world the object lies still and
 the camera goes round: with B the camera's rotation in the first frame and u the axis, frame i has
 
     R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
 
 for the axis stands still before the camera. Both are linear in what is looked for (u, then p and q). The object lies
-about the axis, so q is known well even where a frame's rotation and place are wrong together, as they are where a
+about the axis, so q is known well even where a frame's rotation and position are wrong together, as they are where a
 small object is seen from far away.
 """
 
@@ -19,10 +19,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.tracks import TrackedTurntable
+from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable
 
-FEWEST_FRAMES = 3
-# A frame contradicts the machine if a misfit is above this and above so many times the median misfit.
+# A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
 _CONTRADICTS_DEG = 3.0
 _CONTRADICTS_DISTANCES = 0.02
 _CONTRADICTS_MEDIANS = 6.0
@@ -33,7 +33,7 @@ _ROUNDS = 10
 
 @dataclass(frozen=True)
 class TurntableFit:
-    """The machine nearest to free poses, in the poses' own unit of length.
+    """The turntable nearest to free poses, in the poses' own unit of length.
 
     The turntable's frame: z is the axis, up; the camera sits at (``distance``, 0, 0) at the angle 0. Angles are
     counter-clockwise seen from above, relative to the first frame that was fitted, unwrapped over the frames. Rows of
@@ -53,32 +53,31 @@ class TurntableFit:
     """How far the frame's pose shifts the axis before the camera, in distances of the camera from the axis."""
     contradicts: Bool[np.ndarray, "n"]
 
-    def place(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def transform(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Points of the poses' world in the turntable's frame, with the camera's distance as the unit of length."""
         return (points - self.origin) @ self.to_turntable.T / self.distance
 
-    def tracked(
-        self, places: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
-    ) -> TrackedTurntable:
-        """Where ``track_adjust`` can start from: the fitted frames, and points of the poses' world, by row."""
+    def turntable(
+        self, points_3d: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
+    ) -> PointTurntable:
+        """The start for ``adjust_tracks``: the fitted frames, and points of the poses' world, numbered by row."""
         frames = np.flatnonzero(np.isfinite(self.angles_rad))
-        return TrackedTurntable(
+        return PointTurntable(
             focal_px=focal_px,
             centre_px=centre_px,
-            radial=(0.0, 0.0),
             camera_rotation=self.camera_rotation,
             frames=frames,
             angles_rad=self.angles_rad[frames],
-            points=np.arange(len(places)),
-            places=self.place(places),
+            points=np.arange(len(points_3d)),
+            points_3d=self.transform(points_3d),
         )
 
 
 def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> TurntableFit:
-    """The axis, the camera before it and one angle a frame that suit free poses best.
+    """The axis, the camera before it and one angle per frame that fit free poses best.
 
     The axis comes from the frames that most pairs of frames agree with; single wrong poses do no harm. Poses alone
-    do not tell which end of an axis is up: it is taken up in the image, to within 90 degrees.
+    do not determine which end of an axis is up: it is taken up in the image, to within 90 degrees.
 
     Args:
         world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
@@ -95,11 +94,11 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     good = _agreeing(rotations)
     while good.sum() >= FEWEST_FRAMES:
         axis, base, angles = _about_one_axis(rotations, good)
-        on_axis, before_camera = _axis_place(rotations, shifts, axis, good)
-        distance = float(np.linalg.norm(_across(base.T @ before_camera, axis)))
-        misfit_deg = np.rad2deg(_angle_between(rotations, base @ _turns(axis, angles)))
+        on_axis, before_camera = _axis_position(rotations, shifts, axis, good)
+        distance = float(np.linalg.norm(_perpendicular(base.T @ before_camera, axis)))
+        misfit_deg = np.rad2deg(_angle_between(rotations, base @ _rotations_about(axis, angles)))
         misfit = np.linalg.norm(rotations @ on_axis + shifts - before_camera, axis=-1) / max(distance, 1e-12)
-        wrong = _above(misfit_deg, good, _CONTRADICTS_DEG) | _above(misfit, good, _CONTRADICTS_DISTANCES)
+        wrong = _is_outlier(misfit_deg, good, _CONTRADICTS_DEG) | _is_outlier(misfit, good, _CONTRADICTS_DISTANCES)
         if not wrong[good].any():
             break
         good = good & ~wrong
@@ -111,9 +110,9 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
 
     if (base @ axis)[1] > 0.0:  # the image's y points down
         axis, angles = -axis, -angles
-    place = -base.T @ before_camera
-    across = _across(place, axis)
-    x = across / np.linalg.norm(across)
+    camera = -base.T @ before_camera
+    horizontal = _perpendicular(camera, axis)
+    x = horizontal / np.linalg.norm(horizontal)
     first = int(np.flatnonzero(good)[0])
     # The frame's x belongs to the angle 0 of `base`; turn both to the first fitted frame.
     to_turntable = Rotation.from_rotvec([0.0, 0.0, angles[first]]).as_matrix() @ np.stack(
@@ -128,7 +127,7 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     contradicts[posed] = ~good
     return TurntableFit(
         to_turntable=to_turntable,
-        origin=on_axis + (place @ axis) * axis,
+        origin=on_axis + (camera @ axis) * axis,
         distance=distance,
         camera_rotation=camera_rotation,
         angles_rad=rows[0],
@@ -161,48 +160,47 @@ def _about_one_axis(rotations, good):
     # |R_i u - v| is least where u is what the mean rotation shortens least.
     axis = np.linalg.svd(rotations[good].mean(axis=0))[2][0]
     base = rotations[good][0]
-    cross = _cross_matrix(axis)
+    cross = cross_matrix(axis)
     for _ in range(_ROUNDS):
         relative = base.T @ rotations
         cosine = np.trace(relative, axis1=1, axis2=2) - axis @ relative @ axis
         sine = np.einsum("nij,ij->n", relative, cross)
         angles = np.arctan2(sine, cosine)
-        base = _nearest_rotation((rotations @ np.swapaxes(_turns(axis, angles), -1, -2))[good].sum(axis=0))
+        base = _nearest_rotation((rotations @ np.swapaxes(_rotations_about(axis, angles), -1, -2))[good].sum(axis=0))
     return axis, base, angles
 
 
-def _axis_place(rotations, shifts, axis, good):
-    """R_i p + t_i = q: p in the world, at the height of what the camera looks at, q in the camera.
+def _axis_position(rotations, shifts, axis, good):
+    """R_i p + t_i = q: p in the world, at the height of the object, q in the camera.
 
-    The sum of distances is made least, not of their squares, by reweighting: one wrong place must not pull.
+    Reweighting minimises the sum of the distances, not of their squares, for robustness to single wrong poses.
     """
     rotations, shifts = rotations[good], shifts[good]
     n = len(rotations)
-    places = -np.einsum("nji,nj->ni", rotations, shifts)
-    # Where the viewing rays meet: there p is near the object, whose place the poses tell best.
-    sideways = np.eye(3) - rotations[:, 2, :, None] * rotations[:, 2, None, :]
-    seen = np.linalg.lstsq(sideways.reshape(-1, 3), np.einsum("nij,nj->ni", sideways, places).ravel(), rcond=1e-6)[0]
+    # Where the viewing directions meet, p is near the object, where the poses determine it best.
+    cameras = -np.einsum("nji,nj->ni", rotations, shifts)
+    (near_object,), _ = closest_point_to_rays(cameras, rotations[:, 2])
     plane = np.linalg.svd(axis[None])[2][1:].T
     design = np.concatenate([rotations @ plane, -np.tile(np.eye(3), (n, 1, 1))], axis=-1)
-    wanted = -(rotations @ seen + shifts)
+    right = -(rotations @ near_object + shifts)
     weight = np.ones(n)
     for _ in range(_ROUNDS):
         weighted = (design * weight[:, None, None]).reshape(3 * n, 5)
-        solution = np.linalg.lstsq(weighted, (wanted * weight[:, None]).ravel(), rcond=None)[0]
-        left = np.linalg.norm(design @ solution - wanted, axis=-1)
+        solution = np.linalg.lstsq(weighted, (right * weight[:, None]).ravel(), rcond=None)[0]
+        left = np.linalg.norm(design @ solution - right, axis=-1)
         weight = 1.0 / np.sqrt(np.maximum(left, max(1e-3 * float(np.median(left)), 1e-12)))
-    return seen + plane @ solution[:2], solution[2:]
+    return near_object + plane @ solution[:2], solution[2:]
 
 
-def _above(misfit, good, least):
+def _is_outlier(misfit, good, least):
     return misfit > max(least, _CONTRADICTS_MEDIANS * float(np.median(misfit[good])))
 
 
-def _turns(axis, angles):
+def _rotations_about(axis, angles):
     return Rotation.from_rotvec(np.outer(angles, axis)).as_matrix()
 
 
-def _across(vector, axis):
+def _perpendicular(vector, axis):
     return vector - (vector @ axis) * axis
 
 
@@ -214,7 +212,3 @@ def _angle_between(a, b):
 def _nearest_rotation(matrix):
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-
-
-def _cross_matrix(v):
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

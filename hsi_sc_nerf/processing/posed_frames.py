@@ -1,69 +1,44 @@
-"""Poses of a session's frames: what the session tells about them, how they are found, and what is reported."""
+"""Poses of a session's frames: the checks before, the search, the report, and the frames of the dataset."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from rich.console import Console
 
 from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
-from hsi_sc_nerf.poses.from_features import PSEUDO_RGB, FeatureConfig, group_of_most_variance
-from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.picture import draw_poses
-from hsi_sc_nerf.poses.report import describe_poses
+from hsi_sc_nerf.poses.pose_methods import KnownCamera, PoseMethod
+from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.session_pictures import GRAY, MadeWhenAsked, SessionPictures, read_frames
-from hsi_sc_nerf.poses.ways import PoseWay, SessionFacts
+from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures, read_frames
+from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.frames import FramePaths
 
 _log = logging.getLogger(__name__)
 
 PoseFunction = Callable[..., TurntablePoses]
-"""Called like ``poses.ways.find_poses``."""
+"""Called like ``poses.pose_methods.find_poses``."""
 
 
-def session_facts(session: Session, marker_side_m: float | None, earlier: PackedDataset | None) -> SessionFacts:
-    """What a session tells that its images do not.
-
-    Args:
-        session: the session.
-        marker_side_m: goes before the session's own.
-        earlier: a dataset of the same camera before the same turntable, whose camera is taken for known.
-    """
-    info = session.info
-    return SessionFacts(
-        marker_dictionary=info.marker_dictionary,
-        marker_side_m=marker_side_m or info.marker_side_m,
-        camera_distance_m=info.camera_distance_m,
-        nominal_step_deg=info.nominal_step_deg,
-        direction=info.direction,
-        container_diameter_m=info.container_diameter_m,
-        container_height_m=info.container_height_m,
-        frame_angles_deg=info.frame_angles_deg,
-        camera=None if earlier is None else _camera(earlier),
-    )
-
-
-def check_scale(session: Session, facts: SessionFacts, way: PoseWay) -> None:
-    """Refuse a session of which nothing gives the size, unless poses without a scale were asked for.
+def check_scale(session: Session, info: SessionInfo, camera: KnownCamera | None, method: PoseMethod) -> None:
+    """Refuse a session of which nothing gives the size, unless its poses may do without a scale.
 
     Raises:
         InputError: nothing gives the scale.
     """
-    known = (facts.marker_side_m, facts.container_diameter_m, facts.camera_distance_m, facts.camera)
-    if way in ("auto", "markers") and all(fact is None for fact in known):
+    known = (info.marker_side_m, info.container_diameter_m, info.camera_distance_m, camera)
+    if method in ("auto", "markers") and all(value is None for value in known):
         raise InputError(
             f"{session.info_path}: does not give marker_side_m, the side of a marker's black square in metres, "
             "without which nothing has a size; add it, give --marker-side-m, or take --poses colmap and do without "
@@ -74,39 +49,49 @@ def check_scale(session: Session, facts: SessionFacts, way: PoseWay) -> None:
 def pose_frames(
     session: Session,
     images: Sequence[UInt8[np.ndarray, "h w"]],
-    facts: SessionFacts,
-    way: PoseWay,
+    info: SessionInfo,
+    camera: KnownCamera | None,
+    method: PoseMethod,
     config: FeatureConfig,
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
     marker_range_nm: tuple[float, float] = (450.0, 700.0),
 ) -> TurntablePoses:
-    """Find the poses, write ``poses.json`` and its picture, and say what was found.
+    """Find the poses, write ``poses.json`` and its figure, and print what was found.
 
     Args:
         session: the session, whose frames are packed under ``output_dir``.
-        images: of each frame the mean over ``marker_range_nm``.
-        facts: what else is known.
-        way: how poses are found.
+        images: the mean over ``marker_range_nm`` of each frame.
+        info: what is known of the session.
+        camera: of an earlier session, if it is known.
+        method: how poses are found.
         config: settings of poses from features.
         output_dir: the dataset.
-        console: where to say it.
+        console: prints.
         find_poses: finds the poses.
-        marker_range_nm: range in which markers are printed to be seen.
+        marker_range_nm: range in which the markers' ink is visible.
 
     Raises:
-        InputError: no way to poses works, or the operating system refused to write.
+        InputError: no method finds poses, or the operating system refused to write.
     """
     names = [capture.name for capture in session.frames]
-    # Known angles before a known camera: nothing is measured.
-    measured = way != "angles" or facts.camera is None
+    # Known angles before a known camera need no images.
+    measured = method != "angles" or camera is None
     pictures = _read_pictures(names, images, config, output_dir, marker_range_nm) if measured else None
     try:
-        poses = find_poses(pictures or images, names, facts=facts, way=way, config=config, progress=not console.quiet)
+        poses = find_poses(
+            pictures or images,
+            names,
+            info=info,
+            method=method,
+            config=config,
+            camera=camera,
+            progress=not console.quiet,
+        )
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
-    report = poses.report() | {"pictures": None if pictures is None else _pictures_report(names, pictures, poses)}
+    report = pose_report(poses) | {"pictures": None if pictures is None else _pictures_report(names, pictures, poses)}
     write_json(output_dir / "poses.json", report)
     draw_poses(poses, output_dir / "report" / "poses.png")
     console.print(f"Poses {poses.chosen}: {', '.join(describe_poses(poses, report))}.", highlight=False)
@@ -163,28 +148,11 @@ def _read_pictures(
     paths = [FramePaths.of(output_dir, name) for name in names]
     band = {} if config.band_nm is None else {f"{config.band_nm:g} nm": config.band_nm}
     frames = read_frames([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm, band)
-    if band:
-        return SessionPictures(frames, *band)
-    if config.picture == "foreground-variance":
-        pictures = SessionPictures(frames)
-        return SessionPictures(frames, group_of_most_variance(pictures, config.motion.background))
-    if config.picture == "pseudo-rgb":
-        shown = [np.asarray(cv2.imread(str(p.image), cv2.IMREAD_GRAYSCALE)) for p in paths]
-        more = [
-            replace(
-                frame,
-                pictures=MadeWhenAsked(
-                    (*frame.pictures, PSEUDO_RGB), frame.pictures.__getitem__, {PSEUDO_RGB: image}
-                ),
-            )
-            for frame, image in zip(frames, shown, strict=True)
-        ]
-        return SessionPictures(more, PSEUDO_RGB)
-    return SessionPictures(frames)
+    return SessionPictures(frames, *band)
 
 
 def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: TurntablePoses) -> dict:
-    """Where features were looked for, and of each frame how well each picture tells its edges, best first."""
+    """The picture of the features, and the edge precision of each frame's pictures, best first."""
     return {
         "features": None if poses.method == "markers" else pictures.features,
         "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},
@@ -195,8 +163,8 @@ def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: Tur
     }
 
 
-def _camera(earlier: PackedDataset) -> KnownCamera:
-    """The camera at the angle 0."""
+def known_camera(earlier: PackedDataset) -> KnownCamera:
+    """The camera of a dataset that was made before with the same camera and turntable, at the angle 0."""
     first = earlier.frames[0]
     k1, k2, p1, p2 = (float(c) for c in earlier.distortion)
     return KnownCamera(
@@ -208,7 +176,7 @@ def _camera(earlier: PackedDataset) -> KnownCamera:
 
 
 def _direction(angles_deg: Sequence[float]) -> Literal["ccw", "cw"] | None:
-    """How a turntable turned, by the sign of its frames' angles; None where both occur, or neither."""
+    """Direction of the turn by the sign of the frames' angles; None where both signs occur, or neither."""
     forth, back = max(angles_deg) > 0.0, min(angles_deg) < 0.0
     if forth == back:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +34,9 @@ from hsi_sc_nerf.packed.dataset import (
     transforms_path,
     write_transforms,
 )
-from hsi_sc_nerf.poses.from_features import FeatureConfig
+from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.ways import PoseWay, find_poses
+from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
@@ -44,9 +44,9 @@ from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
     check_scale,
     container_under,
+    known_camera,
     pose_frames,
     posed_frames,
-    session_facts,
 )
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
@@ -65,7 +65,7 @@ class ProcessConfig:
     """Foreground masks."""
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
     """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
-    poses: PoseWay = "auto"
+    poses: PoseMethod = "auto"
     """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
     angles that session.json gives (angles); or by the first of these that works (auto)."""
     features: FeatureConfig = field(default_factory=FeatureConfig)
@@ -126,8 +126,9 @@ def process_session(
     if _is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
-    facts = session_facts(session, config.marker_side_m, open_packed(config.camera) if config.camera else None)
-    check_scale(session, facts, config.poses)
+    camera = None if config.camera is None else known_camera(open_packed(config.camera))
+    info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
+    check_scale(session, info, camera, config.poses)
     _remove_transforms(output_dir)
 
     calibration = _calibrate(session, config, output_dir, console)
@@ -146,7 +147,8 @@ def process_session(
     poses = pose_frames(
         session,
         [cache.gray for cache in caches],
-        facts,
+        info,
+        camera,
         config.poses,
         config.features,
         output_dir,

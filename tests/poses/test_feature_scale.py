@@ -3,7 +3,8 @@
 import pytest
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.poses.from_features import Known, scale_by_markers
+from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.poses.object_frame import scale_by_markers
 
 UNIT_M = 0.37
 """Length of the unit that features leave lengths in."""
@@ -21,8 +22,8 @@ def side_m():
 
 
 def test_the_markers_side_gives_the_scale_and_the_container_is_measured_against_it():
-    known = Known(marker_side_m=side_m(), container_diameter_m=1.02 * WALL_M, container_height_m=0.07)
-    scale, metres = scale_by_markers(corners(), 0.0, known)
+    info = SessionInfo(marker_side_m=side_m(), container_diameter_m=1.02 * WALL_M, container_height_m=0.07)
+    scale, metres = scale_by_markers(corners(), 0.0, info)
     assert metres == pytest.approx(UNIT_M)
     assert scale.source == "markers"
     assert scale.measured_container_diameter_m == pytest.approx(WALL_M)
@@ -30,12 +31,12 @@ def test_the_markers_side_gives_the_scale_and_the_container_is_measured_against_
 
 
 def test_without_the_side_the_container_gives_the_scale():
-    scale, metres = scale_by_markers(corners(), 0.0, Known(container_diameter_m=WALL_M))
+    scale, metres = scale_by_markers(corners(), 0.0, SessionInfo(container_diameter_m=WALL_M))
     assert metres == pytest.approx(UNIT_M)
     assert scale.source == "container"
     assert scale.marker_side_m == pytest.approx(side_m())
 
 
 def test_with_neither_there_is_the_cameras_distance_or_nothing():
-    assert scale_by_markers(corners(), 0.0, Known(camera_distance_m=0.4)) == (None, 0.4)
-    assert scale_by_markers({}, 0.0, Known(marker_side_m=0.03)) == (None, 1.0)
+    assert scale_by_markers(corners(), 0.0, SessionInfo(camera_distance_m=0.4)) == (None, 0.4)
+    assert scale_by_markers({}, 0.0, SessionInfo(marker_side_m=0.03)) == (None, 1.0)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.poses.loop_closure import track_loop_closure_deg
-from hsi_sc_nerf.poses.track_adjust import AdjustedTracks
-from hsi_sc_nerf.poses.tracks import TrackedTurntable, Tracks, project
+from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks
+from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project
 
 FRAMES, REACH = 24, 3
 LOOKS_DOWN = np.deg2rad(20.0)
@@ -22,15 +23,14 @@ def creeping(creep_deg, noise_px=0.0, last_frame_sees=True):
     radius, height = rng.uniform(0.05, 0.1, points), rng.uniform(-0.45, -0.3, points)
     angles = np.linspace(0.0, 2.0 * np.pi, FRAMES, endpoint=False)
     about = -angles[azimuth] + rng.uniform(-0.1, 0.1, points)
-    machine = TrackedTurntable(
+    turntable = PointTurntable(
         focal_px=400.0,
         centre_px=(128.0, 128.0),
-        radial=(0.0, 0.0),
         camera_rotation=np.array([[0.0, 1.0, 0.0], [S, 0.0, -C], [-C, 0.0, -S]]),
         frames=np.arange(FRAMES),
         angles_rad=angles,
         points=np.arange(points),
-        places=np.stack([radius * np.cos(about), radius * np.sin(about), height], axis=-1),
+        points_3d=np.stack([radius * np.cos(about), radius * np.sin(about), height], axis=-1),
     )
     apart = np.tile(np.arange(-REACH, REACH + 1), points)
     point = np.repeat(np.arange(points), 2 * REACH + 1)
@@ -40,27 +40,21 @@ def creeping(creep_deg, noise_px=0.0, last_frame_sees=True):
         keep &= ~((frame == 0) & (azimuth[point] >= FRAMES // 2))
         apart, point, frame = apart[keep], point[keep], frame[keep]
     # Another angle for each row: as if each was a frame of its own.
-    turned = TrackedTurntable(
-        **{
-            **vars(machine),
-            "frames": np.arange(len(frame)),
-            "angles_rad": angles[frame] + np.deg2rad(creep_deg) * apart,
-        }
-    )
-    pixels = project(turned, np.arange(len(frame)), point)[0] + noise_px * rng.normal(size=(len(frame), 2))
-    tracks = Tracks(frame, point, pixels)
-    residual = project(machine, frame, point)[0] - pixels
-    return AdjustedTracks(machine, tracks, np.zeros(len(frame), bool), residual, None)
+    rows = np.arange(len(frame))
+    turned = replace(turntable, frames=rows, angles_rad=angles[frame] + np.deg2rad(creep_deg) * apart)
+    pixels = project(turned, rows, turntable.points_3d[point]).pixels
+    tracks = Tracks(frame, point, pixels + noise_px * rng.normal(size=pixels.shape))
+    return AdjustedTracks(turntable, tracks, np.zeros(len(frame), bool))
 
 
 @pytest.mark.parametrize("creep_deg", [0.0, 0.02, -0.05])
 def test_steps_that_creep_do_not_close_the_loop(creep_deg):
-    assert track_loop_closure_deg(creeping(creep_deg)) == pytest.approx(FRAMES * creep_deg, rel=2e-2, abs=1e-9)
+    assert creeping(creep_deg).loop_closure_deg() == pytest.approx(FRAMES * creep_deg, rel=2e-2, abs=1e-9)
 
 
 def test_noise_alone_leaves_little():
-    assert abs(track_loop_closure_deg(creeping(0.0, noise_px=0.02))) < 0.3
+    assert abs(creeping(0.0, noise_px=0.02).loop_closure_deg()) < 0.3
 
 
 def test_frames_that_share_no_point_tell_nothing():
-    assert track_loop_closure_deg(creeping(0.0, last_frame_sees=False)) is None
+    assert creeping(0.0, last_frame_sees=False).loop_closure_deg() is None

@@ -7,9 +7,9 @@ from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.poses.fit import fit_marker
-from hsi_sc_nerf.poses.markers import detect_markers, dictionary_by_name, find_dictionary, marker_pattern
-from hsi_sc_nerf.poses.observe import find_blur
+from hsi_sc_nerf.poses.marker_detection import detect_markers, dictionary_by_name, find_dictionary, marker_pattern
+from hsi_sc_nerf.poses.marker_fit import fit_marker
+from hsi_sc_nerf.poses.marker_observations import find_blur
 
 DICTIONARY = "DICT_5X5_50"
 

@@ -10,17 +10,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.adjust import reproject, whitening
-from hsi_sc_nerf.poses.choose import LOSS_SIGMAS, choose
-from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
-from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m
-from hsi_sc_nerf.poses.initialise import Observations, Turntable
-from hsi_sc_nerf.poses.knocked import frame_motions
-from hsi_sc_nerf.poses.outliers import KNOCKED, adjust_without_outliers, usable, well_known
-from hsi_sc_nerf.poses.picture import draw_poses
-from hsi_sc_nerf.poses.scale import apparent_sides, container_diameter, length_sigma, resized
+from hsi_sc_nerf.poses.marker_outliers import (
+    DISPLACED,
+    adjust_without_outliers,
+    usable,
+    without_uncertain_frames,
+)
+from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.model_selection import frame_motions, select_model
+from hsi_sc_nerf.poses.object_frame import (
+    apparent_sides,
+    container_diameter,
+    disc_height_m,
+    length_sigma,
+    object_poses,
+)
+from hsi_sc_nerf.poses.report import draw_poses, pose_report
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 from hsi_sc_nerf.simulate.frames import Simulation
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -41,38 +50,39 @@ def true_machine(scene, **changes):
         axes = np.stack([x / np.linalg.norm(x), y / np.linalg.norm(y)], axis=-1)
         marker_pose[:3, :3] = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
         marker_pose[:3, 3] = corners.mean(0) - [0.0, 0.0, camera_m[2]]
-    machine = Turntable(
-        scene.intrinsics.fl_x,
-        (pose_in_object @ np.diag([1.0, -1.0, -1.0, 1.0]))[:3, :3].T,
-        float(np.hypot(camera_m[0], camera_m[1])),
-        np.arange(scene.frames),
-        np.deg2rad(scene.angles_deg),
-        markers,
-        poses,
+    turntable = MarkerTurntable(
+        focal_px=scene.intrinsics.fl_x,
+        centre_px=CENTRE_PX,
+        camera_rotation=(pose_in_object @ np.diag([1.0, -1.0, -1.0, 1.0]))[:3, :3].T,
+        distance=float(np.hypot(camera_m[0], camera_m[1])),
+        frames=np.arange(scene.frames),
+        angles_rad=np.deg2rad(scene.angles_deg),
+        side_m=SIDE_M,
+        markers=markers,
+        marker_poses=poses,
     )
-    return replace(machine, **changes)
+    return replace(turntable, **changes)
 
 
-def observed(machine, side_m=SIDE_M, noise_px=NOISE_PX, seed=0):
+def observed(machine, noise_px=NOISE_PX, seed=0):
     """Noisy corners of all markers that face the camera."""
     rng = np.random.default_rng(seed)
-    rotations, shifts = machine.motions()
     normals, centres = machine.marker_poses[:, :3, 2], machine.marker_poses[:, :3, 3]
     pairs = []
-    for frame, (rotation, shift) in enumerate(zip(rotations, shifts, strict=True)):
-        view = ([machine.distance_m, 0.0, 0.0] - shift) @ rotation - centres
+    for frame, camera in enumerate(machine.camera_positions()):
+        view = camera - centres
         facing = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1) > 0.25
         pairs += [(frame, marker) for marker in machine.markers[facing]]
     frame, marker = np.array(pairs).T
     covariance = np.tile(np.eye(8) * NOISE_PX**2, (len(frame), 1, 1))
-    blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), covariance)
-    corners = reproject(machine, blank, CENTRE_PX, side_m)
+    blank = MarkerObservations(frame, marker, np.zeros((len(frame), 4, 2)), covariance)
+    corners = machine.reproject(blank)
     return replace(blank, corners_px=corners + noise_px * rng.normal(size=corners.shape))
 
 
 def solved(machine, observations):
-    start = replace(machine, radial=(0.0, 0.0), tilts_rad=None, shifts_m=None, focal_px=1.01 * machine.focal_px)
-    return choose(start, observations, CENTRE_PX, SIDE_M, whitening(observations.covariance_px2))
+    start = replace(machine, radial=(0.0, 0.0), tilts_rad=None, shifts=None, focal_px=1.01 * machine.focal_px)
+    return select_model(start, observations)
 
 
 def wobbling(amplitude_deg, frames=18, cycles=2.0, seed=None):
@@ -84,7 +94,7 @@ def wobbling(amplitude_deg, frames=18, cycles=2.0, seed=None):
     # The table leans about a point 0.12 m below the camera's height.
     foot = np.array([0.0, 0.0, -0.12])
     lean = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1)))).as_matrix()
-    return true_machine(scene, tilts_rad=tilts, shifts_m=foot - lean @ foot)
+    return true_machine(scene, tilts_rad=tilts, shifts=foot - lean @ foot)
 
 
 def relative_errors(found, truth):
@@ -99,12 +109,12 @@ def test_a_wobbling_table_gets_free_poses(amplitude_deg, seed):
     machine = wobbling(amplitude_deg, seed=seed)
     found = solved(machine, observed(machine)).turntable
     assert found.tilts_rad is not None
-    rotation, position = relative_errors(camera_to_world(found, -0.1), camera_to_world(machine, -0.1))
+    rotation, position = relative_errors(object_poses(found, -0.1), object_poses(machine, -0.1))
     assert rotation < 0.06
     assert position < 0.4
     # Against the one axis that is nearest, the same poses would be wrong by the wobble.
-    still = replace(machine, tilts_rad=None, shifts_m=None)
-    assert relative_errors(camera_to_world(still, -0.1), camera_to_world(machine, -0.1))[0] > amplitude_deg
+    still = replace(machine, tilts_rad=None, shifts=None)
+    assert relative_errors(object_poses(still, -0.1), object_poses(machine, -0.1))[0] > amplitude_deg
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -150,7 +160,7 @@ def test_displaced_markers_are_thrown_out():
     displaced = [10, 33, 52]
     corners[displaced] += np.array([3.0, -3.0])
     spoilt = replace(observations, corners_px=corners)
-    adjusted, kept, rejected = adjust_without_outliers(machine, spoilt, CENTRE_PX, SIDE_M)
+    adjusted, kept, rejected = adjust_without_outliers(machine, spoilt)
     assert [(r.frame, r.marker) for r in rejected] == [(spoilt.frame[i], spoilt.marker[i]) for i in displaced]
     np.testing.assert_allclose([r.error_px for r in rejected], 3.0 * np.sqrt(2.0), atol=0.2)
     assert len(kept) == len(spoilt) - len(rejected)
@@ -158,86 +168,85 @@ def test_displaced_markers_are_thrown_out():
     assert adjusted.turntable.focal_px == pytest.approx(machine.focal_px, rel=2e-3)
 
 
-def knocked(machine, frames, tilt_deg, shift_m, seed=0):
+def displaced(machine, frames, tilt_deg, shift_m, seed=0):
     """The machine with some frames tilted and shifted."""
     rng = np.random.default_rng(seed)
     n = len(machine.frames)
     tilts = np.zeros((n, 2)) if machine.tilts_rad is None else machine.tilts_rad.copy()
-    shifts = np.zeros((n, 3)) if machine.shifts_m is None else machine.shifts_m.copy()
+    shifts = np.zeros((n, 3)) if machine.shifts is None else machine.shifts.copy()
     for moved, size in ((tilts, np.deg2rad(tilt_deg)), (shifts, shift_m)):
         directions = rng.normal(size=(len(frames), moved.shape[1]))
         moved[list(frames)] += size * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    return replace(machine, tilts_rad=tilts, shifts_m=shifts)
+    return replace(machine, tilts_rad=tilts, shifts=shifts)
 
 
 @pytest.mark.parametrize(
     ("frames", "which", "tilt_deg", "shift_m"),
     [(14, [6], 0.2, 0.0002), (14, [0], 8.0, 0.015), (30, [4, 5, 19], 0.3, 0.0003), (30, [0, 11, 29], 2.0, 0.003)],
 )
-def test_a_few_knocked_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
+def test_a_few_displaced_frames_are_left_out_and_the_table_keeps_still(frames, which, tilt_deg, shift_m):
     machine = true_machine(MarkerScene(size_px=256, frames=frames))
-    observations = observed(knocked(machine, which, tilt_deg, shift_m))
-    adjusted, kept, rejected = adjust_without_outliers(machine, observations, CENTRE_PX, SIDE_M)
+    observations = observed(displaced(machine, which, tilt_deg, shift_m))
+    adjusted, kept, rejected = adjust_without_outliers(machine, observations)
     assert adjusted.turntable.tilts_rad is None
-    assert sorted(adjusted.knocked) == which
+    assert sorted(adjusted.displaced_frames) == which
     assert sorted({r.frame for r in rejected}) == which
-    assert all(r.why == KNOCKED and r.error_px > 3.0 * NOISE_PX for r in rejected)
+    assert all(r.why == DISPLACED and r.error_px > 3.0 * NOISE_PX for r in rejected)
     np.testing.assert_array_equal(np.unique(kept.frame), adjusted.turntable.frames)
     assert len(kept) + len(rejected) == len(observations)
     rotation, position = relative_errors(
-        camera_to_world(adjusted.turntable, -0.1), camera_to_world(machine.restricted(kept), -0.1)
+        object_poses(adjusted.turntable, -0.1), object_poses(machine.restricted(kept), -0.1)
     )
     assert rotation < 0.05
     assert position < 0.4
 
 
 @pytest.mark.parametrize("which", [[], [5]])
-def test_a_table_that_wobbles_is_not_taken_for_knocked_frames(which):
-    machine = knocked(wobbling(0.1, frames=24), which, 2.0, 0.003)
-    adjusted, _, rejected = adjust_without_outliers(machine, observed(machine), CENTRE_PX, SIDE_M)
+def test_a_table_that_wobbles_is_not_taken_for_displaced_frames(which):
+    machine = displaced(wobbling(0.1, frames=24), which, 2.0, 0.003)
+    adjusted, _, rejected = adjust_without_outliers(machine, observed(machine))
     assert adjusted.turntable.tilts_rad is not None
-    assert adjusted.knocked == {}
+    assert adjusted.displaced_frames == {}
     assert rejected == []
 
 
-def test_more_knocks_than_a_few_are_a_wobble():
-    machine = knocked(true_machine(MarkerScene(size_px=256, frames=20)), range(1, 20, 5), 1.0, 0.001)
+def test_many_displaced_frames_are_a_wobble():
+    machine = displaced(true_machine(MarkerScene(size_px=256, frames=20)), range(1, 20, 5), 1.0, 0.001)
     assert solved(machine, observed(machine)).turntable.tilts_rad is not None
 
 
-def test_one_displaced_marker_is_no_knocked_frame():
+def test_one_displaced_marker_is_no_displaced_frame():
     machine = true_machine(MarkerScene(size_px=256, frames=14))
     observations = observed(machine)
     corners = observations.corners_px + np.where(np.arange(len(observations)) == 33, 2.0, 0.0)[:, None, None]
-    weights = whitening(observations.covariance_px2)
-    found = frame_motions(machine, replace(observations, corners_px=corners), CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
-    assert found.chance.min() > 1e-4
+    found = frame_motions(machine, replace(observations, corners_px=corners))
+    assert found.p_value.min() > 1e-4
     moved = np.where(observations.frame == 3, 0.5, 0.0)[:, None, None] * [1.0, -1.0]
     bumped = replace(observations, corners_px=corners + moved)
-    found = frame_motions(machine, bumped, CENTRE_PX, SIDE_M, weights, LOSS_SIGMAS)
-    assert np.flatnonzero(found.chance < 1e-6).tolist() == [3]
-    assert 0.2 < found.away_px[3] < 0.75
+    found = frame_motions(machine, bumped)
+    assert np.flatnonzero(found.p_value < 1e-6).tolist() == [3]
+    assert 0.2 < found.rms_error_px[3] < 0.75
 
 
 @pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
-def test_a_session_with_knocked_frames_keeps_the_turntable_and_names_them(frames, which):
-    scene = MarkerScene(size_px=128, frames=frames, knocked=which)
+def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(frames, which):
+    scene = MarkerScene(size_px=128, frames=frames, displaced=which)
     names = scene.names()
-    poses = estimate_turntable_poses(scene.render(), names, marker_side_m=SIDE_M, progress=False)
+    poses = poses_from_markers(scene.render(), names, SessionInfo(marker_side_m=SIDE_M), progress=False)
     assert poses.model == "turntable"
     assert set(poses.dropped) == {names[i] for i in which}
-    assert all(KNOCKED in why for why in poses.dropped.values())
+    assert all(DISPLACED in why for why in poses.dropped.values())
     truth = rotation_about_z(scene.angles_deg[poses.used][0]) @ scene.camera_to_world[poses.used]
     rotation, position = relative_errors(poses.camera_to_world[poses.used], truth)
     assert rotation < 0.1
     assert position < 1.5
-    (warning,) = [w for w in poses.report()["warnings"] if "left out" in w]
+    (warning,) = [w for w in pose_report(poses)["warnings"] if "left out" in w]
     assert warning.startswith(f"{len(which)} of {frames} frames are left out: {', '.join(names[i] for i in which)} (")
 
 
 def test_a_session_on_a_wobbling_table_keeps_its_frames():
     scene = MarkerScene(size_px=128, frames=10, wobble_deg=0.5)
-    poses = estimate_turntable_poses(scene.render(), scene.names(), marker_side_m=SIDE_M, progress=False)
+    poses = poses_from_markers(scene.render(), scene.names(), SessionInfo(marker_side_m=SIDE_M), progress=False)
     assert poses.model == "free poses"
     assert poses.used.all()
     assert poses.wobble_deg == pytest.approx(0.5, abs=0.1)
@@ -248,14 +257,11 @@ def test_markers_that_cannot_count_are_named_with_the_reason():
     observations = observed(machine)
     rng = np.random.default_rng(0)
     still = np.tile(observations.corners_px[0], (10, 1, 1)) + 0.01 * rng.normal(size=(10, 4, 2))
-    extra = Observations(
+    extra = MarkerObservations(
         np.append(np.arange(10), 4), np.append(np.full(10, 40), 41), np.concatenate([still, still[:1] + 9.0]),
         observations.covariance_px2[:11],
     )  # fmt: skip
-    both = Observations(
-        *(np.concatenate([getattr(observations, k), getattr(extra, k)]) for k in Observations.__dataclass_fields__)
-    )
-    kept, rejected, stands_still = usable(both)
+    kept, rejected, stands_still = usable(observations.append(extra))
     assert stands_still == [40]
     assert len(kept) == len(observations)
     assert {(r.marker, r.why) for r in rejected} == {
@@ -270,14 +276,14 @@ def test_a_frame_whose_angle_is_hardly_known_is_left_out():
     covariance = observations.covariance_px2.copy()
     covariance[observations.frame == 5] *= 400.0**2
     vague = replace(observations, covariance_px2=covariance)
-    adjusted, kept, rejected = well_known(solved(machine, vague), vague, CENTRE_PX, SIDE_M)
+    adjusted, kept, rejected = without_uncertain_frames(solved(machine, vague), vague)
     assert 5 not in adjusted.turntable.frames
     assert {r.frame for r in rejected} == {5}
     assert len(kept) + len(rejected) == len(vague)
     vague = replace(observations, covariance_px2=400.0**2 * covariance)
     adjusted = solved(machine, vague)
     with pytest.raises(InputError, match="larger or sharper"):
-        well_known(adjusted, vague, CENTRE_PX, SIDE_M)
+        without_uncertain_frames(adjusted, vague)
 
 
 def test_uncertainties_are_those_of_the_errors():
@@ -292,7 +298,7 @@ def test_uncertainties_are_those_of_the_errors():
         errors.append(
             [
                 np.log(adjusted.turntable.focal_px / machine.focal_px) / np.sqrt(covariance[0, 0]),
-                np.log(adjusted.turntable.distance_m / machine.distance_m) / np.sqrt(covariance[4, 4]),
+                np.log(adjusted.turntable.distance / machine.distance) / np.sqrt(covariance[4, 4]),
                 np.log(radius / np.linalg.norm(machine.marker_poses[:, :2, 3]))
                 / length_sigma(adjusted.turntable, adjusted.problem, covariance),
             ]
@@ -310,7 +316,7 @@ def test_a_marker_of_another_side_stands_out():
     grown = (observations.marker == 3)[:, None, None]
     corners = np.where(grown, centre + 1.01 * (observations.corners_px - centre), observations.corners_px)
     adjusted = solved(machine, replace(observations, corners_px=corners))
-    sides, sigmas = apparent_sides(adjusted.turntable, adjusted.problem, LOSS_SIGMAS)
+    sides, sigmas = apparent_sides(adjusted.turntable, adjusted.problem)
     assert sides[3] == pytest.approx(1.01 - 0.01 / len(sides), abs=2e-3)
     assert np.abs(np.delete(sides, 3) - 1.0).max() < 5e-3
     assert sigmas.min() > 1e-4
@@ -323,18 +329,16 @@ def test_the_container_is_measured_by_its_markers(shift_m):
     poses = machine.marker_poses.copy()
     poses[:, 0, 3] += shift_m
     machine = replace(machine, marker_poses=poses)
-    disc_m = disc_height_m(machine, SIDE_M)
+    disc_m = disc_height_m(machine)
     faces = machine.marker_poses[:, :3, 2], machine.marker_poses[:, :3, 3]
     assert container_diameter(*faces, SIDE_M, disc_m, 0.07) == pytest.approx(2 * 0.0455, abs=1e-9)
-    larger = resized(machine, 1.7).marker_poses
+    larger = machine.resized(1.7).marker_poses
     assert container_diameter(larger[:, :3, 2], larger[:, :3, 3], 1.7 * SIDE_M, 1.7 * disc_m, None) == pytest.approx(
         1.7 * 2 * 0.0455, abs=1e-9
     )
     assert container_diameter(*faces, SIDE_M, disc_m, 0.02) is None
-    corners = reproject(machine, observed(machine), CENTRE_PX, SIDE_M)
-    np.testing.assert_allclose(
-        corners, reproject(resized(machine, 2.0), observed(machine), CENTRE_PX, 2.0 * SIDE_M), atol=1e-9
-    )
+    seen = observed(machine)
+    np.testing.assert_allclose(machine.reproject(seen), machine.resized(2.0).reproject(seen), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +373,7 @@ def test_a_wobbling_and_distorted_session_is_posed_and_reported(tmp_path):
     assert posed.place_mm.max() < 0.7
     assert posed.poses.distortion[0] == pytest.approx(-0.3, abs=0.05)
     assert posed.poses.distortion[2:] == (0.0, 0.0)
-    report = json.loads(json.dumps(posed.poses.report()))
+    report = json.loads(json.dumps(pose_report(posed.poses)))
     assert report["model"] == "free poses"
     assert report["wobble_deg"] == pytest.approx(1.0, abs=0.1)
     assert any("wobbles" in warning for warning in report["warnings"])
@@ -387,22 +391,21 @@ def test_the_container_alone_gives_the_scale_and_a_wrong_one_is_noticed():
     simulation = Simulation(scene)
     images = grey_images(simulation)
     wall_m = scene.container.diameter_m + 0.001  # what the plaques touch
-    known = {"dictionary": scene.markers.dictionary, "container_height_m": 0.07, "progress": False}
-    poses = estimate_turntable_poses(
-        images, simulation.captures, marker_side_m=None, container_diameter_m=wall_m, **known
+    info = SessionInfo(
+        marker_dictionary=scene.markers.dictionary, container_diameter_m=wall_m, container_height_m=0.07
     )
+    poses = poses_from_markers(images, simulation.captures, info, progress=False)
     assert poses.scale.source == "container"
     assert poses.scale.marker_side_m == pytest.approx(scene.markers.side_m, rel=5e-3)
     away_m = np.linalg.norm(poses.camera_to_world[:, :3, 3] - simulation.camera_to_world[:, :3, 3], axis=-1)
     assert away_m.max() < 4e-3
-    wrong = estimate_turntable_poses(
-        images, simulation.captures, marker_side_m=1.05 * scene.markers.side_m, container_diameter_m=wall_m, **known
-    )
+    info = replace(info, marker_side_m=1.05 * scene.markers.side_m)
+    wrong = poses_from_markers(images, simulation.captures, info, progress=False)
     assert wrong.scale.disagreement_percent == pytest.approx(5.0, abs=0.5)
-    assert any("% wider than given" in warning for warning in wrong.report()["warnings"])
+    assert any("% wider than given" in warning for warning in pose_report(wrong)["warnings"])
 
 
 def test_without_any_length_the_session_is_refused():
     images = [np.zeros((16, 16), np.uint8)] * 3
     with pytest.raises(InputError, match="marker_side_m"):
-        estimate_turntable_poses(images, list("abc"), marker_side_m=None, progress=False)
+        poses_from_markers(images, list("abc"), SessionInfo(), progress=False)

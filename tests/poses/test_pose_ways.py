@@ -7,20 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses import ways
-from hsi_sc_nerf.poses.from_features import FeatureConfig
-from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.report import describe_poses
-from hsi_sc_nerf.poses.scale import Scale
-from hsi_sc_nerf.poses.ways import SessionFacts, find_poses
+from hsi_sc_nerf.poses.object_frame import Scale
+from hsi_sc_nerf.poses.pose_methods import KnownCamera, PoseEstimators, find_poses
+from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, to_8_bit
 
 SIZE_PX, FRAMES = 288, 24
-CONFIG = FeatureConfig()
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +33,9 @@ def pear():
     return images, list(simulation.captures), simulation.camera_to_world, simulation.intrinsics
 
 
-def facts(**values):
+def pear_info(**values):
     side_m = load_scene("pear").markers.side_m
-    return replace(SessionFacts(marker_side_m=side_m, nominal_step_deg=360.0 / FRAMES, direction="ccw"), **values)
+    return replace(SessionInfo(marker_side_m=side_m, nominal_step_deg=360.0 / FRAMES, direction="ccw"), **values)
 
 
 def largest_errors(poses, truth):
@@ -49,18 +46,18 @@ def largest_errors(poses, truth):
 
 def test_auto_takes_markers(pear):
     images, names, truth, _ = pear
-    poses = find_poses(images, names, facts(), "auto", CONFIG, progress=False)
+    poses = find_poses(images, names, pear_info(), "auto", progress=False)
     assert (poses.method, poses.chosen) == ("markers", "by markers")
     rotation_deg, place_m = largest_errors(poses, truth)
     assert rotation_deg < 0.1
     assert place_m < 0.5e-3
 
 
-@pytest.mark.parametrize("way", ["colmap", "angles"])
-def test_features_find_the_poses_and_markers_their_scale(pear, way):
+@pytest.mark.parametrize("method", ["colmap", "angles"])
+def test_features_find_the_poses_and_markers_their_scale(pear, method):
     images, names, truth, intrinsics = pear
-    poses = find_poses(images, names, facts(), way, CONFIG, progress=False)
-    assert poses.method == way
+    poses = find_poses(images, names, pear_info(), method, progress=False)
+    assert poses.method == method
     assert poses.metric
     assert poses.used.all()
     rotation_deg, _ = largest_errors(poses, truth)
@@ -76,16 +73,20 @@ def test_features_find_the_poses_and_markers_their_scale(pear, way):
     assert np.abs(disc[:, 2]).max() < 1e-3
 
 
-def test_without_markers_and_a_known_distance_there_is_no_scale(pear, monkeypatch):
+def test_without_markers_and_a_known_distance_there_is_no_scale(pear):
     images, names, truth, _ = pear
-    monkeypatch.setattr("hsi_sc_nerf.poses.from_features.find_dictionary", lambda images: None)
-    by_hand = facts(marker_side_m=None, camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])))
-    unknown = facts(marker_side_m=None)
-    metric, free = (find_poses(images, names, f, "angles", CONFIG, progress=False) for f in (by_hand, unknown))
+    # The session's markers are of another dictionary.
+    by_hand = pear_info(
+        marker_side_m=None,
+        marker_dictionary="DICT_7X7_50",
+        camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])),
+    )
+    unknown = replace(by_hand, camera_distance_m=None)
+    metric, free = (find_poses(images, names, info, "angles", progress=False) for info in (by_hand, unknown))
     assert metric.metric
     assert not free.metric
-    assert any("nothing gives the scale" in warning for warning in free.report()["warnings"])
-    assert not any("nothing gives the scale" in warning for warning in metric.report()["warnings"])
+    assert any("nothing gives the scale" in warning for warning in pose_report(free)["warnings"])
+    assert not any("nothing gives the scale" in warning for warning in pose_report(metric)["warnings"])
     for poses, distance in ((metric, by_hand.camera_distance_m), (free, 1.0)):
         assert np.linalg.norm(poses.camera_to_world[0, :2, 3]) == pytest.approx(distance, rel=1e-6)
 
@@ -94,49 +95,45 @@ def fails(*_, **__):
     raise InputError("it fails.")
 
 
-def test_auto_says_why_not(pear, monkeypatch):
+def test_auto_says_why_not(pear):
     images, names, truth, intrinsics = pear
-    monkeypatch.setattr(ways, "estimate_turntable_poses", fails)
-    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    estimators = PoseEstimators(markers=fails, colmap=fails)
     camera = KnownCamera(intrinsics, (0.0, 0.0, 0.0, 0.0), truth[0])
-    poses = find_poses(images, names, facts(camera=camera), "auto", CONFIG, progress=False)
+    poses = find_poses(images, names, pear_info(), "auto", camera=camera, progress=False, estimators=estimators)
     assert largest_errors(poses, truth)[1] < 1e-9
     assert poses.method == "angles"
     assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
 
 
-def test_where_colmap_fails_known_angles_are_a_start(pear, monkeypatch):
+def test_where_colmap_fails_known_angles_are_a_start(pear):
     images, names, truth, _ = pear
-    monkeypatch.setattr(ways, "poses_by_colmap", fails)
     given = np.arange(FRAMES) * 360.0 / FRAMES + np.where(np.arange(FRAMES) % 5 == 2, 1.5, 0.0)
-    poses = find_poses(images, names, facts(frame_angles_deg=tuple(given)), "colmap", CONFIG, progress=False)
+    info, estimators = pear_info(frame_angles_deg=tuple(given)), PoseEstimators(colmap=fails)
+    poses = find_poses(images, names, info, "colmap", progress=False, estimators=estimators)
     assert poses.method == "angles"
     assert poses.chosen.startswith(
         "by features, from known angles that were adjusted (not by features (COLMAP): it f"
     )
-    assert any("known angles were taken to start from" in warning for warning in poses.report()["warnings"])
+    assert any("known angles were taken to start from" in warning for warning in pose_report(poses)["warnings"])
     assert poses.used.all()
     away = poses.angles_deg - np.arange(FRAMES) * 360.0 / FRAMES
     assert np.abs(away - away.mean()).max() < 0.3
     assert largest_errors(poses, truth)[0] < 0.5
 
 
-def test_where_colmap_fails_and_no_angle_is_known_it_says_why(pear, monkeypatch):
+def test_where_colmap_fails_and_no_angle_is_known_it_says_why(pear):
     images, names, _, _ = pear
-    monkeypatch.setattr(ways, "poses_by_colmap", fails)
+    estimators = PoseEstimators(colmap=fails, angles=fails)
     with pytest.raises(InputError, match=r"^it fails\.$"):
-        find_poses(images, names, facts(nominal_step_deg=None), "colmap", CONFIG, progress=False)
-    monkeypatch.setattr(ways, "poses_by_freed_angles", fails)
-    with pytest.raises(InputError, match="it fails; nor do features suit the known angles: it fails"):
-        find_poses(images, names, facts(), "colmap", CONFIG, progress=False)
+        find_poses(images, names, pear_info(nominal_step_deg=None), "colmap", progress=False, estimators=estimators)
+    with pytest.raises(InputError, match=r"it fails; nor do features .* known angles: it fails"):
+        find_poses(images, names, pear_info(), "colmap", progress=False, estimators=estimators)
 
 
-def test_no_way_works(pear, monkeypatch):
+def test_no_method_works(pear):
     images, names, _, _ = pear
-    for way in ("estimate_turntable_poses", "poses_by_colmap", "poses_by_angles"):
-        monkeypatch.setattr(ways, way, fails)
-    with pytest.raises(InputError, match="no way to poses works: markers: it fails; features"):
-        find_poses(images, names, facts(), "auto", CONFIG, progress=False)
+    with pytest.raises(InputError, match="markers: it fails; features"):
+        find_poses(images, names, pear_info(), "auto", progress=False, estimators=PoseEstimators(fails, fails, fails))
 
 
 CAMERA = KnownCamera(
@@ -146,6 +143,7 @@ CAMERA = KnownCamera(
     "ccw",
 )
 BLANK = [np.zeros((48, 64), np.uint8)] * 4
+STEPS = SessionInfo(nominal_step_deg=90.0)
 
 
 @pytest.mark.parametrize(
@@ -153,61 +151,58 @@ BLANK = [np.zeros((48, 64), np.uint8)] * 4
 )
 def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
     camera = replace(CAMERA, direction=before)
-    known = SessionFacts(camera=camera, frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=told)
-    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+    info = SessionInfo(frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=told)
+    poses = find_poses(BLANK, list("abcd"), info, "angles", camera=camera, progress=False)
     np.testing.assert_allclose(poses.angles_deg, sign * np.array([0.0, 10.0, 25.0, 80.0]))
     for pose, angle in zip(poses.camera_to_world, poses.angles_deg, strict=True):
         np.testing.assert_allclose(pose, rotation_about_z(-angle) @ CAMERA.camera_to_world, atol=1e-12)
     assert poses.distortion == CAMERA.distortion
-    report = poses.report()
+    report = pose_report(poses)
     assert report["reprojection_error_px"]["overall"] is None
     assert "nothing was measured" in report["warnings"][0]
 
 
 def test_angles_that_are_not_there():
     with pytest.raises(InputError, match="the angles are not known"):
-        find_poses(BLANK, list("abcd"), SessionFacts(camera=CAMERA), "angles", CONFIG, progress=False)
-    few = SessionFacts(camera=CAMERA, frame_angles_deg=(0.0, 1.0))
-    with pytest.raises(InputError, match="2 frame angles are given for 4 frames"):
-        find_poses(BLANK, list("abcd"), few, "angles", CONFIG, progress=False)
+        find_poses(BLANK, list("abcd"), SessionInfo(), "angles", camera=CAMERA, progress=False)
+    few = SessionInfo(frame_angles_deg=(0.0, 1.0))
+    with pytest.raises(InputError, match="2 frame angles"):
+        find_poses(BLANK, list("abcd"), few, "angles", camera=CAMERA, progress=False)
 
 
 def test_a_direction_that_nothing_tells():
-    known = SessionFacts(camera=replace(CAMERA, direction=None), nominal_step_deg=90.0)
+    camera = replace(CAMERA, direction=None)
     with pytest.raises(InputError, match=r"which way the turntable turns is not known.*give direction"):
-        find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+        find_poses(BLANK, list("abcd"), STEPS, "angles", camera=camera, progress=False)
 
 
 def test_a_camera_of_other_images():
-    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
     images = [np.zeros((10, 10), np.uint8)] * 4
     with pytest.raises(InputError, match="10 x 10 pixels, but the camera of the earlier session had 64 x 48"):
-        find_poses(images, list("abcd"), known, "angles", CONFIG, progress=False)
+        find_poses(images, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
 
 
-def test_a_camera_that_no_one_has_is_not_believed(monkeypatch):
-    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
-    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
+def test_a_camera_that_no_one_has_is_not_believed():
+    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
     for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
         found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
-        monkeypatch.setattr(ways, "poses_by_colmap", lambda *_, found=found: found)
+        options = {"method": "colmap", "estimators": PoseEstimators(colmap=lambda *_, found=found: found)}
         if believed:
-            assert find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG).intrinsics.fl_x == focal_px
+            assert find_poses(BLANK, list("abcd"), SessionInfo(), **options).intrinsics.fl_x == focal_px
             continue
-        with pytest.raises(InputError, match="too few to tell the camera"):
-            find_poses(BLANK, list("abcd"), SessionFacts(), "colmap", CONFIG)
+        with pytest.raises(InputError, match="too few"):
+            find_poses(BLANK, list("abcd"), SessionInfo(), **options)
 
 
 def test_the_figures_in_words_and_the_warning_above_one_pixel():
-    known = SessionFacts(camera=CAMERA, nominal_step_deg=90.0)
-    poses = find_poses(BLANK, list("abcd"), known, "angles", CONFIG, progress=False)
-    words = ", ".join(describe_poses(poses, poses.report()))
+    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
+    words = ", ".join(describe_poses(poses, pose_report(poses)))
     assert words.startswith("4 of 4 frames, one axis, axis leans ")
     assert words.endswith("scale as given")
     scale = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.092)
     worse = replace(poses, overall_error_px=1.2, loop_closure_deg=-0.25, disc_tilt_deg=0.5, scale=scale)
-    words = ", ".join(describe_poses(worse, worse.report()))
+    words = ", ".join(describe_poses(worse, pose_report(worse)))
     for part in ("error 1.20 px", "closes to 0.250°", "0.50° to the disc", "markers ± 0.20 % (by it", "+2.2 % off"):
         assert part in words
-    assert "the reprojection error of 1.20 px is above 1.0 px" in worse.report()["warnings"]
-    assert not any("above 1.0 px" in w for w in replace(poses, overall_error_px=0.99).report()["warnings"])
+    assert "the reprojection error of 1.20 px is above 1.0 px" in pose_report(worse)["warnings"]
+    assert not any("above 1.0 px" in w for w in pose_report(replace(poses, overall_error_px=0.99))["warnings"])

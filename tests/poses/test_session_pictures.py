@@ -22,14 +22,14 @@ from scipy.special import ndtr
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.poses import session_pictures
-from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
-from hsi_sc_nerf.poses.from_features import FeatureConfig, group_of_most_variance
-from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.markers import find_dictionary
-from hsi_sc_nerf.poses.observe import observe
+from hsi_sc_nerf.poses.marker_detection import find_dictionary
+from hsi_sc_nerf.poses.marker_observations import observe
+from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.pose_methods import KnownCamera
 from hsi_sc_nerf.poses.session_pictures import (
     BAND_GROUPS_NM,
     GRAY,
@@ -39,7 +39,7 @@ from hsi_sc_nerf.poses.session_pictures import (
     frame_pictures,
     group_means,
 )
-from hsi_sc_nerf.poses.ways import SessionFacts
+from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.posed_frames import pose_frames
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -58,12 +58,12 @@ def test_group_means_count_what_was_measured():
     packed[40:, 2] = FLAGGED
     members = rng.random((4, 9)) < 0.4
     members[:, 3] = True
-    means, flagged_share = group_means(packed, members)
+    means, flagged_fraction = group_means(packed, members)
     for k, inside in enumerate(members):
         values, valid = (part[..., inside] for part in unpack(packed))
         with np.errstate(invalid="ignore"):
             np.testing.assert_allclose(means[k], values.sum(-1) / valid.sum(-1), rtol=1e-5)
-        np.testing.assert_allclose(flagged_share[k], 1.0 - valid.mean(-1), atol=1e-6)
+        np.testing.assert_allclose(flagged_fraction[k], 1.0 - valid.mean(-1), atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -289,9 +289,9 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
         for marker in (6, 8):
             x, y = np.rint(project(scene.corners_m[marker], pose, scene.intrinsics)[0].mean(axis=0)).astype(int)
             image[max(0, y - 3) : y + 3, max(0, x - 3) : x + 3] = 255
-    known = {"dictionary": DICTIONARY, "marker_side_m": scene.marker_side_m, "progress": False}
+    info = SessionInfo(marker_dictionary=DICTIONARY, marker_side_m=scene.marker_side_m)
     alone, joined = (
-        estimate_turntable_poses(shown, scene.names(), **known) for shown in (spot, two_pictures(spot, images))
+        poses_from_markers(shown, scene.names(), info, progress=False) for shown in (spot, two_pictures(spot, images))
     )
     more = np.subtract(joined.markers_per_frame, alone.markers_per_frame)
     assert more[:2].min() > 0
@@ -301,7 +301,8 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     hidden = two_pictures([np.where(image == 255, 128, image).astype(np.uint8) for image in spot], images)
     ill_exposed = [replace(frame, flagged=image == 255) for frame, image in zip(hidden.frames, spot, strict=True)]
     well, ill = (
-        estimate_turntable_poses(shown, scene.names(), **known) for shown in (hidden, SessionPictures(ill_exposed))
+        poses_from_markers(shown, scene.names(), info, progress=False)
+        for shown in (hidden, SessionPictures(ill_exposed))
     )
     more = np.subtract(ill.markers_per_frame, well.markers_per_frame)
     assert more[:2].min() > 0
@@ -316,24 +317,6 @@ def test_plain_images_are_sessions_of_one_picture_a_frame():
     assert [int(image[0, 0]) for image in session] == [0, 1, 2]
     assert [int(image[0, 0]) for image in session[1:]] == [1, 2]
     assert session.named(session.features)[2] is images[2]
-
-
-def test_the_group_that_differs_most_over_what_turns():
-    rng = np.random.default_rng(3)
-    frames = []
-    for _ in range(6):
-        texture = rng.integers(0, 2, (12, 12)).repeat(5, 0).repeat(5, 1)
-        still = np.where(np.arange(100) % 20 < 10, 30, 220) * np.ones((100, 1))
-        shown = {}
-        for name, contrast in ((GRAY, 60.0), ("red", 90.0), ("near infrared", 20.0)):
-            # What stands still differs most of all, in the near infrared.
-            picture = still.copy() if name == "near infrared" else np.full((100, 100), 120.0)
-            picture[20:80, 20:80] = 90.0 + contrast * texture
-            shown[name] = picture.astype(np.uint8)
-        frames.append(FramePictures(shown, dict.fromkeys(shown, 1.0)))
-    assert group_of_most_variance(SessionPictures(frames)) == "red"
-    still_frames = [FramePictures({GRAY: np.full((40, 40), 100, np.uint8)}, {GRAY: 0.0})] * 3
-    assert group_of_most_variance(SessionPictures(still_frames)) == GRAY
 
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -351,9 +334,7 @@ def packed(tmp_path_factory):
     ("features", "name"),
     [
         (FeatureConfig(), GRAY),
-        (FeatureConfig(picture="pseudo-rgb"), "pseudo-RGB"),
-        (FeatureConfig(picture="pseudo-rgb", band_nm=760.0), "760 nm"),
-        (FeatureConfig(picture="foreground-variance"), None),
+        (FeatureConfig(band_nm=760.0), "760 nm"),
     ],
 )
 def test_the_packed_frames_pictures_are_read_and_reported(packed, features, name):
@@ -367,20 +348,18 @@ def test_the_packed_frames_pictures_are_read_and_reported(packed, features, name
     grays = [
         to_8_bit(frame_reflectance(angle)[..., bands(WAVELENGTHS_NM, *GRAY_NM)].mean(-1)) for angle in ANGLES_DEG
     ]
-    pose_frames(session, grays, SessionFacts(), "colmap", features, data, Console(quiet=True), poses)
+    pose_frames(session, grays, SessionInfo(), None, "colmap", features, data, Console(quiet=True), poses)
     (pictures,) = got
     report = json.loads((data / "poses.json").read_text())["pictures"]
     assert report["features"] == pictures.features
     assert list(report["best"].values()) == [frame.ranking[0] for frame in pictures.frames]
-    assert pictures.features == name or (name is None and pictures.features in {GRAY, *BAND_GROUPS_NM})
+    assert pictures.features == name
     expected = {
         GRAY: lambda cube: cube[..., bands(WAVELENGTHS_NM, *GRAY_NM)].mean(-1),
-        "pseudo-RGB": lambda cube: cube[..., [4, 3, 1]] @ [0.299, 0.587, 0.114],
         "760 nm": lambda cube: cube[..., np.abs(WAVELENGTHS_NM - 760.0).argmin()],
     }
-    if name in expected:
-        for image, angle in zip(pictures.named(name), ANGLES_DEG, strict=True):
-            np.testing.assert_allclose(image, 255.0 * expected[name](frame_reflectance(angle)), atol=1.5)
+    for image, angle in zip(pictures.named(name), ANGLES_DEG, strict=True):
+        np.testing.assert_allclose(image, 255.0 * expected[name](frame_reflectance(angle)), atol=1.5)
 
 
 def test_pictures_are_not_read_where_nothing_is_measured(packed):
@@ -393,7 +372,7 @@ def test_pictures_are_not_read_where_nothing_is_measured(packed):
         got.append(images)
         return replace(true_poses(images, names), method="angles")
 
-    facts = SessionFacts(camera=camera, nominal_step_deg=90.0)
-    pose_frames(session, blank, facts, "angles", FeatureConfig(), data, Console(quiet=True), poses)
+    info = SessionInfo(nominal_step_deg=90.0)
+    pose_frames(session, blank, info, camera, "angles", FeatureConfig(), data, Console(quiet=True), poses)
     assert got == [blank]
     assert json.loads((data / "poses.json").read_text())["pictures"] is None

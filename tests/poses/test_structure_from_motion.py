@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.poses.static_background import moving_pixels
+from hsi_sc_nerf.poses.moving_pixels import moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import (
-    StructureFromMotionConfig,
     matched_tracks,
     neighbour_pairs,
     structure_from_motion,
 )
-from hsi_sc_nerf.poses.track_adjust import TrackAdjustConfig, adjust_tracks
+from hsi_sc_nerf.poses.track_adjustment import adjust_tracks
 from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 
@@ -96,7 +95,7 @@ def test_a_ball_before_a_patterned_wall_is_posed(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     assert free.used.all()
     fit = turntable_from_poses(free.world_to_camera)
-    start = fit.tracked(free.places, free.focal_px, free.centre_px)
+    start = fit.turntable(free.points_3d, free.focal_px, free.centre_px)
     found = adjust_tracks(start, free.tracks)
     rotation_deg, place_m = errors(found.turntable, truth)
     assert rotation_deg < 0.3
@@ -120,7 +119,7 @@ def test_matched_tracks_and_known_angles_give_the_camera():
     both = np.stack([tracks.point, tracks.frame])
     assert len(np.unique(both, axis=1).T) == len(tracks)
     start = turntable_from_angles(tracks, np.arange(FRAMES), np.deg2rad(STEPS_DEG), (SIZE_PX, SIZE_PX))
-    found = adjust_tracks(start, tracks, TrackAdjustConfig(free_angles=False))
+    found = adjust_tracks(start, tracks, free_angles=False)
     rotation_deg, place_m = errors(found.turntable, truth)
     assert rotation_deg < 0.3
     assert place_m < 0.0015
@@ -141,10 +140,9 @@ def test_a_ball_without_patterns_is_refused():
 
 
 def test_last_and_first_frame_are_neighbours():
-    config = StructureFromMotionConfig(neighbours_deg=60.0, fewest_neighbours=2)
-    pairs = neighbour_pairs(60, config)
+    pairs = neighbour_pairs(60, 60.0)
     assert len(pairs) == 60 * 10
     assert (0, 59) in pairs
     assert (0, 10) in pairs
     assert (0, 11) not in pairs
-    assert len(neighbour_pairs(8, config)) == 8 * 2
+    assert len(neighbour_pairs(8, 60.0)) == 8 * 3

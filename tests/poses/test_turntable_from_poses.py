@@ -48,7 +48,7 @@ def test_exact_poses_give_the_exact_machine(angles_deg):
     np.testing.assert_allclose(np.rad2deg(fit.angles_rad), angles_deg - angles_deg[0], atol=1e-6)
     turn = Rotation.from_euler("z", angles_deg[0], True).as_matrix()
     np.testing.assert_allclose(fit.camera_rotation, machine(), atol=1e-8)
-    np.testing.assert_allclose(fit.place(in_world), points @ turn.T / DISTANCE, atol=1e-8)
+    np.testing.assert_allclose(fit.transform(in_world), points @ turn.T / DISTANCE, atol=1e-8)
     assert fit.distance == pytest.approx(3.0 * DISTANCE)
     assert not fit.contradicts.any()
     assert np.max(fit.rotation_misfit_deg) < 1e-5

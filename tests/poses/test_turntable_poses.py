@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from turntable_scene import MarkerScene
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project, rotation_angle_deg
-from hsi_sc_nerf.poses.adjust import Problem, Unknowns, adjust, reproject, whitening
-from hsi_sc_nerf.poses.estimate import estimate_turntable_poses
-from hsi_sc_nerf.poses.frame import camera_to_world, disc_height_m, on_disc
-from hsi_sc_nerf.poses.initialise import Observations, initialise, linked_rows
-from hsi_sc_nerf.poses.picture import draw_poses
-from hsi_sc_nerf.poses.report import is_full_turn
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, MarkerProblem
+from hsi_sc_nerf.poses.marker_initialisation import initialise
+from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.model_selection import linked_rows
+from hsi_sc_nerf.poses.object_frame import disc_height_m, lie_on_disc, object_poses
+from hsi_sc_nerf.poses.report import draw_poses, is_full_turn, pose_report
+from hsi_sc_nerf.poses.turntable import MarkerObservations
 
 SIDE_M = 0.03
+INFO = SessionInfo(marker_side_m=SIDE_M)
 
 
 def exact_observations(scene, noise_px=0.0, seed=0):
@@ -32,13 +35,13 @@ def exact_observations(scene, noise_px=0.0, seed=0):
                 pixels, _ = project(corners, pose, scene.intrinsics)
                 rows.append((i, marker, pixels + noise_px * rng.normal(size=(4, 2))))
     frame, marker, corners = (np.array(column) for column in zip(*rows, strict=True))
-    return Observations(frame, marker, corners, np.tile(np.eye(8) * 0.05**2, (len(frame), 1, 1)))
+    return MarkerObservations(frame, marker, corners, np.tile(np.eye(8) * 0.05**2, (len(frame), 1, 1)))
 
 
 def solve(scene, observations):
     centre = (scene.size_px / 2, scene.size_px / 2)
     start = initialise(observations, centre, scene.size_px, SIDE_M)
-    return adjust(start, observations, centre, SIDE_M, whitening(observations.covariance_px2), 3.0)
+    return MarkerProblem(start, observations, 3.0).minimise(start)
 
 
 def pose_errors(found, truth):
@@ -50,7 +53,7 @@ def pose_errors(found, truth):
 @lru_cache(maxsize=8)
 def estimated(**options):
     scene = MarkerScene(**options)
-    return scene, estimate_turntable_poses(scene.render(), scene.names(), marker_side_m=SIDE_M, progress=False)
+    return scene, poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +70,7 @@ def test_exact_corners_give_exact_poses(options):
     scene = MarkerScene(**options)
     turntable = solve(scene, exact_observations(scene))
     assert turntable.focal_px == pytest.approx(scene.intrinsics.fl_x, rel=1e-4)
-    found = camera_to_world(turntable, disc_height_m(turntable, SIDE_M))
+    found = object_poses(turntable, disc_height_m(turntable))
     rotation, position = pose_errors(found, scene.camera_to_world)
     assert rotation < 1e-2
     assert position < 1e-1
@@ -79,50 +82,72 @@ def test_first_guess_is_all_but_exact_on_exact_corners():
     scene = MarkerScene(frames=18, turn_deg=200.0)
     observations = exact_observations(scene)
     start = initialise(observations, (64.0, 64.0), scene.size_px, SIDE_M)
-    error = reproject(start, observations, (64.0, 64.0), SIDE_M) - observations.corners_px
+    error = start.reproject(observations) - observations.corners_px
     assert np.abs(error).max() < 0.05
 
 
 def test_noisy_corners_give_close_poses():
     scene = MarkerScene(frames=24)
     turntable = solve(scene, exact_observations(scene, noise_px=0.05))
-    found = camera_to_world(turntable, disc_height_m(turntable, SIDE_M))
+    found = object_poses(turntable, disc_height_m(turntable))
     rotation, position = pose_errors(found, scene.camera_to_world)
     assert rotation < 0.2
     assert position < 1.0
 
 
-@pytest.mark.parametrize("unknowns", [Unknowns(), Unknowns(2), Unknowns(1, (0.02, 0.003))])
-def test_derivatives_are_those_of_the_residuals(unknowns):
+@pytest.mark.parametrize(
+    "free",
+    [
+        FreeParameters(),
+        FreeParameters(radial_terms=2),
+        FreeParameters(radial_terms=1, motion_sigmas=(0.02, 0.003)),
+        FreeParameters(camera=False, landmarks=False, motion_sigmas=(0.02, 0.003)),
+    ],
+)
+def test_derivatives_are_those_of_the_residuals(free):
     scene = MarkerScene(frames=5)
     observations = exact_observations(scene, noise_px=0.5)
     start = initialise(observations, (64.0, 64.0), 128, SIDE_M)
     rng = np.random.default_rng(0)
-    problem = Problem(start, observations, (64.0, 64.0), SIDE_M, rng.normal(size=(len(observations), 8, 8)), unknowns)
-    here = problem.moved(start, 0.05 * rng.normal(size=problem.columns.size))
-    columns, values = problem.rows(here)
-    jacobian = np.zeros((len(observations), 8, problem.columns.size + 1))
+    weights = rng.normal(size=(len(observations), 8, 8))
+    problem = MarkerProblem(start, observations, 1e9, free, weights)
+    layout = problem.layout
+
+    def moved(turntable, step):
+        return problem.moved(turntable, step[: layout.motion_size], step[layout.landmark])
+
+    here = moved(start, 0.05 * rng.normal(size=layout.size))
+    jacobian, by_marker = problem.jacobian(here)
+    columns, values = problem.motion_jacobian(jacobian)
+    dense = np.zeros((len(observations), 8, layout.size + 1))
     for row in range(len(observations)):
-        jacobian[row, :, columns[row]] += values[row].T
-    steps = 1e-6 * np.eye(problem.columns.size)
-    numeric = np.stack(
+        own = np.where(columns[row] == layout.motion_size, layout.size, columns[row])
+        dense[row, :, own] += values[row].T
+        dense[row, :, layout.landmark[problem.marker[row]]] += by_marker[row].T
+    dense = dense[..., :-1]
+    numeric = np.concatenate(
         [
-            (problem.residuals(problem.moved(here, d)) - problem.residuals(problem.moved(here, -d))) / 2e-6
-            for d in steps
+            (problem.residuals(moved(here, d)) - problem.residuals(moved(here, -d))) / 2e-6
+            for d in 1e-6 * np.eye(layout.size)
         ],
         axis=-1,
     )
-    np.testing.assert_allclose(jacobian[..., :-1], numeric, atol=1e-5 * np.abs(numeric).max())
+    np.testing.assert_allclose(dense, numeric, atol=1e-5 * np.abs(numeric).max())
     # The normal equations are made of them, and of the motions' own spread.
-    normal, gradient = problem.normal_equations(here, loss_scale=1e9)
-    flat, residual = jacobian[..., :-1].reshape(-1, len(gradient)), problem.residuals(here).ravel()
-    spread = np.zeros(len(gradient))
-    if unknowns.motion_spread:
-        spread[problem.columns.motion] = 1.0 / np.repeat(unknowns.motion_spread, (2, 3)) ** 2
-    np.testing.assert_allclose(normal, flat.T @ flat + np.diag(spread), atol=1e-9 * np.abs(normal).max())
-    own = np.zeros(len(gradient))
-    own[problem.columns.motion] = problem.motions(here) * np.sqrt(spread[problem.columns.motion])
-    np.testing.assert_allclose(gradient, flat.T @ residual + own, atol=1e-9 * np.abs(gradient).max())
+    equations = problem.normal_equations(here)
+    normal, gradient = equations.dense()
+    flat, residual = dense.reshape(-1, len(gradient)), problem.residuals(here).ravel()
+    inverse_variance, prior = np.zeros(len(gradient)), np.zeros(len(gradient))
+    if free.motion_sigmas:
+        inverse_variance[layout.motion] = 1.0 / np.repeat(free.motion_sigmas, (2, 3)) ** 2
+        prior[layout.motion] = problem.scaled_motions(here) * np.sqrt(inverse_variance[layout.motion])
+    expected = flat.T @ flat + np.diag(inverse_variance)
+    np.testing.assert_allclose(normal, expected, atol=1e-9 * np.abs(normal).max())
+    np.testing.assert_allclose(gradient, flat.T @ residual + prior, atol=1e-9 * np.abs(gradient).max())
+    # Eliminating the markers gives the step of the whole system.
+    step, marker_step = equations.solve(1.0)
+    whole = -np.linalg.solve(normal + np.diag(np.diag(normal)), gradient)
+    np.testing.assert_allclose(np.concatenate([step, marker_step.ravel()]), whole, atol=1e-6 * np.abs(whole).max())
 
 
 def test_frames_without_a_shared_marker_are_not_linked():
@@ -161,7 +186,7 @@ GAPS = {"size_px": 128, "frames": 20, "direction": -1, "jitter_deg": 1.0, "drop"
 
 def test_report_is_json_and_says_how_good_the_poses_are():
     _, poses = estimated(**FULL)
-    report = json.loads(json.dumps(replace(poses, nominal_step_deg=20.0, nominal_direction="ccw").report()))
+    report = json.loads(json.dumps(pose_report(replace(poses, nominal_step_deg=20.0, nominal_direction="ccw"))))
     assert report["warnings"] == []
     assert report["reprojection_error_px"]["overall"] < 0.2
     assert not report["reprojection_error_px"]["above_target"]
@@ -178,7 +203,7 @@ def test_report_is_json_and_says_how_good_the_poses_are():
 
 def test_report_warns_of_a_wrong_direction_and_of_left_out_frames():
     scene, poses = estimated(**GAPS)
-    report = json.loads(json.dumps(replace(poses, nominal_step_deg=18.0, nominal_direction="ccw").report()))
+    report = json.loads(json.dumps(pose_report(replace(poses, nominal_step_deg=18.0, nominal_direction="ccw"))))
     assert report["direction"] == {"nominal": "ccw", "found": "cw"}
     assert any("cw" in warning for warning in report["warnings"])
     left_out = scene.names()[next(iter(scene.blanked))]
@@ -197,14 +222,14 @@ def test_full_turn_is_told_from_a_partial_one():
 def test_disc_is_the_lowest_group_that_faces_up():
     scene = MarkerScene(frames=12)
     turntable = solve(scene, exact_observations(scene))
-    np.testing.assert_array_equal(on_disc(turntable, SIDE_M), turntable.markers >= 6)
+    np.testing.assert_array_equal(lie_on_disc(turntable.corners()), turntable.markers >= 6)
 
 
 def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
     scene, poses = estimated(size_px=160, frames=15, disc_markers=0)
     lowest = min(corners[:, 2].min() for corners in poses.marker_corners_m.values())
     assert lowest == pytest.approx(0.0, abs=1e-9)
-    assert any("lowest marker corner" in warning for warning in poses.report()["warnings"])
+    assert any("lowest marker corner" in warning for warning in pose_report(poses)["warnings"])
     shifted = scene.camera_to_world.copy()
     shifted[:, 2, 3] -= min(corners[:, 2].min() for corners in list(scene.corners_m.values())[:6])
     rotation, position = pose_errors(poses.camera_to_world, shifted)
@@ -215,24 +240,27 @@ def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
 def test_frames_without_markers_are_refused_with_names_and_advice():
     noise = list(np.random.default_rng(0).integers(0, 255, (4, 64, 64)).astype(np.uint8))
     with pytest.raises(InputError, match=r"first \.\.\. last.*dictionary"):
-        estimate_turntable_poses(noise, ["first", "b", "c", "last"], marker_side_m=SIDE_M, progress=False)
+        poses_from_markers(noise, ["first", "b", "c", "last"], INFO, progress=False)
     scene = MarkerScene(frames=18)
     with pytest.raises(InputError, match="DICT_4X4_50"):
-        estimate_turntable_poses(
-            scene.render()[:3], scene.names()[:3], dictionary="DICT_4X4_50", marker_side_m=SIDE_M, progress=False
+        poses_from_markers(
+            scene.render()[:3],
+            scene.names()[:3],
+            SessionInfo(marker_dictionary="DICT_4X4_50", marker_side_m=SIDE_M),
+            progress=False,
         )
 
 
 def test_a_single_frame_is_refused():
     with pytest.raises(InputError, match="3 or more frames"):
-        estimate_turntable_poses([np.zeros((8, 8), np.uint8)], ["only"], marker_side_m=SIDE_M, progress=False)
+        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO, progress=False)
 
 
 def test_a_camera_before_a_still_table_is_refused():
     scene = MarkerScene(frames=18, noise=0.01)
     still = [scene.render()[0]] * 4
     with pytest.raises(InputError, match="share"):
-        estimate_turntable_poses(still, list("abcd"), marker_side_m=SIDE_M, progress=False)
+        poses_from_markers(still, list("abcd"), INFO, progress=False)
 
 
 def test_picture_is_drawn_whole(tmp_path):

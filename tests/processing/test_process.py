@@ -28,12 +28,11 @@ from capture_factory import (
 
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig
 from hsi_sc_nerf.capture.envi import write_cube
-from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing.masks import MaskConfig
-from hsi_sc_nerf.processing.posed_frames import session_facts
+from hsi_sc_nerf.processing.posed_frames import known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -122,10 +121,10 @@ def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
 
     run(session, tmp_path / "data", poses=poses)
     assert got["names"] == ["ball_1", "ball_2", "ball_3", "ball_4"]
-    facts = got["facts"]
-    assert (facts.marker_dictionary, facts.marker_side_m) == ("DICT_4X4_50", 0.02)
-    assert (facts.nominal_step_deg, facts.direction) == (90, "ccw")
-    assert (facts.container_diameter_m, facts.container_height_m) == (0.09, 0.07)
+    info = got["info"]
+    assert (info.marker_dictionary, info.marker_side_m) == ("DICT_4X4_50", 0.02)
+    assert (info.nominal_step_deg, info.direction) == (90, "ccw")
+    assert (info.container_diameter_m, info.container_height_m) == (0.09, 0.07)
     visible = (WAVELENGTHS_NM >= 450.0) & (WAVELENGTHS_NM <= 700.0)
     for image, angle in zip(got["images"], ANGLES_DEG, strict=True):
         assert image.dtype == np.uint8
@@ -174,7 +173,7 @@ def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
 
     def told(*angles_deg):
         frames = [replace(frame, angle_deg=a) for frame, a in zip(dataset.frames, angles_deg, strict=False)]
-        return session_facts(open_session(session), None, replace(dataset, frames=tuple(frames))).camera.direction
+        return known_camera(replace(dataset, frames=tuple(frames))).direction
 
     assert told(0.0, 90.0, 180.0) == "ccw"
     assert told(0.0, -90.0, -180.0) == "cw"
@@ -300,7 +299,7 @@ def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
     seen = []
 
     def poses(images, names, **options):
-        seen.append(options["facts"].marker_side_m)
+        seen.append(options["info"].marker_side_m)
         raise InputError("enough")
 
     for info in (None, {"marker_side_m": 0.02}):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from hsi_sc_nerf.poses.markers import marker_pattern
+from hsi_sc_nerf.poses.marker_detection import marker_pattern
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
@@ -28,9 +28,9 @@ _TEXELS_A_PIXEL = 2.0
 _TEXELS_A_CELL = (8, 16, 32)
 _ITERATIONS = 12
 _CONVERGED_PX = 3e-3
-# A fit explains the pixels when what it leaves is below this share of their variance.
+# A fit explains the pixels when what it leaves is below this fraction of their variance.
 _LARGEST_UNEXPLAINED = 0.15
-# A start that leaves more than this is no start: another thing is in front of the marker.
+# A start that leaves more than this cannot converge: something else is in front of the marker.
 _HOPELESS_UNEXPLAINED = 0.8
 # Errors of the pattern's model itself (print, lens, shading) that the pixels' residual does not show.
 _MODEL_ERROR_PX = 0.02
@@ -128,7 +128,7 @@ def fit_marker(
     unexplained = float(np.sum(raw**2) / np.sum((values - values.mean()) ** 2))
     if unexplained > _LARGEST_UNEXPLAINED or white_over_black.min() <= 0.0:
         return None
-    to_corners = _corner_slopes(homography, unit_corners) * extent
+    to_corners = _corner_jacobian(homography, unit_corners) * extent
     covariance = variance * to_corners @ np.linalg.solve(information, to_corners.T)
     return FittedMarker(corners, covariance + _MODEL_ERROR_PX**2 * np.eye(8), unexplained)
 
@@ -202,8 +202,8 @@ class _Footprint:
 
 
 def _texels_a_cell(corners_px, cells):
-    wanted = _TEXELS_A_PIXEL * np.sqrt(quad_area(corners_px)) / cells
-    return min(_TEXELS_A_CELL, key=lambda texels: abs(np.log(texels / wanted)))
+    texels_a_cell = _TEXELS_A_PIXEL * np.sqrt(quad_area(corners_px)) / cells
+    return min(_TEXELS_A_CELL, key=lambda texels: abs(np.log(texels / texels_a_cell)))
 
 
 @lru_cache(maxsize=64)
@@ -254,7 +254,7 @@ def _corners(homography, unit_corners):
     return (back[:2] / back[2]).T
 
 
-def _corner_slopes(homography, unit_corners):
+def _corner_jacobian(homography, unit_corners):
     """Derivatives of the corners (x0, y0, x1, ...) by the homography, which keeps their cells where they are."""
     h = np.append(homography, 1.0).reshape(3, 3)
     slopes = []

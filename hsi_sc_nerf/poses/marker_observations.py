@@ -1,8 +1,8 @@
-"""All markers of all frames: detection, refinement, and a second look where the adjusted turntable expects them.
+"""Markers of all frames: detection, refinement, and a second search where the adjusted turntable expects them.
 
-A frame may be shown in several pictures (``SessionPictures``). Its best one goes first; a marker that is missing
-there is taken from the next one that shows it, unless the best one is well exposed where the marker should be: then
-it is hidden.
+A frame may have several pictures (``SessionPictures``). The best one is searched first. A marker that is missing
+there is taken from the next picture that shows it, unless the best one is well exposed at the marker, which then is
+hidden.
 """
 
 from __future__ import annotations
@@ -19,30 +19,28 @@ from jaxtyping import Float, UInt8
 from rich.progress import track
 from scipy.optimize import minimize_scalar
 
-from hsi_sc_nerf.poses.adjust import reproject
-from hsi_sc_nerf.poses.fit import FittedMarker, fit_marker, quad_area
-from hsi_sc_nerf.poses.frame import layout
-from hsi_sc_nerf.poses.initialise import Observations, Rejected, Turntable
-from hsi_sc_nerf.poses.markers import Detections, detect_markers
+from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers
+from hsi_sc_nerf.poses.marker_fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.session_pictures import FramePictures, SessionPictures
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
 # Frames that are searched at the same time: OpenCV and NumPy let other threads work meanwhile.
 _WORKERS = 2
 # The camera's blur that is tried, standard deviation in pixels, and on how many markers.
 _BLURS_PX = (0.0, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0)
-_MARKERS_TO_TELL_THE_BLUR = 10
+_MARKERS_FOR_BLUR = 10
 _BLUR_TOLERANCE_PX = 0.02
-# A frame has a blur of its own if its patterns leave this many times the share of the variance that others leave, and
-# this share.
+# A frame gets its own blur if its fits leave this many times the fraction of the variance that others leave, and this
+# fraction.
 _OUT_OF_FOCUS_MEDIANS = 2.0
 _LEAST_OUT_OF_FOCUS = 0.01
-# With fewer markers in its best picture a frame is searched in the others too. Where more are seen, the adjustment
-# knows where to look for the rest.
+# With fewer markers in its best picture, a frame's other pictures are searched too. Where more are seen, the adjusted
+# turntable predicts the rest.
 _FEW_MARKERS = 4
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
-# The best picture is ill exposed at a marker where more than this share of its pixels is black, clipped or flagged.
+# The best picture is ill exposed at a marker if more than this fraction of its pixels is black, clipped or flagged.
 _MOST_ILL_EXPOSED = 0.05
 
 
@@ -50,10 +48,20 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
+class Rejected:
+    """A marker in a frame that is not used: its error where it was measured, and the reason."""
+
+    frame: int
+    marker: int
+    error_px: float | None
+    why: str
+
+
+@dataclass(frozen=True)
 class Observed:
     """Markers of all frames, the blur of each frame's best picture, and markers whose pattern was not fitted."""
 
-    observations: Observations
+    observations: MarkerObservations
     blur_px: Float[np.ndarray, "frames"]
     unexplained: tuple[Rejected, ...]
 
@@ -96,7 +104,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
 
 
 def _detect(frame: FramePictures, dictionary: str) -> dict[str, Detections]:
-    """Markers by the picture's name, best picture first; the others only where it shows few."""
+    """Markers by the picture's name, best picture first; the other pictures only where it shows few."""
     found: dict[str, Detections] = {}
     for name in frame.ranking:
         found[name] = detect_markers(frame.pictures[name], dictionary)
@@ -108,7 +116,7 @@ def _detect(frame: FramePictures, dictionary: str) -> dict[str, Detections]:
 def _out_of_focus(fitted: Sequence[Sequence[tuple[int, FittedMarker | None]]]) -> list[int]:
     """Frames whose patterns explain their pixels far worse than the other frames' do."""
     left = [[1.0 if fit is None else fit.unexplained for _, fit in found] for found in fitted]
-    of_frame = np.array([np.median(shares) if shares else np.nan for shares in left])
+    of_frame = np.array([np.median(fractions) if fractions else np.nan for fractions in left])
     if np.isnan(of_frame).all():
         return []
     limit = max(_OUT_OF_FOCUS_MEDIANS * float(np.nanmedian(of_frame)), _LEAST_OUT_OF_FOCUS)
@@ -123,8 +131,8 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
     seen = [(i, m, c) for i, found in enumerate(detections) for m, c in sorted(found.items())]
     seen.sort(key=lambda s: -quad_area(s[2]))
     # Spread over the larger half: neighbours in size are often the same marker in neighbouring frames.
-    seen = seen[: max(_MARKERS_TO_TELL_THE_BLUR, len(seen) // 2)]
-    seen = seen[:: max(1, len(seen) // _MARKERS_TO_TELL_THE_BLUR)][:_MARKERS_TO_TELL_THE_BLUR]
+    seen = seen[: max(_MARKERS_FOR_BLUR, len(seen) // 2)]
+    seen = seen[:: max(1, len(seen) // _MARKERS_FOR_BLUR)][:_MARKERS_FOR_BLUR]
     if not seen:
         return 0.0
 
@@ -149,12 +157,10 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
 def observe_expected(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     dictionary: str,
-    turntable: Turntable,
-    seen: Observations,
-    centre_px: tuple[float, float],
-    side_m: float,
+    turntable: MarkerTurntable,
+    seen: MarkerObservations,
     blur_px: Float[np.ndarray, "frames"],
-) -> Observations:
+) -> MarkerObservations:
     """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones.
 
     Args:
@@ -162,18 +168,16 @@ def observe_expected(
         dictionary: of the markers.
         turntable: adjusted to the seen markers.
         seen: markers so far.
-        centre_px: the principal point.
-        side_m: of the markers.
         blur_px: of each frame's best picture; what the other pictures' is, is found.
     """
     session = SessionPictures.of(images)
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
-    missing = [pair for pair in _facing(turntable, side_m) if pair not in have]
+    missing = [pair for pair in _facing(turntable) if pair not in have]
     if not missing:
         return seen
     frame, marker = np.array(missing).T
-    blank = Observations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
-    expected = dict(zip(missing, reproject(turntable, blank, centre_px, side_m), strict=True))
+    blank = MarkerObservations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
+    expected = dict(zip(missing, turntable.reproject(blank), strict=True))
     found: dict[tuple[int, int], FittedMarker] = {}
     blurs_px: dict[str, float] = {}
     for rank in range(max(len(frame.ranking) for frame in session.frames)):
@@ -191,19 +195,17 @@ def observe_expected(
             for name in sorted(set(names.values()) - blurs_px.keys()):
                 blurs_px[name] = find_blur(session.named(name), dictionary, _by_frame(seen, len(session)))
 
-        def look(pair: tuple[int, int], rank=rank, names=names) -> FittedMarker | None:
+        def fit(pair: tuple[int, int], rank=rank, names=names) -> FittedMarker | None:
             i, marker = pair
             image = session.frames[i].pictures[names[i]].astype(float)
             blur = float(blur_px[i]) if rank == 0 else blurs_px[names[i]]
             return fit_marker(image, dictionary, marker, expected[pair], blur, _FARTHEST_FROM_EXPECTED_PX)
 
         with ThreadPoolExecutor(_WORKERS) as pool:
-            fitted = zip(missing, pool.map(look, missing), strict=True)
-            found |= {pair: fit for pair, fit in fitted if fit is not None}
+            fitted = zip(missing, pool.map(fit, missing), strict=True)
+            found |= {pair: marker for pair, marker in fitted if marker is not None}
     more = _observations([(*pair, found[pair]) for pair in expected if pair in found])
-    return Observations(
-        *(np.concatenate([getattr(seen, k), getattr(more, k)]) for k in Observations.__dataclass_fields__)
-    )
+    return seen.append(more)
 
 
 def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> bool:
@@ -214,32 +216,28 @@ def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> 
     return bool(inside.any()) and float(ill[inside].mean()) > _MOST_ILL_EXPOSED
 
 
-def _by_frame(seen: Observations, frames: int) -> list[Detections]:
+def _by_frame(seen: MarkerObservations, frames: int) -> list[Detections]:
     by_frame: list[Detections] = [{} for _ in range(frames)]
     for i, marker, corners in zip(seen.frame.tolist(), seen.marker.tolist(), seen.corners_px, strict=True):
         by_frame[i][marker] = corners
     return by_frame
 
 
-def _facing(turntable, side_m):
+def _facing(turntable: MarkerTurntable) -> list[tuple[int, int]]:
     """Pairs of frame and marker where the marker's front faces the camera."""
-    centres = layout(turntable, side_m).mean(1)
-    normals = turntable.marker_poses[:, :3, 2]
-    pairs = []
-    for frame, rotation, shift in zip(turntable.frames.tolist(), *turntable.motions(), strict=True):
-        camera = ([turntable.distance_m, 0.0, 0.0] - shift) @ rotation
-        view = camera - centres
-        cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
-        pairs += [(frame, int(m)) for m in turntable.markers[cosine > _STEEPEST_COSINE]]
-    return pairs
+    centres, normals = turntable.marker_poses[:, :3, 3], turntable.marker_poses[:, :3, 2]
+    view = turntable.camera_positions()[:, None] - centres
+    cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
+    frame, marker = np.nonzero(cosine > _STEEPEST_COSINE)
+    return list(zip(turntable.frames[frame].tolist(), turntable.markers[marker].tolist(), strict=True))
 
 
 def _all(work: Iterable[_T], what: str, total: int, progress: bool) -> list[_T]:
     return list(track(work, what, total=total, disable=not progress, transient=True))
 
 
-def _observations(rows: list[tuple[int, int, FittedMarker]]) -> Observations:
-    return Observations(
+def _observations(rows: list[tuple[int, int, FittedMarker]]) -> MarkerObservations:
+    return MarkerObservations(
         np.array([i for i, _, _ in rows], dtype=int),
         np.array([m for _, m, _ in rows], dtype=int),
         np.array([f.corners_px for _, _, f in rows]).reshape(-1, 4, 2),

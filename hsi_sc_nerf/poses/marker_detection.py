@@ -35,7 +35,7 @@ _FAMILIES: dict[str, tuple[str, ...]] = {
     "DICT_APRILTAG_25h9": ("DICT_APRILTAG_25h9",),
     "DICT_APRILTAG_16h5": ("DICT_APRILTAG_16h5",),
 }
-_FRAMES_TO_TELL_THE_DICTIONARY = 8
+_FRAMES_FOR_DICTIONARY = 8
 # With so many of its markers in a frame, no other family needs to be tried.
 _CLEAR_MARKERS_PER_FRAME = 2
 
@@ -64,8 +64,8 @@ def marker_pattern(dictionary: str, marker: int) -> UInt8[np.ndarray, "cells cel
 def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detections:
     """Markers seen at any of several magnifications of the image.
 
-    Their corners are good to about half a pixel, and a marker can be a misreading: ``fit.fit_marker`` refines the
-    ones and weeds out the others.
+    Their corners are good to about half a pixel, and some markers are misread: ``fit_marker`` refines the ones and
+    rejects the others.
     """
     detector = _detector(dictionary)
     found: Detections = {}
@@ -88,10 +88,10 @@ def find_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
     """The dictionary whose markers are seen most often in a few of the frames; None if there are none.
 
     Of a family the smallest dictionary that holds the ids is taken: it tolerates the most misread cells. Where the
-    frames' best pictures show no marker, the broad mean is looked at too: sharp edges need not be ink's.
+    frames' best pictures show no marker, the broad mean is searched too: sharp edges need not be those of ink.
     """
     session = SessionPictures.of(images)
-    take = np.unique(np.linspace(0, len(session) - 1, _FRAMES_TO_TELL_THE_DICTIONARY).astype(int)).tolist()
+    take = np.unique(np.linspace(0, len(session) - 1, _FRAMES_FOR_DICTIONARY).astype(int)).tolist()
     found = _most_seen_dictionary([session[i] for i in take])
     if found is None and any(session.frames[i].ranking[0] != GRAY for i in take):
         grays = session.named(GRAY)

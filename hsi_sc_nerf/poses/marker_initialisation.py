@@ -1,23 +1,20 @@
-"""A first guess of camera, axis, angles and marker layout, from each marker's pose in each frame alone.
+"""Initialisation of camera, axis, angles and marker layout, from each marker's pose in each frame.
 
-Centres of markers run on circles about one axis. A wrong focal length stretches these circles along the viewing
-direction, so the focal length is the one that leaves them round; and centres hardly suffer from the two-fold
-ambiguity of a small square's pose, which the layout then resolves: one pose on the object must suit all frames.
+Centres of markers move on circles about one axis. A wrong focal length stretches these circles along the viewing
+direction; the right one leaves them round. The two-fold ambiguity of a small square's pose hardly moves its centre.
+The layout resolves it: one pose on the object must fit all frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable, rotations_about_z, square_corners
 
 # Fields of view over the width that are tried: from a tele lens to a very wide one.
 _FOV_RANGE_DEG = (5.0, 90.0)
@@ -25,103 +22,10 @@ _FOV_STEPS = 16
 _HORIZONTAL_COSINE = 0.95
 
 
-@dataclass(frozen=True)
-class Observations:
-    """Corners of markers in frames: one row a marker seen in a frame."""
-
-    frame: Int[np.ndarray, "n"]
-    marker: Int[np.ndarray, "n"]
-    corners_px: Float[np.ndarray, "n 4 2"]
-    covariance_px2: Float[np.ndarray, "n 8 8"]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, keep: np.ndarray) -> Observations:
-        """The rows that ``keep`` (a mask or indices) picks."""
-        return Observations(self.frame[keep], self.marker[keep], self.corners_px[keep], self.covariance_px2[keep])
-
-    def has(self, frame: int, marker: int) -> bool:
-        """Whether the marker was seen in the frame."""
-        return bool(((self.frame == frame) & (self.marker == marker)).any())
-
-
-@dataclass(frozen=True)
-class Rejected:
-    """A marker in a frame that does not count: its error where it was measured, and the reason."""
-
-    frame: int
-    marker: int
-    error_px: float | None
-    why: str
-
-
-@dataclass(frozen=True)
-class Turntable:
-    """Camera and motion as the adjustment knows them.
-
-    The frame: z is the turntable's axis, up; the camera sits at (``distance_m``, 0, 0). ``frames`` and ``markers``
-    say which frame and which marker the rows of ``angles_rad`` and ``marker_poses`` belong to. The first angle is 0.
-    """
-
-    focal_px: float
-    camera_rotation: Float[np.ndarray, "3 3"]  # from this frame to OpenCV's camera axes
-    distance_m: float
-    frames: Int[np.ndarray, "f"]
-    angles_rad: Float[np.ndarray, "f"]
-    markers: Int[np.ndarray, "m"]
-    marker_poses: Float[np.ndarray, "m 4 4"]  # marker to object
-    radial: tuple[float, float] = (0.0, 0.0)  # lens distortion: OpenCV's k1, k2
-    tilts_rad: Float[np.ndarray, "f 2"] | None = None  # of a wobbling table, frame by frame; None: it keeps still
-    shifts_m: Float[np.ndarray, "f 3"] | None = None
-
-    def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
-        """Rotation and shift that take the object to its place in the room, frame by frame.
-
-        A wobbling table adds a small rotation about a level axis (of rotation vector (tilt x, tilt y, 0)) and a small
-        shift to the turn about its mean axis.
-        """
-        turns = Rotation.from_rotvec(np.outer(self.angles_rad, [0.0, 0.0, 1.0])).as_matrix()
-        if self.tilts_rad is None or self.shifts_m is None:
-            return turns, np.zeros((len(turns), 3))
-        level = np.concatenate([self.tilts_rad, np.zeros((len(turns), 1))], axis=-1)
-        return Rotation.from_rotvec(level).as_matrix() @ turns, self.shifts_m
-
-    def restricted(self, observations: Observations) -> Turntable:
-        """The turntable with only the frames and markers that are observed; the first frame's angle becomes 0."""
-        frames = np.isin(self.frames, observations.frame)
-        markers = np.isin(self.markers, observations.marker)
-        angle = float(self.angles_rad[frames][0])
-        turn = rotation_about_z(np.rad2deg(angle))
-        return replace(
-            self,
-            frames=self.frames[frames],
-            angles_rad=self.angles_rad[frames] - angle,
-            markers=self.markers[markers],
-            marker_poses=turn @ self.marker_poses[markers],
-            tilts_rad=None if self.tilts_rad is None else self.tilts_rad[frames],
-            shifts_m=None if self.shifts_m is None else self.shifts_m[frames],
-        )
-
-
-def square_corners(side_m: float) -> Float[np.ndarray, "4 3"]:
-    """A marker's corners in its own frame (x right, y up, z out of the paper), in ArUco's order."""
-    return side_m / 2 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-
-
-def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
-    """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
-    frames, f = np.unique(frame, return_inverse=True)
-    markers, m = np.unique(marker, return_inverse=True)
-    size = len(frames) + len(markers)
-    links = coo_array((np.ones(len(f)), (f, m + len(frames))), shape=(size, size))
-    _, label = connected_components(links, directed=False)
-    counts = np.bincount(label[: len(frames)])
-    return label[f] == np.argmax(counts)
-
-
-def initialise(observations: Observations, centre_px: tuple[float, float], width_px: int, side_m: float) -> Turntable:
-    """First guess from linked observations (``linked_rows``) of markers that each are in two or more frames."""
+def initialise(
+    observations: MarkerObservations, centre_px: tuple[float, float], width_px: int, side_m: float
+) -> MarkerTurntable:
+    """Initial turntable from linked observations (``linked_rows``) of markers that each are in two or more frames."""
     fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
     focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
     errors = [_Circles(observations, f, centre_px, side_m).error_px for f in focals]
@@ -138,10 +42,12 @@ def initialise(observations: Observations, centre_px: tuple[float, float], width
 class _Circles:
     """The circles that the markers' centres describe, for one focal length."""
 
-    def __init__(self, observations: Observations, focal_px: float, centre_px: tuple[float, float], side_m: float):
+    def __init__(
+        self, observations: MarkerObservations, focal_px: float, centre_px: tuple[float, float], side_m: float
+    ):
         self.frames, self.f = np.unique(observations.frame, return_inverse=True)
         self.markers, self.m = np.unique(observations.marker, return_inverse=True)
-        self.focal_px = focal_px
+        self.focal_px, self.centre_px, self.side_m = focal_px, centre_px, side_m
         self.corners_px = observations.corners_px - centre_px
         self.square = square_corners(side_m)
         self.rotations, self.centres = _marker_poses(observations.corners_px, focal_px, centre_px, side_m)
@@ -177,8 +83,8 @@ class _Circles:
         ideal = np.stack([around.real + self.on_axis[0], around.imag + self.on_axis[1], height[self.m]], -1)
         self.predicted = ideal @ self.basis
 
-    def turntable(self) -> Turntable:
-        """The guess in the adjustment's frame."""
+    def turntable(self) -> MarkerTurntable:
+        """The circles as a turntable."""
         foot = self.basis[:2].T @ self.on_axis
         distance = np.linalg.norm(foot)
         z = self.basis[2]
@@ -186,7 +92,7 @@ class _Circles:
         camera_rotation = np.stack([x, np.cross(z, x), z], -1)
         camera = np.array([distance, 0.0, 0.0])
         angles = self.angles - self.angles[0]
-        turn = np.stack([rotation_about_z(np.rad2deg(a))[:3, :3] for a in angles])[self.f]
+        turn = rotations_about_z(angles)[self.f]
         in_room = self.centres @ camera_rotation + camera
         centres = np.einsum("nji,nj->ni", turn, in_room)
         rotations = np.einsum("nji,kj,nckl->ncil", turn, camera_rotation, self.rotations)
@@ -198,26 +104,33 @@ class _Circles:
             points = np.einsum("cij,kj->cki", candidates, self.square) + poses[k, :3, 3]
             in_camera = (np.einsum("nij,ckj->cnki", turn[rows], points) - camera) @ camera_rotation.T
             error = self.focal_px * in_camera[..., :2] / in_camera[..., 2:] - self.corners_px[rows]
-            # Of all frames' two candidates the one that suits all frames best.
+            # Each frame gives two candidates; the one that fits all frames best is taken.
             size = np.linalg.norm(error, axis=-1).mean(-1)
             poses[k, :3, :3] = candidates[np.argmin(np.median(size, axis=-1))]
-        start = Turntable(self.focal_px, camera_rotation, float(distance), self.frames, angles, self.markers, poses)
+        start = MarkerTurntable(
+            focal_px=self.focal_px,
+            centre_px=self.centre_px,
+            camera_rotation=camera_rotation,
+            distance=float(distance),
+            frames=self.frames,
+            angles_rad=angles,
+            side_m=self.side_m,
+            markers=self.markers,
+            marker_poses=poses,
+        )
         up = poses[:, 2, 2]
         flat = np.abs(up) > _HORIZONTAL_COSINE
-        return turned_over(start) if flat.any() and up[flat].sum() < 0 else start
+        return _turned_over(start) if flat.any() and up[flat].sum() < 0 else start
 
 
-def turned_over(turntable: Turntable) -> Turntable:
-    """The same machine with the axis pointing the other way (a half turn about x)."""
+def _turned_over(turntable: MarkerTurntable) -> MarkerTurntable:
+    """The same turntable with the axis pointing the other way (a half turn about x)."""
     half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    return Turntable(
-        turntable.focal_px,
-        turntable.camera_rotation @ half_turn[:3, :3],
-        turntable.distance_m,
-        turntable.frames,
-        -turntable.angles_rad,
-        turntable.markers,
-        half_turn @ turntable.marker_poses,
+    return replace(
+        turntable,
+        camera_rotation=turntable.camera_rotation @ half_turn[:3, :3],
+        angles_rad=-turntable.angles_rad,
+        marker_poses=half_turn @ turntable.marker_poses,
     )
 
 

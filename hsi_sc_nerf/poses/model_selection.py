@@ -1,0 +1,229 @@
+"""The simplest turntable model that explains the markers: without or with lens distortion, without or with wobble.
+
+A model with more parameters always leaves smaller residuals. It is selected where an F-test on the weighted sums of
+squares shows that chance alone would hardly lower them as much. The unit of the test is the corners' variance as the
+richer model's residuals tell it, and at least that of the corners' fit. The level is strict, for errors of
+neighbouring corners are not quite independent.
+
+A table that wobbles does so in many frames. Where only a few frames call for motions of their own, the object, the
+table or the camera was displaced in these frames, and they are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import f as f_distribution
+
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, MarkerProblem
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
+
+LOSS_SIGMAS = 3.0
+"""Whitened residuals beyond this many standard deviations count by their size, not its square."""
+_LEVEL = 1e-6
+# A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
+_FIRST_SPREAD = (0.02, 0.01)
+_LEAST_SPREAD = (1e-5, 1e-6)
+# At most this fraction of the frames, but at least one, is displaced; if more call for a motion, the table wobbles.
+_MOST_DISPLACED = 0.1
+# Numbers that describe a frame's own motion: angle, tilts (2), shifts (3).
+_FRAME_PARAMETERS = 6
+# A marker is ignored if its corners stay this many standard deviations (RMS) away from the freely moved frame.
+_MISFIT_SIGMAS = 5.0
+# One marker that is read wrongly looks like a displaced frame; several do not agree by chance.
+_FEWEST_MARKERS = 2
+_LEAST_FRACTION = 0.5
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """An adjusted turntable and the problem that it solves."""
+
+    turntable: MarkerTurntable
+    problem: MarkerProblem
+    cost: float
+    displaced_frames: dict[int, float] = field(default_factory=dict)
+    """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
+    square distance of their corners from the turntable's at the best angle, px."""
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of residuals less parameters, at least 1."""
+        return max(1, 8 * len(self.problem.observations) - self.problem.layout.size)
+
+    @property
+    def variance(self) -> float:
+        """Of the whitened residuals: 1 if the corners' covariances are right; at least that."""
+        return max(1.0, self.cost / self.degrees_of_freedom)
+
+    def covariance(self) -> Float[np.ndarray, "p p"]:
+        """Of the parameters, in the order of ``ParameterLayout``."""
+        normal, _ = self.problem.normal_equations(self.turntable).dense()
+        return self.variance * np.linalg.pinv(normal, hermitian=True)
+
+    def angle_sigmas_deg(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "f"]:
+        """Standard deviations of the frames' angles relative to the mean of all, degrees."""
+        at = self.problem.layout.angle[1:]
+        angles = np.pad(covariance[np.ix_(at, at)], ((1, 0), (1, 0)))
+        variance = angles.diagonal() - 2.0 * angles.mean(axis=0) + angles.mean()
+        return np.rad2deg(np.sqrt(np.maximum(variance, 0.0)))
+
+
+@dataclass(frozen=True)
+class FrameMotions:
+    """Evidence that frames moved beside the turntable."""
+
+    frames: Int[np.ndarray, "f"]
+    p_value: Float[np.ndarray, "f"]
+    """Probability that chance alone lowers the frame's squares as much as a motion of its own does (F-test)."""
+    rms_error_px: Float[np.ndarray, "f"]
+    """Root mean square distance of the corners from the turntable's at the frame's best angle."""
+
+
+_Solve = Callable[[MarkerTurntable, FreeParameters], Adjusted]
+
+
+def select_model(start: MarkerTurntable, observations: MarkerObservations) -> Adjusted:
+    """The simplest model that explains the corners, adjusted.
+
+    The lens is decided first, on a table that does not wobble. If then the table should move, a few displaced frames
+    are tried as the explanation. If it wobbles, the lens is decided again beside it.
+
+    Args:
+        start: a turntable that has the frames and markers of the observations.
+        observations: marker corners.
+    """
+    solve = _solver(observations)
+    steady, wobbling = _steady(start, solve)
+    if wobbling is None:
+        return steady
+    without_displaced = _without_displaced_frames(steady.turntable, observations)
+    if without_displaced is not None:
+        return without_displaced
+    for _ in range(2):
+        free = FreeParameters(motion_sigmas=_motion_spread(wobbling.turntable))
+        wobbling = solve(replace(wobbling.turntable, radial=(0.0, 0.0)), free)
+    return _with_lens(wobbling, solve)
+
+
+def frame_motions(turntable: MarkerTurntable, observations: MarkerObservations) -> FrameMotions:
+    """Test whether each frame fits the turntable by its angle, or needs tilts and shifts of its own.
+
+    Camera, lens and markers are held. Frames of fewer than two markers, or of which fewer than half agree on one
+    motion, get a p-value of 1: single markers are left to the outlier test.
+
+    Args:
+        turntable: without wobble; observations of markers that it lacks are ignored.
+        observations: marker corners.
+    """
+    seen = observations.select(turntable.knows(observations))
+    n, frame = len(turntable.frames), np.searchsorted(turntable.frames, seen.frame)
+    turning = FreeParameters(camera=False, landmarks=False)
+    moving = replace(turning, motion_sigmas=(np.inf, np.inf))
+
+    def fitted(start: MarkerTurntable, rows: np.ndarray, free: FreeParameters) -> MarkerTurntable:
+        return MarkerProblem(start, seen.select(rows), LOSS_SIGMAS, free).minimise(start)
+
+    everything = MarkerProblem(turntable, seen, LOSS_SIGMAS, turning)
+    moved = fitted(turntable, np.ones(len(seen), bool), moving)
+    sigmas = np.sqrt((everything.residuals(moved) ** 2).mean(axis=(1, 2)))
+    agrees = sigmas < _MISFIT_SIGMAS * max(1.0, float(np.median(sigmas)))
+    turned, moved = fitted(turntable, agrees, turning), fitted(moved, agrees, moving)
+    by_motion, by_angle = (np.bincount(frame[agrees], everything.losses(t)[agrees], n) for t in (moved, turned))
+    markers, all_markers = np.bincount(frame[agrees], minlength=n), np.bincount(frame, minlength=n)
+    enough = (markers >= _FEWEST_MARKERS) & (markers >= _LEAST_FRACTION * all_markers)
+    freedom = int((8 * markers - _FRAME_PARAMETERS)[enough].sum())
+    variance = max(1.0, float(by_motion[enough].sum()) / max(freedom, 1))
+    ratio = np.maximum(by_angle - by_motion, 0.0) / (_FRAME_PARAMETERS - 1) / variance
+    p_value = np.where(enough, f_distribution.sf(ratio, _FRAME_PARAMETERS - 1, max(freedom, 1)), 1.0)
+    squared_px2 = ((turned.reproject(seen) - seen.corners_px) ** 2).sum(-1).mean(-1)
+    rms_error_px = np.sqrt(np.bincount(frame[agrees], squared_px2[agrees], n) / np.maximum(markers, 1))
+    return FrameMotions(turntable.frames, p_value, rms_error_px)
+
+
+def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
+    """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
+    frames, f = np.unique(frame, return_inverse=True)
+    markers, m = np.unique(marker, return_inverse=True)
+    size = len(frames) + len(markers)
+    links = coo_array((np.ones(len(f)), (f, m + len(frames))), shape=(size, size))
+    _, label = connected_components(links, directed=False)
+    counts = np.bincount(label[: len(frames)])
+    return label[f] == np.argmax(counts)
+
+
+def _solver(observations: MarkerObservations) -> _Solve:
+    def solve(turntable: MarkerTurntable, free: FreeParameters) -> Adjusted:
+        problem = MarkerProblem(turntable, observations, LOSS_SIGMAS, free)
+        adjusted = problem.minimise(turntable)
+        return Adjusted(adjusted, problem, problem.cost(adjusted))
+
+    return solve
+
+
+def _steady(start: MarkerTurntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
+    """The model without wobble; and the one with it, if the corners call for it."""
+    steady = solve(replace(start, radial=(0.0, 0.0), tilts_rad=None, shifts=None), FreeParameters())
+    steady = _with_lens(steady, solve)
+    sigmas = (_FIRST_SPREAD[0], _FIRST_SPREAD[1] * steady.turntable.distance)
+    wobbling = solve(steady.turntable, replace(steady.problem.free, motion_sigmas=sigmas))
+    return steady, wobbling if _is_better(wobbling, steady) else None
+
+
+def _without_displaced_frames(start: MarkerTurntable, observations: MarkerObservations) -> Adjusted | None:
+    """The model without wobble of all but a few displaced frames; None where these do not explain the motions."""
+    most = max(1, round(_MOST_DISPLACED * len(start.frames)))
+
+    def steady_without(frames: Int[np.ndarray, "k"]) -> tuple[Adjusted | None, Adjusted | None]:
+        rest = observations.without_frames(frames)
+        if not linked_rows(rest.frame, rest.marker).all():
+            return None, None
+        return _steady(start.restricted(rest), _solver(rest))
+
+    # Displaced frames bend a turntable that is fitted to them: judge by one without the likeliest.
+    likeliest = start.frames[np.sort(np.argsort(frame_motions(start, observations).p_value, kind="stable")[:most])]
+    steady, wobbling = steady_without(likeliest)
+    if steady is None:
+        return None
+    angles = start.angles_rad.copy()
+    angles[np.isin(start.frames, steady.turntable.frames)] = steady.turntable.angles_rad
+    judged = frame_motions(replace(steady.turntable, frames=start.frames, angles_rad=angles), observations)
+    displaced = judged.p_value < _LEVEL
+    if not 0 < displaced.sum() <= most:
+        return None
+    if not np.array_equal(start.frames[displaced], likeliest):
+        steady, wobbling = steady_without(start.frames[displaced])
+    if steady is None or wobbling is not None:
+        return None
+    errors = zip(start.frames[displaced].tolist(), judged.rms_error_px[displaced].tolist(), strict=True)
+    return replace(steady, displaced_frames=dict(errors))
+
+
+def _motion_spread(turntable: MarkerTurntable) -> tuple[float, float]:
+    """Root mean squares of the tilts (rad) and the shifts (m)."""
+    tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.tilts_and_shifts(), [2], axis=1))
+    return max(tilt, _LEAST_SPREAD[0]), max(shift, _LEAST_SPREAD[1])
+
+
+def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
+    """With as many terms of radial distortion as the corners call for, one after the other."""
+    for terms in (1, 2):
+        distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))
+        if not _is_better(distorted, plain):
+            break
+        plain = distorted
+    return plain
+
+
+def _is_better(more: Adjusted, less: Adjusted) -> bool:
+    """F-test of nested models."""
+    extra = more.problem.layout.size - less.problem.layout.size
+    if 8 * len(more.problem.observations) <= more.problem.layout.size:
+        return False
+    ratio = (less.cost - more.cost) / extra / more.variance
+    return bool(f_distribution.sf(ratio, extra, more.degrees_of_freedom) < _LEVEL)

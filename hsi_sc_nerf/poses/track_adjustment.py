@@ -1,0 +1,226 @@
+"""Bundle adjustment of a turntable and points of the object, with rejection of outliers, and frames found later.
+
+Features alone give no scale: the unit of length is the distance between camera and axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, ParameterLayout, Problem, loop_closure_deg
+from hsi_sc_nerf.poses.turntable import (
+    FEWEST_FRAMES,
+    Jacobian,
+    PointTurntable,
+    Tracks,
+    project,
+    projection_jacobian,
+)
+
+# Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
+# of the object, such as an outline or the shadow side of a bump, creep over it slowly.
+_LOSS_PX = 0.1
+# Far from the solution a small loss scale holds on to what fits by chance.
+_FIRST_LOSS_PX = 1.0
+_SMALLEST_GAIN = 1e-6
+# Points nearer to the camera's plane than this, in distances of the camera, are behind it.
+_NEAREST_DEPTH = 1e-3
+# Outliers are farther than this many standard deviations, measured on the residuals, and than this, pixels.
+_OUTLIER_SIGMAS = 4.0
+_LEAST_OUTLIER_PX = 0.3
+_OUTLIER_ROUNDS = 4
+# The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
+_RAYLEIGH_MEDIAN = 1.1774
+# Points seen in fewer frames, and frames that show fewer points, are left out.
+_FEWEST_VIEWS = 3
+_FEWEST_POINTS = 8
+# The search for a lost frame's angle: its step; a point supports an angle if it is seen this near to its projection;
+# and the fraction of points that must support it.
+_SEARCH_STEP_DEG = 1.0
+_NEAR_PX = 2.0
+_NEAR_FRACTION = 0.5
+
+
+@dataclass(frozen=True)
+class AdjustedTracks:
+    """The adjusted turntable, and how well it explains the tracks."""
+
+    turntable: PointTurntable
+    tracks: Tracks
+    """The rows that were used."""
+    outliers: Bool[np.ndarray, "n"]
+    """Rows of the given tracks that were rejected: they do not fit, or too little is left of their point or frame."""
+
+    @property
+    def residual_px(self) -> Float[np.ndarray, "m 2"]:
+        """Reprojection errors of the used rows."""
+        return self.turntable.reproject(self.tracks) - self.tracks.pixels
+
+    @property
+    def overall_error_px(self) -> float:
+        """Root mean square of the reprojection error."""
+        return float(np.sqrt((self.residual_px**2).sum(-1).mean()))
+
+    def frame_errors_px(self) -> Float[np.ndarray, "f"]:
+        """Root mean square of the reprojection error in each of the turntable's frames."""
+        row = np.searchsorted(self.turntable.frames, self.tracks.frame)
+        squared = (self.residual_px**2).sum(-1)
+        return np.sqrt(np.bincount(row, squared) / np.bincount(row))
+
+    def loop_closure_deg(self) -> float | None:
+        """What is left of a full turn after adding up the steps between neighbouring frames."""
+        return loop_closure_deg(PointProblem(self.turntable, self.tracks, _LOSS_PX), self.turntable)
+
+
+def adjust_tracks(start: PointTurntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
+    """Adjust camera, angles and points to the tracks, reject outliers, and adjust again.
+
+    Args:
+        start: where to start. Tracks of frames or points that it lacks count as outliers.
+        tracks: points seen in frames.
+        free_angles: adjust the frames' angles; otherwise they are held.
+
+    Raises:
+        InputError: too few tracks fit to determine an axis.
+    """
+
+    def adjusted(turntable: PointTurntable, kept: Tracks, loss_px: float) -> PointTurntable:
+        turntable = turntable.restricted(kept)
+        problem = PointProblem(turntable, kept, loss_px, FreeParameters(angles=free_angles))
+        return problem.minimise(turntable, _SMALLEST_GAIN)
+
+    good = _enough(tracks, start.knows(tracks))
+    turntable = adjusted(start, tracks.select(good), _FIRST_LOSS_PX)
+    for last in [False] * _OUTLIER_ROUNDS + [True]:
+        kept = tracks.select(good)
+        turntable = adjusted(turntable, kept, _LOSS_PX)
+        size_px = np.linalg.norm(turntable.reproject(kept) - kept.pixels, axis=-1)
+        outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
+        if last or not outlier.any():
+            break
+        fits = good.copy()
+        fits[np.flatnonzero(good)[outlier]] = False
+        good = _enough(tracks, fits)
+    return AdjustedTracks(turntable, kept, ~good)
+
+
+def split_half_error_deg(found: AdjustedTracks, *, free_angles: bool = True) -> float | None:
+    """Half the largest rotation between the poses from two halves of the points: how far they can be trusted.
+
+    Features that creep over a bumpy or shiny object err together, which the residuals do not show but the halves do.
+    None where half of the points cannot determine the turntable.
+    """
+    halves = []
+    for half in (0, 1):
+        try:
+            tracks = found.tracks.select(found.tracks.point % 2 == half)
+            halves.append(adjust_tracks(found.turntable, tracks, free_angles=free_angles).turntable)
+        except InputError:
+            return None
+    both = np.intersect1d(halves[0].frames, halves[1].frames)
+    one, other = (h.camera_to_world()[np.isin(h.frames, both), :3, :3] for h in halves)
+    return float(np.rad2deg(Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()) / 2.0)
+
+
+def with_lost_frames(turntable: PointTurntable, tracks: Tracks) -> PointTurntable:
+    """Add the frames that structure from motion lost or got wrong, at the angle that suits their points.
+
+    All angles are tried, for a turntable may have stopped or jumped; a frame on whose points no angle agrees stays
+    lost. ``adjust_tracks`` refines the angles.
+    """
+    known = np.isin(tracks.point, turntable.points)
+    frames, angles = turntable.frames, turntable.angles_rad
+    for frame in np.setdiff1d(tracks.frame[known], turntable.frames):
+        angle = _search_angle(turntable, tracks.select(known & (tracks.frame == frame)))
+        if angle is not None:
+            at = int(np.searchsorted(frames, frame))
+            frames, angles = np.insert(frames, at, frame), np.insert(angles, at, angle)
+    return replace(turntable, frames=frames, angles_rad=angles[0] + np.unwrap(angles - angles[0]))
+
+
+class PointProblem(Problem[PointTurntable]):
+    """Points of the object, in pixels. The loss is that of a residual's length. The distance to the axis is held."""
+
+    def __init__(
+        self, start: PointTurntable, tracks: Tracks, loss_px: float, free: FreeParameters | None = None
+    ) -> None:
+        """Args:
+        start: a turntable that has the frames and points of the tracks.
+        tracks: observed points.
+        loss_px: residuals well above this count by their length, not its square.
+        free: parameters to adjust; by default camera, angles and landmarks.
+        """
+        free = free or FreeParameters()
+        frame, point = start.rows(tracks)
+        layout = ParameterLayout.of(free, len(start.frames), len(start.points), 4, 3)
+        super().__init__(layout, frame, point, free, loss_px)
+        self.tracks = tracks
+
+    def residuals(self, turntable: PointTurntable) -> Float[np.ndarray, "n 1 2"]:
+        """Reprojection errors, infinite for a point behind the camera."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
+        return np.where(behind, np.inf, projection.pixels - self.tracks.pixels)[:, None]
+
+    def jacobian(self, turntable: PointTurntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
+        """By the point's coordinates."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        jacobian = projection_jacobian(turntable, self.frame, projection)
+        return jacobian, jacobian.point
+
+    def with_landmark_step(self, turntable: PointTurntable, step: Float[np.ndarray, "p 3"]) -> PointTurntable:
+        """The turntable with its points shifted."""
+        return replace(turntable, points_3d=turntable.points_3d + step)
+
+
+def _search_angle(turntable: PointTurntable, seen: Tracks) -> float | None:
+    """The angle (rad) at which the points of one frame are nearest to their projections; None without agreement."""
+    if len(seen) < _FEWEST_POINTS:
+        return None
+    points_3d = turntable.points_3d[np.searchsorted(turntable.points, seen.point)]
+
+    def distances_px(angles_rad):
+        at_angles = replace(turntable, angles_rad=np.atleast_1d(angles_rad))
+        tries = len(at_angles.angles_rad)
+        frame = np.repeat(np.arange(tries), len(points_3d))
+        pixels = project(at_angles, frame, np.tile(points_3d, (tries, 1))).pixels
+        return np.linalg.norm(pixels.reshape(tries, -1, 2) - seen.pixels, axis=-1)
+
+    def cost(angles_rad, largest_px):
+        return np.minimum(distances_px(angles_rad), largest_px).mean(axis=1)
+
+    grid = np.deg2rad(np.arange(0.0, 360.0, _SEARCH_STEP_DEG))
+    # A step of the grid moves a point by several pixels.
+    rough = grid[np.argmin(cost(grid, 10.0 * _NEAR_PX))]
+    step = np.deg2rad(_SEARCH_STEP_DEG)
+    fine = rough + step * np.linspace(-1.0, 1.0, 41)
+    rough = fine[np.argmin(cost(fine, _NEAR_PX))]
+    found = minimize_scalar(
+        lambda angle: float(cost(angle, _NEAR_PX)[0]), bounds=(rough - step / 20, rough + step / 20), method="bounded"
+    )
+    near = float((distances_px(found.x)[0] < _NEAR_PX).mean())
+    return float(found.x) if near >= _NEAR_FRACTION else None
+
+
+def _enough(tracks: Tracks, good: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Of the good rows those of points in enough frames and of frames with enough points."""
+    while True:
+        views = np.bincount(tracks.point[good], minlength=tracks.point.max(initial=0) + 1)
+        good = good & (views[tracks.point] >= _FEWEST_VIEWS)
+        seen = np.bincount(tracks.frame[good], minlength=tracks.frame.max(initial=0) + 1)
+        enough = good & (seen[tracks.frame] >= _FEWEST_POINTS)
+        if (enough == good).all():
+            break
+        good = enough
+    if len(np.unique(tracks.frame[good])) < FEWEST_FRAMES:
+        raise InputError(
+            "too few points of the object are seen in enough frames to fix the turntable's axis; take smaller steps, "
+            "give the object more texture, or take markers"
+        )
+    return good

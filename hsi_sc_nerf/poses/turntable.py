@@ -1,0 +1,304 @@
+"""The turntable model: a fixed camera, one axis, one angle per frame; its projection and the Jacobian of it.
+
+Symbols: f frames, m markers, p points, n rows of one observed point each. The turntable frame has z along the axis,
+up, and the camera at (distance, 0, 0). In frame i a point X of the object has the OpenCV camera coordinates
+
+    camera_rotation (T_i X + s_i - (distance, 0, 0)),    T_i = tilt_i Rot(z, angle_i),
+
+where tilt_i and the shift s_i are small motions of a wobbling table; a perfect turntable has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+from typing_extensions import Self
+
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, cross_matrix
+
+FEWEST_FRAMES = 3
+"""Fewer frames do not determine a turntable's axis."""
+
+
+@dataclass(frozen=True)
+class MarkerObservations:
+    """Corners of markers in frames, one row per marker and frame. Pixel origin: the image's upper left corner."""
+
+    frame: Int[np.ndarray, "n"]
+    marker: Int[np.ndarray, "n"]
+    corners_px: Float[np.ndarray, "n 4 2"]
+    covariance_px2: Float[np.ndarray, "n 8 8"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def select(self, keep: np.ndarray) -> MarkerObservations:
+        """The rows that ``keep`` (a mask or indices) selects."""
+        return MarkerObservations(
+            self.frame[keep], self.marker[keep], self.corners_px[keep], self.covariance_px2[keep]
+        )
+
+    def append(self, more: MarkerObservations) -> MarkerObservations:
+        """These rows followed by others."""
+        pairs = zip(vars(self).values(), vars(more).values(), strict=True)
+        return MarkerObservations(*(np.concatenate(pair) for pair in pairs))
+
+    def without_frames(self, frames: np.ndarray | list[int]) -> MarkerObservations:
+        """The rows of other frames."""
+        return self.select(~np.isin(self.frame, frames))
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Points of the object seen in several frames, one row per point and frame. Pixel origin as above."""
+
+    frame: Int[np.ndarray, "n"]
+    point: Int[np.ndarray, "n"]
+    pixels: Float[np.ndarray, "n 2"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def select(self, keep: np.ndarray) -> Tracks:
+        """The rows that ``keep`` (a mask or indices) selects."""
+        return Tracks(self.frame[keep], self.point[keep], self.pixels[keep])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turntable:
+    """Camera and motion. Lengths are metres, or distances of the camera from the axis where no scale is known.
+
+    ``frames``, ascending, are the session's frames that the rows of ``angles_rad`` (and of the motions) belong to.
+    """
+
+    focal_px: float
+    centre_px: tuple[float, float]
+    """Principal point."""
+    radial: tuple[float, float] = (0.0, 0.0)
+    """Lens distortion: OpenCV's k1 and k2."""
+    camera_rotation: Float[np.ndarray, "3 3"]
+    """From the turntable frame to OpenCV camera axes."""
+    distance: float = 1.0
+    """Of the camera from the axis."""
+    frames: Int[np.ndarray, "f"]
+    angles_rad: Float[np.ndarray, "f"]
+    """Counter-clockwise seen from above."""
+    tilts_rad: Float[np.ndarray, "f 2"] | None = None
+    """Rotation vectors (x, y, 0) of a wobbling table; None for a table that does not wobble."""
+    shifts: Float[np.ndarray, "f 3"] | None = None
+
+    def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
+        """Rotation T and shift s of the object in each frame."""
+        turns = rotations_about_z(self.angles_rad)
+        if self.tilts_rad is None or self.shifts is None:
+            return turns, np.zeros((len(turns), 3))
+        return Rotation.from_rotvec(np.pad(self.tilts_rad, ((0, 0), (0, 1)))).as_matrix() @ turns, self.shifts
+
+    def tilts_and_shifts(self) -> Float[np.ndarray, "f 5"]:
+        """Tilts (2, rad) and shifts (3) of each frame, zero for a table that does not wobble."""
+        if self.tilts_rad is None or self.shifts is None:
+            return np.zeros((len(self.frames), 5))
+        return np.concatenate([self.tilts_rad, self.shifts], axis=-1)
+
+    def camera_positions(self) -> Float[np.ndarray, "f 3"]:
+        """The camera in the object's axes, frame by frame."""
+        rotations, shifts = self.motions()
+        return np.einsum("fji,fj->fi", rotations, [self.distance, 0.0, 0.0] - shifts)
+
+    def camera_to_world(self) -> Float[np.ndarray, "f 4 4"]:
+        """Camera-to-world in OpenGL axes; the world is the object at the angle 0, z = 0 at the camera's height."""
+        rotations, _ = self.motions()
+        poses = np.tile(np.eye(4), (len(rotations), 1, 1))
+        poses[:, :3, :3] = np.swapaxes(self.camera_rotation @ rotations, 1, 2)
+        poses[:, :3, 3] = self.camera_positions()
+        return poses @ OPENCV_TO_OPENGL
+
+    def _selected_frames(self, frame: Int[np.ndarray, "n"]) -> Self:
+        keep = np.isin(self.frames, frame)
+        return replace(
+            self,
+            frames=self.frames[keep],
+            angles_rad=self.angles_rad[keep],
+            tilts_rad=None if self.tilts_rad is None else self.tilts_rad[keep],
+            shifts=None if self.shifts is None else self.shifts[keep],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerTurntable(Turntable):
+    """A turntable with square markers, in metres."""
+
+    side_m: float
+    """Of the markers' black square."""
+    markers: Int[np.ndarray, "m"]
+    """Ids, ascending."""
+    marker_poses: Float[np.ndarray, "m 4 4"]
+    """Marker to object."""
+
+    def rows(self, seen: MarkerObservations) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Rows of ``frames`` and of ``markers`` that the observations belong to."""
+        return np.searchsorted(self.frames, seen.frame), np.searchsorted(self.markers, seen.marker)
+
+    def knows(self, seen: MarkerObservations) -> np.ndarray:
+        """Mask of the observations whose frame and marker the turntable has."""
+        return np.isin(seen.frame, self.frames) & np.isin(seen.marker, self.markers)
+
+    def restricted(self, seen: MarkerObservations) -> MarkerTurntable:
+        """The turntable with only the frames and markers that are observed; angles keep their zero."""
+        keep = np.isin(self.markers, seen.marker)
+        return replace(
+            self._selected_frames(seen.frame), markers=self.markers[keep], marker_poses=self.marker_poses[keep]
+        )
+
+    def corners(self) -> Float[np.ndarray, "m 4 3"]:
+        """Corners of the markers, at the angle 0."""
+        return self.corner_offsets() + self.marker_poses[:, None, :3, 3]
+
+    def corner_offsets(self) -> Float[np.ndarray, "m 4 3"]:
+        """Corners relative to their marker's centre, in the object's axes."""
+        return np.einsum("mij,kj->mki", self.marker_poses[:, :3, :3], square_corners(self.side_m))
+
+    def reproject(self, seen: MarkerObservations) -> Float[np.ndarray, "n 4 2"]:
+        """Pixels of the corners of each observation."""
+        frame, marker = self.rows(seen)
+        return project(self, np.repeat(frame, 4), self.corners()[marker].reshape(-1, 3)).pixels.reshape(-1, 4, 2)
+
+    def resized(self, factor: float) -> MarkerTurntable:
+        """The turntable with all lengths times a factor: its images stay the same."""
+        poses = self.marker_poses.copy()
+        poses[:, :3, 3] *= factor
+        return replace(
+            self,
+            distance=self.distance * factor,
+            side_m=self.side_m * factor,
+            marker_poses=poses,
+            shifts=None if self.shifts is None else self.shifts * factor,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointTurntable(Turntable):
+    """A turntable with points of the object. Its unit of length is the distance of the camera from the axis."""
+
+    points: Int[np.ndarray, "p"]
+    """The tracks' numbers of the points, ascending."""
+    points_3d: Float[np.ndarray, "p 3"]
+
+    def rows(self, tracks: Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Rows of ``frames`` and of ``points`` that the tracks' rows belong to."""
+        return np.searchsorted(self.frames, tracks.frame), np.searchsorted(self.points, tracks.point)
+
+    def knows(self, tracks: Tracks) -> np.ndarray:
+        """Mask of the tracks' rows whose frame and point the turntable has."""
+        return np.isin(tracks.frame, self.frames) & np.isin(tracks.point, self.points)
+
+    def restricted(self, tracks: Tracks) -> PointTurntable:
+        """The turntable with only the frames and points of the tracks; angles keep their zero."""
+        keep = np.isin(self.points, tracks.point)
+        return replace(self._selected_frames(tracks.frame), points=self.points[keep], points_3d=self.points_3d[keep])
+
+    def reproject(self, tracks: Tracks) -> Float[np.ndarray, "n 2"]:
+        """Pixels of each row of the tracks."""
+        frame, point = self.rows(tracks)
+        return project(self, frame, self.points_3d[point]).pixels
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Pixels of points, and what the Jacobian needs."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    rotation: Float[np.ndarray, "n 3 3"]
+    """T of the row's frame."""
+    rotated: Float[np.ndarray, "n 3"]
+    """T X."""
+    in_camera: Float[np.ndarray, "n 3"]
+    normalised: Float[np.ndarray, "n 2"]
+    """``in_camera`` over its depth."""
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of the pixels."""
+
+    camera: Float[np.ndarray, "n 2 5"]
+    """By the log of the focal length, a small rotation of the camera (3, rad), the log of its distance."""
+    radial: Float[np.ndarray, "n 2 2"]
+    """By k1 and k2."""
+    angle: Float[np.ndarray, "n 2 1"]
+    """By the frame's angle, rad."""
+    motion: Float[np.ndarray, "n 2 5"] | None
+    """By the frame's tilt (2, rad) and shift (3); None for a turntable without."""
+    point: Float[np.ndarray, "n 2 3"]
+    """By the point, in the object's axes."""
+
+
+def project(turntable: Turntable, frame: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]) -> Projection:
+    """Project points of the object in frames (rows of ``turntable.frames``).
+
+    A direction (x, y, 1) appears at (1 + k1 r^2 + k2 r^4) (x, y), as in OpenCV.
+    """
+    rotations, shifts = turntable.motions()
+    rotation = rotations[frame]
+    rotated = np.einsum("nij,nj->ni", rotation, points)
+    in_camera = (rotated + (shifts - [turntable.distance, 0.0, 0.0])[frame]) @ turntable.camera_rotation.T
+    normalised = in_camera[:, :2] / in_camera[:, 2:]
+    k1, k2 = turntable.radial
+    r2 = (normalised**2).sum(-1, keepdims=True)
+    pixels = turntable.focal_px * (1.0 + r2 * (k1 + k2 * r2)) * normalised + turntable.centre_px
+    return Projection(pixels, rotation, rotated, in_camera, normalised)
+
+
+def projection_jacobian(turntable: Turntable, frame: Int[np.ndarray, "n"], projection: Projection) -> Jacobian:
+    """Derivatives of ``project``."""
+    xy, n = projection.normalised, len(projection.normalised)
+    k1, k2 = turntable.radial
+    r2 = (xy**2).sum(-1)[:, None, None]
+    by_xy = turntable.focal_px * (
+        (1.0 + r2 * (k1 + k2 * r2)) * np.eye(2) + (2.0 * k1 + 4.0 * k2 * r2) * xy[:, :, None] * xy[:, None, :]
+    )
+    depth = projection.in_camera[:, 2, None, None]
+    by_camera_point = by_xy @ np.concatenate([np.tile(np.eye(2), (n, 1, 1)), -xy[:, :, None]], axis=-1) / depth
+    by_room = by_camera_point @ turntable.camera_rotation
+    camera = [
+        (projection.pixels - turntable.centre_px)[:, :, None],
+        np.cross(projection.in_camera[:, None, :], by_camera_point),
+        -turntable.distance * by_room[..., :1],
+    ]
+    # A tilted table turns about its own axis: the last column of T.
+    by_angle = np.cross(projection.rotation[:, :, 2], projection.rotated)
+    motion = None
+    if turntable.tilts_rad is not None:
+        left = _left_jacobian(np.pad(turntable.tilts_rad, ((0, 0), (0, 1))))[frame]
+        motion = np.concatenate([(by_room @ -cross_matrix(projection.rotated) @ left)[..., :2], by_room], axis=-1)
+    return Jacobian(
+        camera=np.concatenate(camera, axis=-1),
+        radial=turntable.focal_px * xy[:, :, None] * np.concatenate([r2, r2**2], axis=-1),
+        angle=by_room @ by_angle[:, :, None],
+        motion=motion,
+        point=by_room @ projection.rotation,
+    )
+
+
+def square_corners(side_m: float) -> Float[np.ndarray, "4 3"]:
+    """A marker's corners in its own frame (x right, y up, z out of the paper), in ArUco's order."""
+    return side_m / 2 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def rotations_about_z(angles_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
+    """Rotations about z, counter-clockwise seen from +z."""
+    return Rotation.from_rotvec(np.outer(angles_rad, [0.0, 0.0, 1.0])).as_matrix()
+
+
+def _left_jacobian(rotvec):
+    """The left Jacobian J of SO(3): d(exp(w) x) = -[exp(w) x]x J(w) dw."""
+    angle = np.linalg.norm(rotvec, axis=-1)[:, None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    cross = cross_matrix(rotvec)
+    return np.eye(3) + a * cross + b * (cross @ cross)
