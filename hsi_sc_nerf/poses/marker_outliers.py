@@ -32,6 +32,8 @@ def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[Rejected]
     Returns:
         These observations, the others with the reason, and the markers that stand still in the image.
     """
+    if len(seen) == 0:
+        return seen, [], []
     count = Counter(seen.marker.tolist())
     size_px = np.sqrt(np.median([np.ptp(c, axis=0).prod() for c in seen.corners_px]))
     static = []
