@@ -57,7 +57,7 @@ class TraitsCommand:
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
     roi_file: Path | None = None
-    """More regions of interest: a YAML file of lines such as `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
+    """More regions of interest: a YAML file of lines like `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
 
     def main(self) -> None:
         """Measure and write.
