@@ -15,6 +15,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.dataset import SpectralDataset
+from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
 from hsi_sc_nerf.data.pixels import PixelReader, PixelSampler, spread_over
 
 
@@ -30,6 +31,9 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     """Rays of an evaluation step during training."""
     seed: int = 0
     """Seed of the random pixels."""
+    hold_on_gpu: bool = True
+    """Hold the training cubes in a GPU's memory where they fill no more than half of what is free there. False, and
+    without a GPU: every batch is read from the files."""
     # Pixels are read from the cubes on disk one by one: these options of nerfstudio's have nothing to act on.
     camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
     images_on_gpu: tyro.conf.Suppress[bool] = False
@@ -44,7 +48,7 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
 
 
 class SpectralDataManager(VanillaDataManager[SpectralDataset]):
-    """Random pixels of the cubes on disk; nothing is cached but the masks.
+    """Random pixels of the cubes on disk; nothing is cached but the masks, unless the cubes fit on a GPU.
 
     Attributes:
         foreground_share: share of the training rays that hit the foreground; ``None`` for whole frames. The
@@ -70,7 +74,13 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_train(self) -> None:
         """Open the training cubes."""
         self.train_pixel_sampler = self._pixels(self.train_dataset, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        cameras = self.train_dataset.cameras.to(self.device)
+        self.train_ray_generator = RayGenerator(cameras)
+        self._held: DevicePixels | None = None
+        if self.config.hold_on_gpu and fits_on_gpu(self.train_dataset.frames, torch.device(self.device)):
+            masks, flagged = self.train_pixel_sampler.masks, self.train_dataset.has_flagged
+            self._held = DevicePixels(self.train_dataset.frames, masks, self.device, has_flagged=flagged)
+            self._rays = CameraRays(cameras)
 
     def setup_eval(self) -> None:
         """Open the held-out cubes."""
@@ -91,6 +101,10 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """The training batch of ``step``: always the same for the same step, stage and seed."""
         self.train_count += 1
+        if self._held is not None:
+            places = self.train_pixel_sampler.draw(step, self.foreground_share, self.rim_share)
+            indices = torch.from_numpy(places).pin_memory().to(self.device, non_blocking=True)
+            return self._rays(indices), self._held(indices)
         batch = self.train_pixel_sampler.sample(step, self.foreground_share, self.rim_share)
         return self._with_rays(batch, self.train_ray_generator)
 

@@ -121,16 +121,19 @@ class PixelSampler:
     def sample(
         self, step: int, foreground_share: float | None = None, rim_share: float = 0.0
     ) -> dict[str, np.ndarray]:
-        """One batch.
+        """One batch: what `at` returns for the pixels that `draw` draws."""
+        return self.at(self.draw(step, foreground_share, rim_share))
+
+    def draw(
+        self, step: int, foreground_share: float | None = None, rim_share: float = 0.0
+    ) -> Int[np.ndarray, "count 3"]:
+        """The pixels (frame, line, sample) of one batch.
 
         Args:
             step: training step.
             foreground_share: share of the pixels drawn from the foreground, in [0, 1], the others from the rest of
                 the frames; ``None`` draws evenly from whole frames.
             rim_share: share of those others that is drawn from the foreground's rim.
-
-        Returns:
-            What `at` returns.
 
         Raises:
             InputError: pixels of the foreground, or of the rest, are asked for, and there are none.
@@ -160,7 +163,7 @@ class PixelSampler:
             if in_rim > 0:
                 drawn.append(self._rim[rng.integers(0, len(self._rim), in_rim)])
             flat = np.concatenate(drawn)
-        return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
+        return np.stack(np.unravel_index(flat, self.masks.shape), axis=1)
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
         """Given pixels (frame, line, sample).

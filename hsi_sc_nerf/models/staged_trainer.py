@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -17,6 +18,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf.data.atomic import write_json
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
     find_checkpoint,
@@ -42,6 +44,9 @@ from hsi_sc_nerf.models.training_log import stage_summary
 from hsi_sc_nerf.models.training_progress import TrainingProgress
 from hsi_sc_nerf.models.weight_average import WeightAverage
 
+_GPU_PROGRESS_STEPS = 16
+"""On a GPU the progress bar is brought up to date once in so many steps: each time, the GPU is waited for."""
+
 
 @dataclass
 class StagedTrainerConfig(TrainerConfig):
@@ -60,6 +65,8 @@ class StagedTrainerConfig(TrainerConfig):
     """Evaluate the held-out views at the end of each stage and keep the result beside the stage's checkpoint."""
     max_nonfinite_steps: int = 20
     """Stop the run after this many skipped steps in a row."""
+    capture_steps: bool = True
+    """On a GPU, launch a step's forward and backward pass as one CUDA graph."""
 
 
 class StagedTrainer(Trainer):
@@ -94,10 +101,15 @@ class StagedTrainer(Trainer):
         self._loaded: Path | None = None
         self._completed: str | None = None
         self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
+        self._captured: CapturedSteps | None = None
         try:
             super().setup(test_mode)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        on_gpu = self.pipeline.device.type == "cuda"
+        plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
+        if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
+            self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimisers that skip non-finite steps, and the average of what they change."""
@@ -106,6 +118,11 @@ class StagedTrainer(Trainer):
             group: [parameter for parameter in parameters if parameter.requires_grad]
             for group, parameters in optimizers.parameters.items()
         }
+        if self.pipeline.device.type == "cuda":
+            for optimizer in optimizers.optimizers.values():
+                for group in optimizer.param_groups:
+                    # One pass over the hash grid's tables, in place of one for each operation of a step of Adam.
+                    group.update(fused=True, foreach=False)
         if self.config.ema_decay is not None:
             learned = {name: value for name, value in self.pipeline.named_parameters() if value.requires_grad}
             self.pipeline.weight_average = WeightAverage(learned, self.config.ema_decay)
@@ -145,12 +162,15 @@ class StagedTrainer(Trainer):
             self._enter(stage)
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
         rates = self._set_learning_rates(stage, step)
-        torch.manual_seed(step_seed(self.config.machine.seed, step))
         sampler = self._model.proposal_sampler
         # Evaluations and the viewer move these counters, too, and no checkpoint of nerfstudio's holds them.
         sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
-        loss, loss_dict, metrics_dict = super().train_iteration(step)
+        torch.manual_seed(step_seed(self.config.machine.seed, step))
+        if self._captured is None:
+            loss, loss_dict, metrics_dict = super().train_iteration(step)
+        else:
+            loss, loss_dict, metrics_dict = self._captured_iteration(self._captured, step)
 
         self._steps_since_update = sampler._steps_since_update + 1
         if self.pipeline.weight_average is not None:
@@ -161,8 +181,23 @@ class StagedTrainer(Trainer):
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for group, rate in rates.items():  # named as nerfstudio names those of its schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
-        self._progress.update(step, stage, float(metrics_dict["psnr"]))
+        if self._captured is None or step % _GPU_PROGRESS_STEPS == 0 or step == stage.end - 1:
+            self._progress.update(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
+
+    def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
+        """What nerfstudio does in a step, its forward and backward pass as a graph."""
+        sampler = self._model.proposal_sampler
+        # As the sampler will say itself, in the steps that are not captured.
+        proposals_learn = sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+        rays, batch = self.pipeline.datamanager.next_train(step)
+        kind = (id(self._stage), frozenset(self._frozen or ()), proposals_learn)
+        seed = partial(torch.manual_seed, step_seed(self.config.machine.seed, step))
+        found = steps(kind, rays, batch, seed)
+        self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
+        if proposals_learn:
+            sampler._steps_since_update = 0
+        return found
 
     def _enter(self, stage: Stage) -> None:
         """Begin, or go on with, ``stage``."""
