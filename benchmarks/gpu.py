@@ -116,7 +116,7 @@ class GpuBenchmark:
             self._guarded("tests", self._tests)
         if session is not None:
             self._guarded("session", lambda: self._wait_for(session))
-        for name, work in (("profile", self._profile), ("train", self._train), ("demo", self._demo)):
+        for name, work in (("demo", self._demo), ("profile", self._profile), ("train", self._train)):
             if name in self.parts:
                 self._guarded(name, work)
         self._say("done")

@@ -30,7 +30,12 @@ def main(data: str, folder: str, method: str) -> None:
         ("eager, pixels from files", ("--capture-steps", "False", *HELD, "False")),
         ("eager, pixels held", ("--capture-steps", "False", *HELD, "True")),
         ("graph, pixels held", ("--capture-steps", "True", *HELD, "True")),
+        ("graph of compiled functions", ("--capture-steps", "True", *HELD, "True")),
     ):
+        if name == "graph of compiled functions":
+            if not ON_GPU:
+                continue
+            _compile_functions()
         trainer = build_trainer(training_config(method, words), job, 4000, Path(folder))
         trainer._progress = TrainingProgress(4000, 0)
         trainer.pipeline.train()
@@ -52,6 +57,7 @@ def main(data: str, folder: str, method: str) -> None:
             _profile(trainer, device)
         if name == "eager, pixels held" and device == "cuda":
             _synchronisations(trainer)
+        print("captured:", trainer._captured is not None, flush=True)
         trainer._captured = None
         del trainer
         if device == "cuda":
@@ -60,6 +66,14 @@ def main(data: str, folder: str, method: str) -> None:
 
 
 HELD = ("--pipeline.datamanager.hold-on-gpu",)
+
+
+def _compile_functions() -> None:
+    """Let torch.compile fuse what the hash grid is made of."""
+    from hsi_sc_nerf.fields import hash_grid
+
+    for name in ("_corner_rows", "_corner_weights", "_slopes", "_scatter_to_table"):
+        setattr(hash_grid, name, torch.compile(getattr(hash_grid, name)))
 
 
 def _wait(device: str) -> None:

@@ -8,6 +8,7 @@ could not be composited group by group.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -53,8 +54,9 @@ def composite_band_groups(
     weights = weights_of_depths(optical_depths)
     parts = zip(spectra.split(tuple(sizes), dim=-1), weights.split(1, dim=-1), strict=True)
     composited = torch.cat([torch.sum(weight * part, dim=-2) for part, weight in parts], dim=-1)
-    repeats = torch.tensor(sizes, device=weights.device)
-    return composited, weights.sum(dim=-2).repeat_interleave(repeats, dim=-1, output_size=sum(sizes))
+    opacities = weights.sum(dim=-2).split(1, dim=-1)
+    by_band = [opacity.expand(*opacity.shape[:-1], size) for opacity, size in zip(opacities, sizes, strict=True)]
+    return composited, torch.cat(by_band, dim=-1)
 
 
 class BandGroupSum(nn.Module):
@@ -104,7 +106,7 @@ class BandGroupField(SpectralField):
 
     def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
         groups = hidden[..., : len(self.group_sizes)]
-        return (groups - torch.tensor(float(groups.shape[-1])).log()).logsumexp(dim=-1, keepdim=True)
+        return groups.logsumexp(dim=-1, keepdim=True) - math.log(groups.shape[-1])
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
         """Mean density, and the groups' densities followed by the geometry features."""

@@ -165,6 +165,8 @@ class FusedHashEncoding(HashEncoding):
 
     def pytorch_fwd(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs features"]:
         """Encode points in [0, 1]^3."""
+        # nerfstudio leaves them where they were made, and brings them to the device each time.
+        self.scalings = self.scalings.to(in_tensor.device)
         flat = interpolate_hash_grid(in_tensor.reshape(-1, 3), self.hash_table, self.scalings, self.hash_table_size)
         return flat.reshape(*in_tensor.shape[:-1], flat.shape[1])
 

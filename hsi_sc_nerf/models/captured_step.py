@@ -25,12 +25,19 @@ _WARM_UP_PASSES = 3
 """Passes before a capture: libraries set themselves up in the first ones."""
 
 
+def forward_pass(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
+    """Loss, terms and metrics of a batch, without any transfer between host and device."""
+    # nerfstudio makes some tensors on the host to bring them to the device: these are made there.
+    with torch.device(model.device):
+        outputs = model(rays)
+        metrics = model.get_metrics_dict(outputs, dict(batch))
+        losses = model.get_loss_dict(outputs, dict(batch), metrics)
+        return functools.reduce(torch.add, losses.values()), losses, metrics
+
+
 def run_step(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
     """Forward and backward pass; gradients are left in the parameters."""
-    outputs = model(rays)
-    metrics = model.get_metrics_dict(outputs, dict(batch))
-    losses = model.get_loss_dict(outputs, dict(batch), metrics)
-    loss = functools.reduce(torch.add, losses.values())
+    loss, losses, metrics = forward_pass(model, rays, batch)
     loss.backward()
     detached = ({name: value.detach() for name, value in values.items()} for values in (losses, metrics))
     return (loss.detach(), *detached)  # type: ignore[return-value]

@@ -195,7 +195,8 @@ class SpectralModel(NerfactoModel):
             spectral = spectral + behind * (1.0 - opacity)
         # A basis can go below black by a little.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
-        outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
+        # An index of numbers would be a transfer to the device, for which that has to wait.
+        outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:

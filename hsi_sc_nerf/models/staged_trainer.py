@@ -193,7 +193,13 @@ class StagedTrainer(Trainer):
         rays, batch = self.pipeline.datamanager.next_train(step)
         kind = (id(self._stage), frozenset(self._frozen or ()), proposals_learn)
         seed = partial(torch.manual_seed, step_seed(self.config.machine.seed, step))
-        found = steps(kind, rays, batch, seed)
+        try:
+            found = steps(kind, rays, batch, seed)
+        except RuntimeError as error:
+            CONSOLE.print(f"[yellow]Steps are launched one operation at a time: {escape(str(error))}")
+            self._captured = None
+            seed()
+            return super().train_iteration(step)
         self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
         if proposals_learn:
             sampler._steps_since_update = 0
