@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -22,7 +24,7 @@ def opacity_crossing_depth(
     """
     optical = torch.cumsum(densities * edges.diff(dim=-1), dim=-1)
     optical = torch.cat([torch.zeros_like(optical[:, :1]), optical], dim=-1)
-    wanted = -torch.log1p(torch.tensor(-level, dtype=optical.dtype, device=optical.device))
+    wanted = -math.log1p(-level)
     after = (optical < wanted).sum(dim=-1, keepdim=True).clamp(1, densities.shape[-1])
     before = after - 1
     collected = optical.gather(1, before)

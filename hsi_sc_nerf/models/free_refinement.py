@@ -51,7 +51,7 @@ class FreeRefinement(PoseRefinement):
         return matrices[..., :3], positions + matrices[..., 3]
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
-        """Mean sizes of the corrections, for the logs; nerfstudio's would fetch them from the device in every step."""
+        """Mean sizes of the corrections, for the logs; nerfstudio fetches them from the device each step."""
         shifts, turns = self.pose_adjustment.detach().split(3, dim=1)
         metrics_dict["camera_opt_translation"] = shifts.norm(dim=-1).mean()
         metrics_dict["camera_opt_rotation"] = turns.norm(dim=-1).mean()
