@@ -159,12 +159,17 @@ def select_pixels(
     """
     if mask is None:
         return values.reshape(-1, values.shape[-1])
+    check_mask(values, mask)
+    return values[mask]
+
+
+def check_mask(values: Float[Tensor, "*pixels bands"], mask: Bool[Tensor, "*pixels"]) -> None:
+    """Raise ValueError where the mask is not boolean, or its shape is not that of the pixels."""
     if mask.dtype != torch.bool or mask.shape != values.shape[:-1]:
         raise ValueError(
             f"a mask for spectra of shape {tuple(values.shape)} is boolean with shape {tuple(values.shape[:-1])}, "
             f"not {mask.dtype} with shape {tuple(mask.shape)}"
         )
-    return values[mask]
 
 
 def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | None = None) -> Float[Tensor, ""]:
@@ -173,5 +178,10 @@ def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | 
     Raises:
         ValueError: the mask is not boolean, or its shape is not that of the values.
     """
-    selected = widen(select_pixels(values[..., None], mask))
-    return narrow(selected.sum() / max(selected.numel(), 1), values)
+    if mask is None:
+        wide = widen(values)
+        return narrow(wide.sum() / max(wide.numel(), 1), values)
+    check_mask(values[..., None], mask)
+    # To pick the selected values, a GPU would have to tell how many they are and be waited for.
+    selected = widen(torch.where(mask, values, 0.0))
+    return narrow(selected.sum() / mask.sum().clamp_min(1), values)

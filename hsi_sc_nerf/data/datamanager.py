@@ -16,6 +16,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
+from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler, spread_over
@@ -33,6 +34,9 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     """Rays of an evaluation step during training."""
     seed: int = 0
     """Seed of the random pixels."""
+    hold_on_gpu: bool = True
+    """Keep the training cubes in GPU memory if they fill at most half of what is free there. Otherwise, and without a
+    GPU, every batch is read from the files."""
     # Pixels are read from the cubes on disk one by one, so these options of nerfstudio have no effect.
     camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
     images_on_gpu: tyro.conf.Suppress[bool] = False
@@ -73,7 +77,7 @@ class SpectralDataset(InputDataset):
 
 
 class SpectralDataManager(VanillaDataManager[SpectralDataset]):
-    """Random pixels of the cubes on disk; only the masks are kept in memory.
+    """Random pixels of the cubes on disk; only the masks are kept in memory, and the cubes if they fit on a GPU.
 
     Attributes:
         foreground_ray_fraction: fraction of the training rays that hit the foreground; None for whole frames. The
@@ -90,7 +94,13 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_train(self) -> None:
         """Open the training cubes."""
         self.train_pixel_sampler = self._pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        cameras = self.train_dataset.cameras.to(self.device)
+        self.train_ray_generator = RayGenerator(cameras)
+        self._held: DevicePixels | None = None
+        if self.config.hold_on_gpu and fits_on_gpu(self.train_dataset.frames, torch.device(self.device)):
+            masks, flagged = self.train_pixel_sampler.masks, self.train_dataset.has_flagged
+            self._held = DevicePixels(self.train_dataset.frames, masks, self.device, has_flagged=flagged)
+            self._rays = CameraRays(cameras)
 
     def setup_eval(self) -> None:
         """Open the held-out cubes."""
@@ -111,6 +121,10 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """The training batch of ``step``: the same for the same step, stage and seed."""
         self.train_count += 1
+        if self._held is not None:
+            pixels = self.train_pixel_sampler.draw(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
+            indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)
+            return self._rays(indices), self._held(indices)
         batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
         return self._with_rays(batch, self.train_ray_generator)
 

@@ -103,9 +103,9 @@ class _Interpolate(torch.autograd.Function):
 
 def _corner_rows(lower_cell: Int[Tensor, "n levels 3"], table_size: int) -> Int[Tensor, "n_x_levels 8"]:
     """Row in the table of each corner of the cells (Müller et al. 2022, Eq. 4)."""
-    primes = torch.tensor(_HASH_PRIMES, dtype=torch.int32, device=lower_cell.device)
-    near = lower_cell * primes
-    x, y, z = torch.stack([near, near + primes]).unbind(dim=-1)  # (2, n, levels) each
+    # A tensor of the primes would be a transfer to the device, for which that has to wait.
+    near = [axis * prime for axis, prime in zip(lower_cell.unbind(dim=-1), _HASH_PRIMES, strict=True)]
+    x, y, z = ((axis, axis + prime) for axis, prime in zip(near, _HASH_PRIMES, strict=True))  # (n, levels) each
     offsets = torch.arange(lower_cell.shape[1], dtype=torch.int32, device=lower_cell.device) * table_size
     xy = [x[i] ^ y[j] for i in (0, 1) for j in (0, 1)]
     corners = torch.stack([pair ^ z[k] for pair in xy for k in (0, 1)], dim=-1)
@@ -165,6 +165,8 @@ class FusedHashEncoding(HashEncoding):
 
     def pytorch_fwd(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs features"]:
         """Encode points in [0, 1]^3."""
+        # nerfstudio leaves them where they were made, and brings them to the device each time.
+        self.scalings = self.scalings.to(in_tensor.device)
         flat = interpolate_hash_grid(in_tensor.reshape(-1, 3), self.hash_table, self.scalings, self.hash_table_size)
         return flat.reshape(*in_tensor.shape[:-1], flat.shape[1])
 

@@ -8,6 +8,8 @@ channels are coefficients of a spectral basis, linear so that they can be compos
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RaySamples
@@ -173,7 +175,7 @@ class BandGroupField(SpectralField):
 
     def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
         groups = hidden[..., : len(self.group_sizes)]
-        return (groups - torch.tensor(float(groups.shape[-1])).log()).logsumexp(dim=-1, keepdim=True)
+        return groups.logsumexp(dim=-1, keepdim=True) - math.log(groups.shape[-1])
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
         """Mean density, and the groups' densities followed by the geometry features."""

@@ -18,8 +18,8 @@ def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
     """Names of the tensors that contain an infinity or a NaN."""
     if not values:
         return []
-    # The sum of a tensor is finite only if all its elements are. Stacking the sums needs one transfer from the GPU.
-    sums = torch.stack([value.detach().float().sum() for value in values.values()])
+    # The sum of magnitudes is finite only if all elements are; one transfer from the GPU for all.
+    sums = torch.stack(torch._foreach_norm([value.detach().float() for value in values.values()], 1))
     return [name for name, finite in zip(values, torch.isfinite(sums).tolist(), strict=True) if not finite]
 
 

@@ -267,6 +267,12 @@ class FreeRefinement(PoseRefinement):
         matrices = exp_map_SO3xR3(self.interpolation @ self.pose_adjustment)[frames]
         return matrices[..., :3], positions + matrices[..., 3]
 
+    def get_metrics_dict(self, metrics_dict: dict) -> None:
+        """Mean sizes of the corrections, for the logs, left on the GPU."""
+        shifts, turns = self.pose_adjustment.detach().split(3, dim=1)
+        metrics_dict["camera_opt_translation"] = shifts.norm(dim=-1).mean()
+        metrics_dict["camera_opt_rotation"] = turns.norm(dim=-1).mean()
+
     def penalty(self) -> Float[Tensor, ""]:
         """nerfstudio's: mean lengths of the shifts (scene units) and turns (radians)."""
         shifts, turns = self.pose_adjustment.split(3, dim=1)

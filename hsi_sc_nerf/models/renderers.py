@@ -100,8 +100,9 @@ def composite_band_groups(
     weights = weights_of_depths(optical_depths)
     groups = zip(spectra.split(tuple(sizes), dim=-1), weights.split(1, dim=-1), strict=True)
     composited = torch.cat([torch.sum(weight * spectrum, dim=-2) for spectrum, weight in groups], dim=-1)
-    repeats = torch.tensor(sizes, device=weights.device)
-    return composited, weights.sum(dim=-2).repeat_interleave(repeats, dim=-1, output_size=sum(sizes))
+    opacities = weights.sum(dim=-2).split(1, dim=-1)
+    by_band = [opacity.expand(*opacity.shape[:-1], size) for opacity, size in zip(opacities, sizes, strict=True)]
+    return composited, torch.cat(by_band, dim=-1)
 
 
 def weights_of_depths(optical_depths: Float[Tensor, "*rays samples groups"]) -> Float[Tensor, "*rays samples groups"]:

@@ -264,7 +264,8 @@ class SpectralModel(NerfactoModel):
             spectral = spectral + background * (1.0 - opacity)
         # Coefficients of a basis may decode to slightly negative reflectance.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
-        outputs["rgb"] = outputs["spectral"][..., self.rgb_bands]
+        # An index of numbers would be a transfer to the device, for which that has to wait.
+        outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
 
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:

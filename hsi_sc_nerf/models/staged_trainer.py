@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -17,6 +18,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
     find_checkpoint,
@@ -39,6 +41,9 @@ from hsi_sc_nerf.models.stages import (
 )
 from hsi_sc_nerf.models.training_log import TrainingProgress, stage_summary
 
+_GPU_PROGRESS_STEPS = 16
+"""On a GPU the progress bar is brought up to date once in so many steps: each time, the GPU is waited for."""
+
 
 @dataclass
 class StagedTrainerConfig(TrainerConfig):
@@ -53,6 +58,8 @@ class StagedTrainerConfig(TrainerConfig):
     """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
     max_nonfinite_steps: int = 20
     """Number of consecutive skipped steps that stops the run."""
+    capture_steps: bool = True
+    """On a GPU, launch a step's forward and backward pass as one CUDA graph."""
 
 
 class StagedTrainer(Trainer):
@@ -85,10 +92,15 @@ class StagedTrainer(Trainer):
         self._loaded: Path | None = None
         self._completed: str | None = None
         self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
+        self._captured: CapturedSteps | None = None
         try:
             super().setup(test_mode)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        on_gpu = self.pipeline.device.type == "cuda"
+        plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
+        if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
+            self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimisers that skip non-finite steps."""
@@ -97,6 +109,11 @@ class StagedTrainer(Trainer):
             group: [parameter for parameter in parameters if parameter.requires_grad]
             for group, parameters in optimizers.parameters.items()
         }
+        if self.pipeline.device.type == "cuda":
+            for optimizer in optimizers.optimizers.values():
+                for group in optimizer.param_groups:
+                    # One pass over the hash grid's tables, in place of one for each operation of a step of Adam.
+                    group.update(fused=True, foreach=False)
         return optimizers
 
     @property
@@ -133,12 +150,15 @@ class StagedTrainer(Trainer):
             self._enter(stage)
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
         rates = self._set_learning_rates(stage, step)
-        torch.manual_seed(step_seed(self.config.machine.seed, step))
         sampler = self._model.proposal_sampler
         # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
         sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
-        loss, loss_dict, metrics_dict = super().train_iteration(step)
+        torch.manual_seed(step_seed(self.config.machine.seed, step))
+        if self._captured is None:
+            loss, loss_dict, metrics_dict = super().train_iteration(step)
+        else:
+            loss, loss_dict, metrics_dict = self._captured_iteration(self._captured, step)
 
         self._steps_since_update = sampler._steps_since_update + 1
         warning = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
@@ -147,8 +167,29 @@ class StagedTrainer(Trainer):
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for group, rate in rates.items():  # under the names of nerfstudio's own schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
-        self._progress.update(step, stage, float(metrics_dict["psnr"]))
+        if self._captured is None or step % _GPU_PROGRESS_STEPS == 0 or step == stage.end - 1:
+            self._progress.update(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
+
+    def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
+        """What nerfstudio does in a step, its forward and backward pass as a graph."""
+        sampler = self._model.proposal_sampler
+        # As the sampler will say itself, in the steps that are not captured.
+        proposals_learn = sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+        rays, batch = self.pipeline.datamanager.next_train(step)
+        kind = (id(self._stage), frozenset(self._frozen or ()), proposals_learn)
+        seed = partial(torch.manual_seed, step_seed(self.config.machine.seed, step))
+        try:
+            found = steps(kind, rays, batch, seed)
+        except RuntimeError as error:
+            CONSOLE.print(f"[yellow]Steps are launched one operation at a time: {escape(str(error))}")
+            self._captured = None
+            seed()
+            return super().train_iteration(step)
+        self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
+        if proposals_learn:
+            sampler._steps_since_update = 0
+        return found
 
     def _enter(self, stage: Stage) -> None:
         """Set the rays and loss weights of ``stage``."""

@@ -105,7 +105,13 @@ class PixelSampler:
     def sample(
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
     ) -> dict[str, np.ndarray]:
-        """One batch.
+        """One batch: what `at` returns for the pixels that `draw` draws."""
+        return self.at(self.draw(step, foreground_ray_fraction, boundary_ray_fraction))
+
+    def draw(
+        self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
+    ) -> Int[np.ndarray, "count 3"]:
+        """The pixels (frame, line, sample) of one batch.
 
         Args:
             step: training step.
@@ -114,9 +120,6 @@ class PixelSampler:
             boundary_ray_fraction: fraction of the background pixels drawn from within ``BOUNDARY_PX`` of the
                 foreground, in [0, 1].
 
-        Returns:
-            As `at`.
-
         Raises:
             InputError: the batch needs foreground or background pixels and the masks have none.
         """
@@ -124,7 +127,7 @@ class PixelSampler:
         count = self.num_rays_per_batch
         if foreground_ray_fraction is None:
             flat = rng.integers(0, self.masks.size, count)
-            return self.at(np.stack(np.unravel_index(flat, self.masks.shape), axis=1))
+            return np.stack(np.unravel_index(flat, self.masks.shape), axis=1)
         in_foreground = round(count * foreground_ray_fraction)
         if in_foreground > 0 and len(self._foreground) == 0:
             raise InputError(
@@ -146,7 +149,7 @@ class PixelSampler:
         ]
         if on_boundary > 0:
             drawn.append(self._boundary[rng.integers(0, len(self._boundary), on_boundary)])
-        return self.at(np.stack(np.unravel_index(np.concatenate(drawn), self.masks.shape), axis=1))
+        return np.stack(np.unravel_index(np.concatenate(drawn), self.masks.shape), axis=1)
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
         """The given pixels (frame, line, sample).

@@ -5,6 +5,8 @@ Lengths are in scene units. Depths are distances from a ray's origin.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -90,7 +92,7 @@ def opacity_crossing_depth(
         tensor([1.6931])
     """
     optical_depth = functional.pad(torch.cumsum(densities * edges.diff(dim=-1), dim=-1), (1, 0))
-    target = -torch.log1p(torch.tensor(-level, dtype=densities.dtype, device=densities.device))
+    target = -math.log1p(-level)
     after = (optical_depth < target).sum(dim=-1, keepdim=True).clamp(1, densities.shape[-1])
     before = after - 1
     collected = optical_depth.gather(1, before)

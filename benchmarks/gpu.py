@@ -1,0 +1,352 @@
+"""Everything that only a GPU can tell, in one run of some minutes: tests, the demo, and a session of full size.
+
+    python benchmarks/gpu.py --output-dir /tmp/gpu --csv benchmarks/results/gpu.csv
+
+Parts run one after the other, each in processes of its own, and a part that fails costs only its own rows. The
+session (60 noisy views of the simulated pear, 512 x 512 x 204) is made by all cores while the tests run. Rows are
+written as they come. Neither Open3D nor pycolmap is needed: `gpu_stand_ins` takes their place where they are missing.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+STAND_INS = ROOT / "benchmarks" / "gpu_stand_ins"
+COLUMNS = (
+    *("part", "configuration", "step", "scene", "frames", "size_px", "stage", "iterations", "train_seconds"),
+    *("ms_per_iteration", "setup_seconds", "evaluation_seconds", "sam", "rmse", "ssim", "psnr", "full_psnr"),
+    *("gpu_memory_mib", "process_memory_mib", "held_out_views", "note", "seed", "device", "torch", "commit"),
+)
+METRICS = ("sam", "rmse", "ssim", "psnr")
+STEPS = {"graph": "", "eager": "--capture-steps False"}
+"""How a step is launched, and the words that say so."""
+PLUGIN = {
+    "NERFSTUDIO_METHOD_CONFIGS": "hsi-sc-nerf=hsi_sc_nerf.config:hsi_sc_nerf,"
+    "hsi-sc-nerf-paper=hsi_sc_nerf.config:hsi_sc_nerf_paper",
+    "NERFSTUDIO_DATAPARSER_CONFIGS": "hsi-sc-nerf-data=hsi_sc_nerf.data.dataparser:hsi_sc_nerf_dataparser",
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: ``NAME:STEP:SECONDS``, or ``NAME:STEP:ITERATIONSi``."""
+
+    configuration: str
+    step: str
+    seconds: float | None
+    iterations: int | None
+
+    @classmethod
+    def parse(cls, text: str) -> Run:
+        """From the command line."""
+        name, step, length = text.split(":")
+        if length.endswith("i"):
+            return cls(name, step, None, int(length[:-1]))
+        return cls(name, step, float(length), None)
+
+
+@dataclass
+class GpuBenchmark:
+    """Run the parts."""
+
+    output_dir: Path
+    """For logs and everything that is made."""
+    csv: Path
+    """Rows are added here."""
+    commit: str = ""
+    """Of the code; found out where it is not given."""
+    parts: tuple[str, ...] = ("tests", "demo", "session", "profile", "train")
+    """Which parts."""
+    scene: str = "pear"
+    """Of the session."""
+    frames: int = 60
+    """Of the session."""
+    size: int = 512
+    """Width and height of its frames, pixels."""
+    bands: int = 204
+    """Of its frames."""
+    demo_size: int = 128
+    """Of the demo, which has 36 frames."""
+    demo_iterations: int = 500
+    """Of the demo."""
+    runs: tuple[str, ...] = (
+        "ours:graph:600i",
+        "ours:graph:60",
+        "ours:graph:150",
+        "ours:eager:300i",
+        "paper:graph:300i",
+        "paper:graph:60",
+    )
+    """Trainings, CONFIGURATION:STEP:SECONDS or CONFIGURATION:STEP:ITERATIONSi. For the seconds, an earlier run of
+    the same configuration and step tells how long an iteration takes."""
+    checkpoints: tuple[float, ...] = (0.34, 0.67)
+    """Shares of a run of given seconds at which it is evaluated."""
+    held_out_views: int | None = None
+    """Evaluate this many of the held-out views; None for all."""
+    words: str = ""
+    """More words for every training, as after `ns-train hsi-sc-nerf`."""
+    limit_seconds: float = 540.0
+    """No part begins after so many."""
+    _started: float = field(default_factory=time.perf_counter, init=False)
+    _seconds_of: dict[tuple[str, str], float] = field(default_factory=dict, init=False)
+
+    def main(self) -> None:
+        """Run all parts."""
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        self.output_dir, self.csv = self.output_dir.resolve(), self.csv.resolve()
+        self._say(f"device {self._facts()['device']}, torch {self._facts()['torch']}")
+        session: subprocess.Popen | None = None
+        if "session" in self.parts:
+            session = self._start_session()
+        if "tests" in self.parts:
+            self._guarded("tests", self._tests)
+        if session is not None:
+            self._guarded("session", lambda: self._wait_for(session))
+        for name, work in (("demo", self._demo), ("profile", self._profile), ("train", self._train)):
+            if name in self.parts:
+                self._guarded(name, work)
+        self._say("done")
+
+    def _say(self, text: str) -> None:
+        print(f"[{time.perf_counter() - self._started:6.1f} s] {text}", flush=True)
+
+    def _guarded(self, name: str, work: Callable[[], None]) -> None:
+        if time.perf_counter() - self._started > self.limit_seconds:
+            self._say(f"{name}: left out, there is no time left")
+            return
+        self._say(f"{name} ...")
+        try:
+            work()
+        except Exception as error:
+            self._say(f"{name} FAILED: {error!r}")
+            self._row(part=name, note=f"failed: {error}"[:300])
+
+    def _facts(self) -> dict[str, str]:
+        import torch
+
+        if not self.commit:
+            found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+            self.commit = found.stdout.strip() or "unknown"
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+        return {"device": device, "torch": torch.__version__, "commit": self.commit, "seed": "0"}
+
+    def _row(self, **values: Any) -> None:
+        self.csv.parent.mkdir(parents=True, exist_ok=True)
+        new = not self.csv.exists()
+        shown = {key: f"{value:.5g}" if isinstance(value, float) else value for key, value in values.items()}
+        with self.csv.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if new:
+                writer.writeheader()
+            writer.writerow(shown | self._facts())
+        self._say("  " + ", ".join(f"{key} {value}" for key, value in shown.items() if value not in ("", None)))
+
+    def _environment(self) -> dict[str, str]:
+        environment = os.environ | PLUGIN | {"PYTHONUNBUFFERED": "1", "PYTHONWARNINGS": "ignore"}
+        places = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+        try:
+            missing = importlib.util.find_spec("open3d") is None
+        except ImportError:
+            missing = True
+        if missing:
+            places.append(str(STAND_INS))
+        environment["PYTHONPATH"] = os.pathsep.join(place for place in places if place)
+        return environment
+
+    def _command(self, name: str, words: list[str], timeout: float) -> float:
+        """Run a command into a log; seconds that it took."""
+        log = self.output_dir / f"{name}.log"
+        started = time.perf_counter()
+        with log.open("wb") as file:
+            done = subprocess.run(
+                words, stdout=file, stderr=subprocess.STDOUT, env=self._environment(), cwd=ROOT, timeout=timeout
+            )
+        if done.returncode != 0:
+            tail = log.read_text(encoding="utf-8", errors="replace")[-2500:]
+            print(tail, flush=True)
+            raise RuntimeError(f"{name} ended with status {done.returncode}")
+        return time.perf_counter() - started
+
+    def _tests(self) -> None:
+        """The tests that have a CUDA case; others are left out, and so are files that need what is not there."""
+        files = [
+            str(path)
+            for path in sorted((ROOT / "tests").glob("test_*.py"))
+            if "cuda" in path.read_text(encoding="utf-8") and "fake_cuda" not in path.name
+        ]
+        words = [sys.executable, "-m", "pytest", "-q", "-k", "cuda", "--numprocesses", "4", *files]
+        try:
+            seconds = self._command("tests", words, 240.0)
+        finally:
+            log = (self.output_dir / "tests.log").read_text(encoding="utf-8", errors="replace")
+            lines = [line for line in log.splitlines() if line.startswith(("FAILED", "ERROR")) or " in " in line]
+            print("\n".join(lines[-25:]), flush=True)
+        self._row(part="tests", train_seconds=seconds, note=log.strip().splitlines()[-1].strip("= "))
+
+    def _demo(self) -> None:
+        """The demo's steps; its iterations and scene are the command's own where nothing else is asked for."""
+        folder = self.output_dir / "demo"
+        words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "demo", "--output-dir", str(folder)]
+        words += ["--scene", str(self._demo_scene()), "--iterations", str(self.demo_iterations)]
+        try:
+            self._command("demo", words, 240.0)
+        except RuntimeError:
+            for log in sorted((folder / "logs").glob("*.log")):
+                print(f"--- {log.name}\n{log.read_text(encoding='utf-8', errors='replace')[-1500:]}", flush=True)
+            raise
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        metrics = summary["metrics"]
+        common = {"part": "demo", "configuration": "ours", "step": "graph", "scene": "pear", "frames": 36}
+        for cost in summary["steps"]:
+            self._row(
+                **common,
+                size_px=self.demo_size,
+                stage=cost["name"],
+                train_seconds=cost["seconds"],
+                process_memory_mib=cost["peak_memory_mib"],
+            )
+        self._row(
+            **common,
+            size_px=self.demo_size,
+            stage="all",
+            iterations=self.demo_iterations,
+            train_seconds=summary["seconds"],
+            note=f"F-score at 2 mm {metrics['f_score']:.2f} %",
+            **{name: metrics[name] for name in METRICS},
+        )
+
+    def _demo_scene(self) -> Path | str:
+        if self.demo_size == 128:
+            return "pear"
+        shipped = (ROOT / "hsi_sc_nerf/simulate/scenes/pear.yaml").read_text(encoding="utf-8")
+        path = self.output_dir / "pear.yaml"
+        path.write_text(shipped.replace("size_px: 128", f"size_px: {self.demo_size}"), encoding="utf-8")
+        return path
+
+    def _start_session(self) -> subprocess.Popen:
+        words = [sys.executable, str(ROOT / "benchmarks" / "gpu_session.py"), str(self._data.parent)]
+        words += ["--scene", self.scene, "--frames", str(self.frames), "--size", str(self.size)]
+        words += ["--bands", str(self.bands)]
+        with (self.output_dir / "session.log").open("wb") as log:
+            return subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, env=self._environment(), cwd=ROOT)
+
+    def _wait_for(self, session: subprocess.Popen) -> None:
+        try:
+            status = session.wait(timeout=300.0)
+        except subprocess.TimeoutExpired:
+            session.kill()
+            raise
+        log = (self.output_dir / "session.log").read_text(encoding="utf-8", errors="replace")
+        print(log[-1500:], flush=True)
+        if status != 0:
+            raise RuntimeError("the session could not be made")
+        told = "; ".join(line for line in log.splitlines() if line.startswith(("simulated", "processed")))
+        self._row(part="session", scene=self.scene, frames=self.frames, size_px=self.size, note=told)
+
+    @property
+    def _data(self) -> Path:
+        return self.output_dir / f"{self.scene}-{self.size}-{self.frames}" / "data"
+
+    def _profile(self) -> None:
+        script = str(ROOT / "benchmarks" / "gpu_profile.py")
+        for name, words in (("ours", ["hsi-sc-nerf"]),):
+            folder = str(self.output_dir / "profile")
+            self._command(f"profile-{name}", [sys.executable, script, str(self._data), folder, *words], 150.0)
+            log = (self.output_dir / f"profile-{name}.log").read_text(encoding="utf-8", errors="replace")
+            for line in log.splitlines():
+                if line.startswith("ROW "):
+                    self._row(part="profile", configuration=name, **json.loads(line[4:]))
+            print(log[-6000:] if name == "ours" else log[-2500:], flush=True)
+
+    def _train(self) -> None:
+        for number, text in enumerate(self.runs):
+            with self._going_on(text):
+                self._train_one(number, Run.parse(text))
+
+    @contextmanager
+    def _going_on(self, text: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self._say(f"{text} FAILED: {error!r}")
+            self._row(part="train", note=f"{text} failed: {error}"[:300])
+
+    def _train_one(self, number: int, run: Run) -> None:
+        """One training in a process of its own, as `hsi-sc-nerf benchmark` does it."""
+        import shlex
+
+        sys.path.insert(0, str(ROOT))
+        from hsi_sc_nerf.benchmark.configurations import named_configuration
+
+        key = run.configuration, run.step
+        iterations, checkpoints = run.iterations, ()
+        left = self.limit_seconds - (time.perf_counter() - self._started)
+        if run.seconds is not None:
+            if run.seconds > left:
+                raise RuntimeError(f"there is no time left for {run.seconds:g} s")
+            iterations, checkpoints = int(run.seconds / self._seconds_of[key]), self.checkpoints
+        configuration = named_configuration(run.configuration)
+        job = {
+            "method": configuration.method,
+            "words": [*configuration.words, *STEPS[run.step].split(), *shlex.split(self.words)],
+            "data": str(self._data),
+            "output_dir": str(self.output_dir / f"run-{number}"),
+            "iterations": iterations,
+            "train_seconds": None,
+            "clock": "wall",
+            "checkpoints": checkpoints,
+            "threads": max(1, (os.cpu_count() or 2) // 2),
+            "held_out_views": self.held_out_views,
+        }
+        job_path, result_path = (self.output_dir / f"{kind}-{number}.json" for kind in ("job", "result"))
+        job_path.write_text(json.dumps(job), encoding="utf-8")
+        self._say(f"{run.configuration}, {run.step}, {iterations} iterations ...")
+        module = "hsi_sc_nerf.evaluation.benchmark.run"
+        words = [sys.executable, "-m", module, str(job_path), str(result_path)]
+        self._command(f"train-{number}-{run.configuration}-{run.step}", words, left + 60.0)
+        result = json.loads(result_path.read_text(encoding="utf-8"))
+        for found in result["checkpoints"]:
+            self._row(
+                part="train",
+                configuration=run.configuration,
+                step=run.step,
+                scene=self.scene,
+                frames=self.frames,
+                size_px=self.size,
+                stage=found["stage"] + (" (end)" if found["ends_stage"] else ""),
+                iterations=found["iteration"],
+                train_seconds=found["train_seconds"],
+                ms_per_iteration=1000.0 * found["train_seconds"] / found["iteration"],
+                setup_seconds=result["setup_seconds"],
+                evaluation_seconds=found["evaluation_seconds"],
+                gpu_memory_mib=found["gpu_memory_mib"],
+                process_memory_mib=found["peak_memory_mib"],
+                held_out_views=self.held_out_views or "all",
+                full_psnr=found["metrics"]["full_psnr"],
+                note=self.words,
+                **{name: found["metrics"][name] for name in METRICS},
+            )
+        last = result["checkpoints"][-1]
+        first = result["checkpoints"][0]
+        # The second half, where libraries and graphs are ready.
+        self._seconds_of[key] = (last["train_seconds"] - first["train_seconds"]) / max(
+            1, last["iteration"] - first["iteration"]
+        )
+
+
+if __name__ == "__main__":
+    tyro.cli(GpuBenchmark).main()

@@ -1,0 +1,43 @@
+"""Casting rays at triangles with embreex."""
+
+from __future__ import annotations
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from open3d.core import Tensor
+
+
+class RaycastingScene:
+    """Triangles at which rays are cast; a ray is (origin, unit direction)."""
+
+    INVALID_ID = 4294967295
+
+    def __init__(self) -> None:
+        self._scene = EmbreeScene(robust=True)
+
+    def add_triangles(self, vertices: Tensor, triangles: Tensor) -> None:
+        """Put a mesh into the scene."""
+        self._kept = np.ascontiguousarray(vertices.array, np.float32), triangles.array.astype(np.int32)
+        self._mesh = TriangleMesh(self._scene, *self._kept)
+
+    def cast_rays(self, rays: Tensor) -> dict[str, Tensor]:
+        """Where rays hit first: the triangle (INVALID_ID for none), barycentric coordinates, distance."""
+        found = self._scene.run(*_split(rays), output=True)
+        triangle = np.where(found["geomID"] < 0, -1, found["primID"]).astype(np.int64) & 0xFFFFFFFF
+        return {
+            "primitive_ids": Tensor(triangle.astype(np.uint32)),
+            "primitive_uvs": Tensor(np.stack([found["u"], found["v"]], axis=-1)),
+            "t_hit": Tensor(found["tfar"]),
+        }
+
+    def test_occlusions(self, rays: Tensor | np.ndarray, tnear: float = 0.0) -> Tensor:
+        """Whether rays hit anything further away than ``tnear`` (metres)."""
+        origins, directions = _split(rays if isinstance(rays, Tensor) else Tensor(rays))
+        hit = self._scene.run(origins + np.float32(tnear) * directions, directions, query="OCCLUDED")
+        return Tensor(np.asarray(hit) == 0)
+
+
+def _split(rays: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(rays.array[:, :3]), np.ascontiguousarray(rays.array[:, 3:])

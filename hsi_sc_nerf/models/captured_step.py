@@ -1,0 +1,132 @@
+"""A training step's forward and backward pass as one CUDA graph.
+
+A step is some thousand small operations. Launched one by one from Python they take several times as long as the GPU
+needs to do them. Captured once, they are launched together: same operations, same random numbers, other rays.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+from torch.nn import Parameter
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.models.spectral_model import SpectralModel
+
+Result = tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]
+"""Loss, its terms, metrics."""
+_WARM_UP_PASSES = 3
+"""Passes before a capture: libraries set themselves up in the first ones."""
+
+
+def forward_pass(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
+    """Loss, terms and metrics of a batch, without any transfer between host and device."""
+    # nerfstudio makes some tensors on the host to bring them to the device: these are made there.
+    with torch.device(model.device):
+        outputs = model(rays)
+        metrics = model.get_metrics_dict(outputs, dict(batch))
+        losses = model.get_loss_dict(outputs, dict(batch), metrics)
+        return functools.reduce(torch.add, losses.values()), losses, metrics
+
+
+def run_step(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
+    """Forward and backward pass; gradients are left in the parameters."""
+    loss, losses, metrics = forward_pass(model, rays, batch)
+    loss.backward()
+    detached = ({name: value.detach() for name, value in values.items()} for values in (losses, metrics))
+    return (loss.detach(), *detached)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, eq=False)
+class _Captured:
+    """A graph, and where its results lie: they hold until a graph is launched again."""
+
+    graph: torch.cuda.CUDAGraph
+    result: Result
+    gradients: tuple[Tensor | None, ...]
+
+
+class CapturedSteps:
+    """Steps by all that makes one step launch other operations than another.
+
+    Args:
+        model: in training.
+        parameters: all that may have a gradient.
+    """
+
+    def __init__(self, model: SpectralModel, parameters: Sequence[Parameter]) -> None:
+        self._model, self._parameters = model, tuple(parameters)
+        self._steps: dict[Hashable, _Captured] = {}
+        self._inputs: dict[str, Tensor] = {}
+        self._pool: Any = None
+        self._anneal = torch.ones((), device=model.device)
+
+    def __call__(
+        self, kind: Hashable, rays: RayBundle, batch: Mapping[str, Tensor], seed: Callable[[], object]
+    ) -> Result:
+        """One forward and backward pass; gradients are set, not added to what was there.
+
+        Args:
+            kind: what else the step's operations depend on: stage, frozen parameters, whether proposals learn. Not
+                the annealing of the proposals, which is handed over by its value.
+            rays: of the batch, all of them with the same parts in every call.
+            batch: tensors on the device, likewise.
+            seed: draws the step's random numbers anew; called before each pass.
+        """
+        sampler = self._model.proposal_sampler
+        anneal, counter = sampler._anneal, sampler._steps_since_update
+        self._anneal.fill_(float(anneal))
+        self._load(rays, batch)
+        if kind not in self._steps:
+            self._steps[kind] = self._capture(seed)
+        sampler._anneal, sampler._steps_since_update = anneal, counter
+        captured = self._steps[kind]
+        seed()
+        captured.graph.replay()
+        for parameter, gradient in zip(self._parameters, captured.gradients, strict=True):
+            parameter.grad = gradient
+        return captured.result
+
+    def _load(self, rays: RayBundle, batch: Mapping[str, Tensor]) -> None:
+        new = {f"rays/{name}": getattr(rays, name) for name in ("origins", "directions", "pixel_area")}
+        new["rays/camera_indices"] = rays.camera_indices
+        new |= {f"metadata/{name}": value for name, value in rays.metadata.items()}
+        new |= {f"batch/{name}": value for name, value in batch.items()}
+        if not self._inputs:
+            self._inputs = {name: value.to(self._model.device, copy=True) for name, value in new.items()}
+        for name, value in new.items():
+            self._inputs[name].copy_(value, non_blocking=True)
+
+    def _pass(self) -> Result:
+        parts: dict[str, dict[str, Tensor]] = {"rays": {}, "metadata": {}, "batch": {}}
+        for name, value in self._inputs.items():
+            kind, _, key = name.partition("/")
+            parts[kind][key] = value
+        for parameter in self._parameters:
+            parameter.grad = None
+        return run_step(self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"])
+
+    def _capture(self, seed: Callable[[], object]) -> _Captured:
+        sampler = self._model.proposal_sampler
+        sampler._anneal = self._anneal  # type: ignore[assignment]
+        counter = sampler._steps_since_update
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(_WARM_UP_PASSES):
+                sampler._steps_since_update = counter
+                seed()
+                self._pass()
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        sampler._steps_since_update = counter
+        with torch.cuda.graph(graph, pool=self._pool):
+            result = self._pass()
+        self._pool = self._pool or graph.pool()
+        return _Captured(graph, result, tuple(parameter.grad for parameter in self._parameters))
