@@ -1,6 +1,6 @@
 """Rigid geometry of a turntable before a camera that stands still: pure functions on NumPy arrays.
 
-Conventions (docs/architecture.md): camera-to-world in OpenGL axes with the object frame as the world, z along
+Conventions (docs/concepts/frames.md): camera-to-world in OpenGL axes with the object frame as the world, z along
 the turntable's axis, metres; pixel coordinates start at the image's upper left corner.
 """
 

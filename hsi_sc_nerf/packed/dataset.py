@@ -1,4 +1,4 @@
-"""The packed dataset on disk (docs/architecture.md): frames, masks and poses, described by ``transforms.json``."""
+"""The packed dataset on disk (docs/reference/files.md): frames, masks and poses, described by ``transforms.json``."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def poses_from_markers(
     Estimated are the focal length, the camera's pose, the axis, one angle per frame and the markers' layout; radial
     lens distortion and small motions of a wobbling table where the images call for them (``select_model``). A few
     displaced frames are left out. Pixels are square. The principal point is the image's centre: one axis hardly
-    determines it (docs/poses.md).
+    determines it (docs/concepts/poses.md).
 
     Args:
         images: one grey image per frame, all of one size, linear in reflectance (a gamma moves every edge).

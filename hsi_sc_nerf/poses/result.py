@@ -36,7 +36,7 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class TurntablePoses:
-    """Poses of all frames in the object frame (docs/architecture.md), and what they rest on.
+    """Poses of all frames in the object frame (docs/concepts/frames.md), and what they rest on.
 
     Rows of frames that are not ``used`` are nan: a frame that cannot be posed is left out, never guessed.
     ``dropped`` says why, by the frame's name. Angles are degrees, counter-clockwise seen from above, relative to the

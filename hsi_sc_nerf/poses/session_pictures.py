@@ -168,7 +168,7 @@ def frame_pictures(
 
     Args:
         cube_path: header of the packed cube; it must exist while pictures are accessed.
-        flags_path: its pixels' flags (docs/architecture.md).
+        flags_path: its pixels' flags (docs/reference/files.md).
         gray: the mean over ``gray_nm``, made when the frame was packed.
         gray_nm: its range.
         extra_nm: further single bands by name; they are not searched for markers.
