@@ -12,7 +12,7 @@ camera are the same. Where the table wobbles, each frame keeps its measured tilt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -55,7 +55,8 @@ class PoseRefinementConfig(CameraOptimizerConfig):
             "free": FreeRefinement,
             "free-discarded": DiscardedRefinement,
         }[mode]
-        return refinement(self, **kwargs)
+        # nerfstudio decides by the mode whether there are parameters.
+        return refinement(replace(self, mode=mode), **kwargs)
 
 
 class PoseRefinement(CameraOptimizer):

@@ -132,7 +132,7 @@ def test_regions_keep_what_lies_in_them_and_the_number_of_points(run, tmp_path):
     assert cloud.spectra.shape == (500, 2)
     assert cloud.points[:, 2].min() > 0.07
     assert np.hypot(cloud.points[:, 0] - 0.01, cloud.points[:, 1] + 0.02).max() < 0.03
-    with pytest.raises(InputError, match="no point of the object lies in the region"):
+    with pytest.raises(InputError, match="no point of the object lies in"):
         export_cloud(run, tmp_path / "none", CloudOptions(num_points=500, roi_box=(1, 1, 1, 2, 2, 2)))
     assert not (tmp_path / "none").exists()
 

@@ -22,7 +22,7 @@ class RaycastingScene:
         self._kept = np.ascontiguousarray(vertices.array, np.float32), triangles.array.astype(np.int32)
         self._mesh = TriangleMesh(self._scene, *self._kept)
 
-    def cast_rays(self, rays: Tensor) -> dict[str, Tensor]:
+    def cast_rays(self, rays: Tensor | np.ndarray) -> dict[str, Tensor]:
         """Where rays hit first: the triangle (INVALID_ID for none), barycentric coordinates, distance."""
         found = self._scene.run(*_split(rays), output=True)
         triangle = np.where(found["geomID"] < 0, -1, found["primID"]).astype(np.int64) & 0xFFFFFFFF
@@ -34,10 +34,11 @@ class RaycastingScene:
 
     def test_occlusions(self, rays: Tensor | np.ndarray, tnear: float = 0.0) -> Tensor:
         """Whether rays hit anything further away than ``tnear`` (metres)."""
-        origins, directions = _split(rays if isinstance(rays, Tensor) else Tensor(rays))
+        origins, directions = _split(rays)
         hit = self._scene.run(origins + np.float32(tnear) * directions, directions, query="OCCLUDED")
         return Tensor(np.asarray(hit) == 0)
 
 
-def _split(rays: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    return np.ascontiguousarray(rays.array[:, :3]), np.ascontiguousarray(rays.array[:, 3:])
+def _split(rays: Tensor | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    array = rays.array if isinstance(rays, Tensor) else np.asarray(rays)
+    return np.ascontiguousarray(array[:, :3]), np.ascontiguousarray(array[:, 3:])
