@@ -112,8 +112,8 @@ def line_chart(
         for index, curve in enumerate(curves):
             colour = _SERIES[(index if curve.colour is None else curve.colour) % len(_SERIES)]
             if curve.spread is not None:
-                edges = (np.maximum(curve.y + side * curve.spread, low) for side in (-1.0, 1.0))
-                band = axes.fill_between(curve.x, *edges)
+                lower, upper = (np.maximum(curve.y + side * curve.spread, low) for side in (-1.0, 1.0))
+                band = axes.fill_between(curve.x, lower, upper)
                 band.remove()  # matplotlib writes a collection as references by identifiers; a patch needs none
                 for path in band.get_paths():
                     axes.add_patch(PathPatch(path, color=colour, alpha=0.22, linewidth=0, gid="band"))
