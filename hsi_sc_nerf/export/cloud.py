@@ -14,7 +14,7 @@ CHUNK_POINTS = 1 << 15
 INCIDENCE = "incidence_deg"
 """Column: the angle between a point's normal and the ray that gave its spectrum."""
 MAX_INCIDENCE_DEG = 70.0
-"""At larger angles of incidence a pixel smears the surface and also covers what lies beside it (docs/how-to/traits.md)."""
+"""At larger angles of incidence a pixel also covers what lies beside the surface (docs/how-to/traits.md)."""
 OUTLIER_NEIGHBOURS = 20
 """Neighbours whose mean distance marks an outlier (released settings of the paper)."""
 

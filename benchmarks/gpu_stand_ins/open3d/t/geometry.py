@@ -29,7 +29,7 @@ class RaycastingScene:
         return {
             "primitive_ids": Tensor(triangle.astype(np.uint32)),
             "primitive_uvs": Tensor(np.stack([found["u"], found["v"]], axis=-1)),
-            "t_hit": Tensor(found["tfar"]),
+            "t_hit": Tensor(np.where(found["geomID"] < 0, np.inf, found["tfar"])),
         }
 
     def test_occlusions(self, rays: Tensor | np.ndarray, tnear: float = 0.0) -> Tensor:
