@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import whitening
+from hsi_sc_nerf.poses.marker_adjustment import whitening
 from hsi_sc_nerf.poses.marker_observations import Rejected
 from hsi_sc_nerf.poses.model_selection import Adjusted, linked_rows, select_model
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, MarkerTurntable

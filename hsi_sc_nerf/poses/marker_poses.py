@@ -13,7 +13,8 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses import object_frame
-from hsi_sc_nerf.poses.bundle_adjustment import MarkerProblem, loop_closure_deg
+from hsi_sc_nerf.poses.bundle_adjustment import loop_closure_deg
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import Rejected, observe, observe_expected

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays, rotation_about_z
-from hsi_sc_nerf.poses.bundle_adjustment import MarkerProblem
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,

@@ -11,7 +11,8 @@ from turntable_scene import MarkerScene
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project, rotation_angle_deg
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, MarkerProblem
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.model_selection import linked_rows
@@ -123,7 +124,7 @@ def test_derivatives_are_those_of_the_residuals(free):
     for row in range(len(observations)):
         own = np.where(columns[row] == layout.motion_size, layout.size, columns[row])
         dense[row, :, own] += values[row].T
-        dense[row, :, layout.landmark[problem.marker[row]]] += by_marker[row].T
+        dense[row, :, layout.landmark[problem.landmark[row]]] += by_marker[row].T
     dense = dense[..., :-1]
     numeric = np.concatenate(
         [
