@@ -14,8 +14,8 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import Scale, lie_on_disc, scale_by_markers, triangulate_markers
-from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_by_markers, triangulate_markers
+from hsi_sc_nerf.poses.result import Scale, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, split_half_error_deg, with_lost_frames

@@ -17,11 +17,10 @@ from hsi_sc_nerf.poses.bundle_adjustment import loop_closure_deg
 from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
-from hsi_sc_nerf.poses.marker_observations import Rejected, observe, observe_expected
+from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.model_selection import Adjusted
-from hsi_sc_nerf.poses.object_frame import Scale
-from hsi_sc_nerf.poses.result import Outlier, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.result import RejectedMarker, Scale, TurntablePoses, Uncertainty
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
@@ -129,7 +128,7 @@ def _check(images, names, info) -> None:
 def _in_object_frame(
     adjusted: Adjusted,
     observations: MarkerObservations,
-    rejected: Sequence[Rejected],
+    rejected: Sequence[RejectedMarker],
     info: SessionInfo,
     found: _Found,
 ) -> TurntablePoses:
@@ -182,7 +181,7 @@ def _in_object_frame(
         warnings=warnings,
         model="turntable" if tilts is None else "free poses",
         wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
-        outliers=tuple(Outlier(found.names[r.frame], r.marker, r.error_px, r.why) for r in rejected),
+        outliers=tuple(rejected),
         scale=_scale(adjusted, covariance, measured_m, info),
         uncertainty=Uncertainty(float(sigmas[0]), float(sigmas[4]), angle_sigmas_deg),
     )
@@ -232,7 +231,7 @@ def _scale(
     )
 
 
-def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[Rejected]) -> dict[str, str]:
+def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[RejectedMarker]) -> dict[str, str]:
     """Why each unused frame is left out: no marker, or what is wrong with most of its markers."""
     reasons: dict[int, Counter[str]] = {}
     for r in rejected:

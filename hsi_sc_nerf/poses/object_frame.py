@@ -5,7 +5,7 @@ Markers determine the disc. The scale comes from the markers' side, or from the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays, rotation_about_z
 from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
+from hsi_sc_nerf.poses.result import Scale
 from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
@@ -28,35 +29,6 @@ _FEWEST_TO_FIND_THE_CENTRE = 3
 # A marker seen in fewer frames, or along rays that are nearly parallel, is not triangulated.
 _FEWEST_VIEWS = 2
 _LEAST_EIGENVALUE = 1e-3
-
-
-@dataclass(frozen=True)
-class Scale:
-    """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
-
-    source: Literal["markers", "container"]
-    marker_side_m: float
-    """As given; as measured against the container where that gives the scale."""
-    uncertainty: float
-    """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
-    marker_sides: dict[int, float]
-    """Each marker's apparent side over the mean of all; empty for a single marker."""
-    marker_side_sigmas: dict[int, float]
-    """Standard deviations of these."""
-    container_diameter_m: float | None
-    """As given."""
-    measured_container_diameter_m: float | None
-    """Of the circle that the upright markers' planes touch; None where there are none.
-
-    A plaque stands off the wall and makes it wider than the container by twice that.
-    """
-
-    @property
-    def disagreement_percent(self) -> float | None:
-        """By how much the container is wider by the markers than as given; None where one is not known."""
-        if self.container_diameter_m is None or self.measured_container_diameter_m is None:
-            return None
-        return 100.0 * (self.measured_container_diameter_m / self.container_diameter_m - 1.0)
 
 
 def object_poses(turntable: MarkerTurntable, disc_m: float) -> Float[np.ndarray, "f 4 4"]:

@@ -93,7 +93,7 @@ def pose_report(poses: TurntablePoses) -> dict:
         "marker_dictionary": poses.dictionary,
         "disc_markers": list(poses.disc_markers),
         "marker_corners_m": {str(m): c.tolist() for m, c in sorted(poses.marker_corners_m.items())},
-        "outliers": [asdict(outlier) for outlier in poses.outliers],
+        "outliers": [asdict(o) | {"frame": poses.names[o.frame]} for o in poses.outliers],
         "warnings": warnings,
     }
 
