@@ -138,10 +138,12 @@ def cross_matrix(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return matrix - np.swapaxes(matrix, -1, -2)
 
 
-def rotation_angle_deg(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:
-    """Angle between the rotations of two poses, degrees (accurate for tiny angles: from the chord, not acos)."""
-    chord = np.linalg.norm(a[:3, :3] - b[:3, :3]) / (2.0 * np.sqrt(2.0))
-    return float(np.rad2deg(2.0 * np.arcsin(min(1.0, chord))))
+def rotation_angle_deg(
+    a: Float[np.ndarray, "*n rows columns"], b: Float[np.ndarray, "*n rows columns"]
+) -> Float[np.ndarray, "*n"]:
+    """Angle between the rotations of two poses or matrices, degrees (from the chord: accurate for tiny angles)."""
+    chord = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
+    return np.rad2deg(2.0 * np.arcsin(np.minimum(1.0, chord)))
 
 
 @dataclass(frozen=True)
