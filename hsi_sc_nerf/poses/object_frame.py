@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays, rotation_about_z
 from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.result import Scale
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable, Turntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
 # in marker sides.
@@ -31,22 +31,17 @@ _FEWEST_VIEWS = 2
 _LEAST_EIGENVALUE = 1e-3
 
 
-def object_poses(turntable: MarkerTurntable, disc_m: float) -> Float[np.ndarray, "f 4 4"]:
-    """Camera-to-world in the object frame (OpenGL axes).
+def to_object_frame(turntable: Turntable, disc: float) -> Float[np.ndarray, "4 4"]:
+    """From the object's axes at the angle 0 to the object frame: a turn about z and a shift along it.
 
     Args:
         turntable: adjusted.
-        disc_m: height of the disc in the turntable frame.
+        disc: height of the disc in the turntable frame, in the turntable's unit of length.
     """
-    to_object = rotation_about_z(-first_azimuth_deg(turntable))
-    to_object[2, 3] = -disc_m
-    return to_object @ turntable.camera_to_world()
-
-
-def first_azimuth_deg(turntable: MarkerTurntable) -> float:
-    """Azimuth of the first frame's camera about the axis, in the object's axes at the angle 0."""
     camera = turntable.camera_positions()[0]
-    return float(np.rad2deg(np.arctan2(camera[1], camera[0])))
+    to_object = rotation_about_z(-float(np.rad2deg(np.arctan2(camera[1], camera[0]))))
+    to_object[2, 3] = -disc
+    return to_object
 
 
 def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:

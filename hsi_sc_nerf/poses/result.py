@@ -81,19 +81,19 @@ class TurntablePoses:
     angles_deg: Float[np.ndarray, "n"]
     reprojection_error_px: Float[np.ndarray, "n"]
     used: Bool[np.ndarray, "n"]
-    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]]
-    dropped: dict[str, str]
-    dictionary: str | None
-    """OpenCV's name; None where the poses rest on no markers."""
-    markers_per_frame: tuple[int, ...]
     overall_error_px: float
-    blur_px: float
-    disc_markers: tuple[int, ...]
-    disc_tilt_deg: float | None
-    loop_closure_deg: float | None
+    markers_per_frame: tuple[int, ...]
+    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]] = field(default_factory=dict)
+    dropped: dict[str, str] = field(default_factory=dict)
+    dictionary: str | None = None
+    """OpenCV's name; None where the poses rest on no markers."""
+    blur_px: float = 0.0
+    disc_markers: tuple[int, ...] = ()
+    disc_tilt_deg: float | None = None
+    loop_closure_deg: float | None = None
     nominal_step_deg: float | None = None
     nominal_direction: Literal["ccw", "cw"] | None = None
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
     chosen: str = ""

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.moving_pixels import moving_pixels
+from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Tracks
 
 if TYPE_CHECKING:
@@ -126,13 +127,7 @@ def neighbour_pairs(frames: int, neighbours_deg: float) -> list[tuple[int, int]]
 @contextmanager
 def _matched(images, names, config, moving) -> Iterator[Path]:
     """A temporary folder with COLMAP's database of features and matches, after checks of the input."""
-    if len(images) != len(names) or len({image.shape for image in images}) > 1:
-        raise ValueError("structure from motion needs images of one size and one name an image")
-    if len(images) < FEWEST_FRAMES:
-        raise InputError(
-            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
-            f"give {FEWEST_FRAMES} or more frames of one session"
-        )
+    check_frames(images, names)
     moving = moving_pixels(images) if moving is None else moving
     if not moving.any():
         raise InputError(

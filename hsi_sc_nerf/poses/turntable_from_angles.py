@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import closest_point_to_rays
-from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, with_lost_frames
 from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project, rotations_about_z
 
 # Starts of the search: the camera's elevation, and its focal length in image widths.
@@ -97,39 +96,6 @@ def turntable_from_angles(
             "take markers"
         )
     return best
-
-
-def adjusted_from_angles(
-    tracks: Tracks,
-    angles_deg: Float[np.ndarray, "n"],
-    size_px: tuple[int, int],
-    *,
-    free_angles: bool,
-    direction_known: bool,
-) -> AdjustedTracks:
-    """The camera before known angles, adjusted; and then the angles too, if they are free.
-
-    Free angles follow uneven steps, but let features that creep over the object bend the turn.
-
-    Args:
-        tracks: points seen in frames.
-        angles_deg: of every frame, also of those without tracks.
-        size_px: width and height of the images.
-        free_angles: adjust the angles, which otherwise are held.
-        direction_known: as in ``turntable_from_angles``.
-
-    Raises:
-        InputError: as ``turntable_from_angles`` and ``adjust_tracks``.
-    """
-    frames = np.unique(tracks.frame)
-    angles_rad = np.deg2rad(angles_deg[frames])
-    start = turntable_from_angles(tracks, frames, angles_rad, size_px, direction_known=direction_known)
-    held = adjust_tracks(start, tracks, free_angles=False)
-    if not free_angles:
-        return held
-    freed = adjust_tracks(held.turntable, tracks)
-    # Frames that the held angles made useless come back at the angle that fits their points.
-    return adjust_tracks(with_lost_frames(freed.turntable, tracks), tracks)
 
 
 def _pairs(tracks, frames, angles_rad):
