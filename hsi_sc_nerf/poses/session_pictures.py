@@ -229,17 +229,18 @@ def _picture(
     return to_8_bit(mean)
 
 
-def read_frames(
+def read_pictures(
     cube_paths: Sequence[Path],
     flags_paths: Sequence[Path],
     grays: Sequence[UInt8[np.ndarray, "h w"]],
     gray_nm: tuple[float, float],
-    extra_nm: Mapping[str, float],
-) -> list[FramePictures]:
-    """``frame_pictures`` of all frames, some at the same time."""
+    feature_nm: float | None,
+) -> SessionPictures:
+    """``frame_pictures`` of all frames; features are measured in the band nearest to ``feature_nm``, if given."""
+    extra_nm = {} if feature_nm is None else {f"{feature_nm:g} nm": feature_nm}
     with ThreadPoolExecutor(_WORKERS) as pool:
         one = partial(frame_pictures, gray_nm=gray_nm, extra_nm=extra_nm)
-        return list(pool.map(one, cube_paths, flags_paths, grays))
+        return SessionPictures(list(pool.map(one, cube_paths, flags_paths, grays)), *extra_nm)
 
 
 def group_means(
