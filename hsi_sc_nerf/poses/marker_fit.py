@@ -1,8 +1,7 @@
 """Sub-pixel marker corners: the marker's known pattern is fitted to the pixels that it covers.
 
-A marker of 20 px has two or three pixels a cell, where refining each corner on its own is biased by the cells beside
-it, and a bias of 0.05 px in its side is 1 mm in the camera's distance. All edges of the pattern together, rendered
-through the pixel's area, give the corners to some hundredths of a pixel, and say how well each is known.
+In small markers, refining each corner on its own is biased by the cells beside it. All edges of the pattern together,
+rendered through the pixel's area, give the corners to some hundredths of a pixel, and their covariance.
 """
 
 from __future__ import annotations
@@ -208,7 +207,7 @@ def _texels_per_cell(corners_px, cells):
 
 @lru_cache(maxsize=64)
 def _texture(dictionary, marker, texels):
-    """The pattern with a white margin of three cells, and its derivatives along u and v (per cell): three channels."""
+    """Three channels: the pattern with a white margin of three cells, and its derivatives by u and v (per cell)."""
     pattern = np.pad(marker_pattern(dictionary, marker), 3, constant_values=1).astype(np.float32)
     texture = np.kron(pattern, np.ones((texels, texels), np.float32))
     derivatives = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (texels / 2) for dx in (1, 0)]

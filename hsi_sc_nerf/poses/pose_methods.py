@@ -114,11 +114,11 @@ def poses_from_known_camera(
     """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
 
     Args:
-        names: the frames' names.
+        names: of the frames.
         size_px: width and height of the images.
-        angles_deg: of each frame, relative to the first, counter-clockwise seen from above.
+        angles_deg: relative to the first frame, counter-clockwise seen from above.
         camera: of the earlier session.
-        info: for the report.
+        info: its nominal step and direction go into the report.
 
     Raises:
         InputError: images of another size than the camera's.

@@ -1,7 +1,7 @@
 """Structure from motion by COLMAP for a turntable: static pixels are masked, neighbours in the turn are matched.
 
-J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (CVPR 2016). Every frame gets a free pose here;
-``turntable_from_poses`` fits one turntable to them.
+J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (CVPR 2016). Every frame gets a pose of its own,
+and ``turntable_from_poses`` fits one turntable to them.
 """
 
 from __future__ import annotations
@@ -103,7 +103,6 @@ def structure_from_motion(
         InputError: nothing moves, or the object has too little texture to pose three frames.
         ValueError: images of different sizes, or not one name per image.
     """
-    config = config or FeatureConfig()
     with _matched(images, names, config, moving) as folder:
         reconstruction = _map(folder)
         if reconstruction is None:
@@ -121,7 +120,7 @@ def matched_tracks(
     Raises:
         InputError, ValueError: as ``structure_from_motion``.
     """
-    with _matched(images, names, config or FeatureConfig(), None) as folder:
+    with _matched(images, names, config, None) as folder:
         tracks = _joined(folder)
     if len(tracks) == 0:
         raise _too_little_texture(names)
@@ -180,7 +179,7 @@ def _matched(images, names, config, moving) -> Iterator[Path]:
         for i, image in enumerate(images):
             cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
         cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
-        _match(folder, len(images), images[0].shape, config)
+        _match(folder, len(images), images[0].shape, config or FeatureConfig())
         yield folder
 
 

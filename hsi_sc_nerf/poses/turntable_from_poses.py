@@ -1,13 +1,11 @@
 """Fit of a turntable (one axis, one angle per frame, a fixed camera) to free poses of single frames.
 
-Structure from motion gives each frame six numbers, where a turntable has one. In its world the object lies still and
-the camera goes round: with B the camera's rotation in the first frame and u the axis, frame i has
+With B the camera's rotation in the first frame and u the axis, frame i has
 
     R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
 
-for the axis stands still before the camera. Both are linear in what is looked for (u, then p and q). The object lies
-about the axis, so q is known well even where a frame's rotation and position are wrong together, as they are where a
-small object is seen from far away.
+for the axis stands still before the camera. Both are linear in the unknowns (u, then p and q). The object lies about
+the axis, so q is known well even where a frame's rotation and position are wrong together.
 """
 
 from __future__ import annotations
