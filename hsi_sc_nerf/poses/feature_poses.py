@@ -116,12 +116,8 @@ def _in_object_frame(
     height, width = images[0].shape
     intrinsics = PinholeIntrinsics(width, height, turntable.focal_px, turntable.focal_px, *turntable.centre_px)
     used = np.isin(np.arange(n), turntable.frames)
-    angles_deg, errors_px, poses = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 4, 4), np.nan)
-    unwrapped_deg = np.rad2deg(np.unwrap(turntable.angles_rad))
-    angles_deg[used], errors_px[used] = unwrapped_deg - unwrapped_deg[0], adjusted.frame_errors_px()
     # The disc's height is not known before the markers are triangulated.
-    to_object = to_object_frame(turntable, 0.0)
-    poses[used] = to_object @ turntable.camera_to_world()
+    poses = turntable.over_session(to_object_frame(turntable, 0.0) @ turntable.camera_to_world(), n)
 
     corners, dictionary, per_frame = _markers(images, info, poses, intrinsics)
     markers = np.array(sorted(corners), dtype=int)
@@ -138,8 +134,8 @@ def _in_object_frame(
         intrinsics=intrinsics,
         distortion=(*turntable.radial, 0.0, 0.0),
         camera_to_world=poses,
-        angles_deg=angles_deg,
-        reprojection_error_px=errors_px,
+        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
+        reprojection_error_px=turntable.over_session(adjusted.frame_errors_px(), n),
         used=used,
         marker_corners_m={m: (c - [0.0, 0.0, disc]) * metres for m, c in corners.items()},
         dropped={names[int(i)]: "it shares too few features with other frames" for i in np.flatnonzero(~used)},

@@ -139,13 +139,9 @@ def _in_object_frame(
     squared_px2 = ((turntable.reproject(observations) - observations.corners_px) ** 2).sum(-1).mean(-1)
     seen = np.bincount(observations.frame, minlength=n)
     used = np.isin(np.arange(n), turntable.frames)
-    angles_deg, angle_sigmas_deg, poses = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 4, 4), np.nan)
-    angles_deg[used] = np.rad2deg(np.unwrap(turntable.angles_rad))
-    angles_deg -= angles_deg[used][0]
-    angle_sigmas_deg[used] = adjusted.angle_sigmas_deg(covariance)
+    angle_sigmas_deg = turntable.over_session(adjusted.angle_sigmas_deg(covariance), n)
     disc_m = object_frame.disc_height_m(turntable)
     to_object = object_frame.to_object_frame(turntable, disc_m)
-    poses[used] = to_object @ turntable.camera_to_world()
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc = object_frame.lie_on_disc(turntable.corners())
     warnings = found.warnings
@@ -158,8 +154,8 @@ def _in_object_frame(
         names=found.names,
         intrinsics=PinholeIntrinsics(*found.size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
         distortion=(*turntable.radial, 0.0, 0.0),
-        camera_to_world=poses,
-        angles_deg=angles_deg,
+        camera_to_world=turntable.over_session(to_object @ turntable.camera_to_world(), n),
+        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
         reprojection_error_px=errors_px,
         used=used,
         marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},

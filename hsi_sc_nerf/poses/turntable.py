@@ -111,6 +111,17 @@ class Turntable:
         poses[:, :3, 3] = self.camera_positions()
         return poses @ OPENCV_TO_OPENGL
 
+    def relative_angles_deg(self) -> Float[np.ndarray, "f"]:
+        """Angles relative to the first frame, unwrapped."""
+        angles_deg = np.rad2deg(np.unwrap(self.angles_rad))
+        return angles_deg - angles_deg[0]
+
+    def over_session(self, values: Float[np.ndarray, "f *shape"], size: int) -> Float[np.ndarray, "n *shape"]:
+        """Values of the turntable's frames as rows of the session's ``size`` frames, nan for the others."""
+        rows = np.full((size, *values.shape[1:]), np.nan)
+        rows[self.frames] = values
+        return rows
+
     def _selected_frames(self, frame: Int[np.ndarray, "n"]) -> Self:
         keep = np.isin(self.frames, frame)
         return replace(
