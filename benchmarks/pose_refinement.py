@@ -33,8 +33,7 @@ from hsi_sc_nerf.cli.demo import DEMO_TRAINING
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.dataparser import scene_scaling
 from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
-from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.geometry.similarity import Similarity
+from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.models.staged_trainer import StagedTrainer, StagedTrainerConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, write_transforms
 from hsi_sc_nerf.processing.process import process_session

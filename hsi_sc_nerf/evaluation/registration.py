@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.geometry.similarity import Similarity
+from hsi_sc_nerf.geometry.camera import Similarity
 
 if TYPE_CHECKING:
     import open3d

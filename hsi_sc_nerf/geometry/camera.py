@@ -1,4 +1,4 @@
-"""Rigid geometry of a turntable before a camera that stands still: pure functions on NumPy arrays.
+"""Cameras, rays, rotations and similarity transformations on NumPy arrays.
 
 Conventions (docs/concepts/frames.md): camera-to-world in OpenGL axes with the object frame as the world, z along
 the turntable's axis, metres; pixel coordinates start at the image's upper left corner.
@@ -6,10 +6,11 @@ the turntable's axis, metres; pixel coordinates start at the image's upper left 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 # Multiplying a camera-to-world pose by this on the right turns OpenCV axes (y down, looking along +z) into
 # OpenGL axes (y up, looking along -z), and back.
@@ -137,7 +138,47 @@ def cross_matrix(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return matrix - np.swapaxes(matrix, -1, -2)
 
 
-def rotation_angle_deg(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:
-    """Angle between the rotations of two poses, degrees (accurate for tiny angles: from the chord, not acos)."""
-    chord = np.linalg.norm(a[:3, :3] - b[:3, :3]) / (2.0 * np.sqrt(2.0))
-    return float(np.rad2deg(2.0 * np.arcsin(min(1.0, chord))))
+def rotation_angle_deg(
+    a: Float[np.ndarray, "*n rows columns"], b: Float[np.ndarray, "*n rows columns"]
+) -> Float[np.ndarray, "*n"]:
+    """Angle between the rotations of two poses or matrices, degrees (from the chord: accurate for tiny angles)."""
+    chord = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
+    return np.rad2deg(2.0 * np.arcsin(np.minimum(1.0, chord)))
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float = 1.0
+    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    translation: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The points moved."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def after(self, first: Similarity) -> Similarity:
+        """The transformation that does ``first`` and then this."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self(first.translation[None])[0])
+
+    def inverse(self) -> Similarity:
+        """The transformation back."""
+        back = self.rotation.T / self.scale
+        return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
+
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """As a homogeneous matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    @classmethod
+    def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> Similarity:
+        """Of a homogeneous matrix that is a similarity."""
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+
+    def turn_deg(self) -> float:
+        """Angle of the rotation, degrees."""
+        return float(np.rad2deg(Rotation.from_matrix(self.rotation).magnitude()))

@@ -10,16 +10,17 @@ from jaxtyping import Float, UInt8
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import Scale, lie_on_disc, scale_by_markers, triangulate_markers
-from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_by_markers, to_object_frame, triangulate_markers
+from hsi_sc_nerf.poses.result import Scale, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig, matched_tracks, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, split_half_error_deg, with_lost_frames
-from hsi_sc_nerf.poses.turntable_from_angles import adjusted_from_angles
+from hsi_sc_nerf.poses.turntable import Tracks
+from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 
 LARGEST_SPLIT_HALF_DEG = 0.3
@@ -56,8 +57,7 @@ def poses_from_colmap(
             "turntable; take images of more pixels, show markers, or give the angles"
         )
     start = fit.turntable(free.points_3d, free.focal_px, free.centre_px)
-    adjusted = adjust_tracks(start, free.tracks)
-    adjusted = adjust_tracks(with_lost_frames(adjusted.turntable, free.tracks), free.tracks)
+    adjusted = _with_lost_frames(adjust_tracks(start, free.tracks), free.tracks)
     return _in_object_frame(adjusted, images, names, info, "colmap")
 
 
@@ -78,7 +78,8 @@ def poses_from_angles(
         angles_deg: of each frame, relative to the first; positive counter-clockwise where the direction is known.
         info: as in ``poses_from_colmap``.
         config: settings.
-        free_angles: adjust the angles too, which must be right to about a degree.
+        free_angles: adjust the angles too, which follows uneven steps, but lets features that creep over the object
+            bend the turn; they must be right to about a degree.
 
     Raises:
         InputError: too little texture, or features that contradict the angles.
@@ -86,10 +87,19 @@ def poses_from_angles(
     pictures = SessionPictures.of(images)
     tracks = matched_tracks(pictures.named(pictures.features), names, config)
     height, width = images[0].shape
-    adjusted = adjusted_from_angles(
-        tracks, angles_deg, (width, height), free_angles=free_angles, direction_known=info.direction is not None
+    frames = np.unique(tracks.frame)
+    start = turntable_from_angles(
+        tracks, frames, np.deg2rad(angles_deg[frames]), (width, height), direction_known=info.direction is not None
     )
+    adjusted = adjust_tracks(start, tracks, free_angles=False)
+    if free_angles:
+        adjusted = _with_lost_frames(adjust_tracks(adjusted.turntable, tracks), tracks)
     return _in_object_frame(adjusted, images, names, info, "angles", free_angles=free_angles)
+
+
+def _with_lost_frames(adjusted: AdjustedTracks, tracks: Tracks) -> AdjustedTracks:
+    """Adjusted once more with the frames that were lost so far."""
+    return adjust_tracks(with_lost_frames(adjusted.turntable, tracks), tracks)
 
 
 def _in_object_frame(
@@ -106,19 +116,14 @@ def _in_object_frame(
     height, width = images[0].shape
     intrinsics = PinholeIntrinsics(width, height, turntable.focal_px, turntable.focal_px, *turntable.centre_px)
     used = np.isin(np.arange(n), turntable.frames)
-    angles_deg, errors_px, poses = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 4, 4), np.nan)
-    unwrapped_deg = np.rad2deg(np.unwrap(turntable.angles_rad))
-    angles_deg[used], errors_px[used] = unwrapped_deg - unwrapped_deg[0], adjusted.frame_errors_px()
-    # The object frame is the object as it stands in the first frame.
-    turn = rotation_about_z(float(unwrapped_deg[0]))
-    poses[used] = turn @ turntable.camera_to_world()
-    points_3d = turntable.points_3d @ turn[:3, :3].T
+    # The disc's height is not known before the markers are triangulated.
+    poses = turntable.over_session(to_object_frame(turntable, 0.0) @ turntable.camera_to_world(), n)
 
     corners, dictionary, per_frame = _markers(images, info, poses, intrinsics)
     markers = np.array(sorted(corners), dtype=int)
     on_disc = lie_on_disc(np.array([corners[m] for m in markers.tolist()]).reshape(-1, 4, 3))
     disc_markers = tuple(markers[on_disc].tolist())
-    disc = float(np.percentile(points_3d[:, 2], LOWEST_POINTS_PERCENTILE))
+    disc = float(np.percentile(turntable.points_3d[:, 2], LOWEST_POINTS_PERCENTILE))
     if disc_markers:
         disc = float(np.median([corners[m][:, 2].mean() for m in disc_markers]))
     scale, metres = scale_by_markers(corners, disc, info)
@@ -129,17 +134,15 @@ def _in_object_frame(
         intrinsics=intrinsics,
         distortion=(*turntable.radial, 0.0, 0.0),
         camera_to_world=poses,
-        angles_deg=angles_deg,
-        reprojection_error_px=errors_px,
+        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
+        reprojection_error_px=turntable.over_session(adjusted.frame_errors_px(), n),
         used=used,
         marker_corners_m={m: (c - [0.0, 0.0, disc]) * metres for m, c in corners.items()},
         dropped={names[int(i)]: "it shares too few features with other frames" for i in np.flatnonzero(~used)},
         dictionary=dictionary,
         markers_per_frame=per_frame,
         overall_error_px=adjusted.overall_error_px,
-        blur_px=0.0,
         disc_markers=disc_markers,
-        disc_tilt_deg=None,
         loop_closure_deg=adjusted.loop_closure_deg(),
         nominal_step_deg=info.nominal_step_deg,
         nominal_direction=info.direction,

@@ -1,8 +1,7 @@
 """Sub-pixel marker corners: the marker's known pattern is fitted to the pixels that it covers.
 
-A marker of 20 px has two or three pixels a cell, where refining each corner on its own is biased by the cells beside
-it, and a bias of 0.05 px in its side is 1 mm in the camera's distance. All edges of the pattern together, rendered
-through the pixel's area, give the corners to some hundredths of a pixel, and say how well each is known.
+In small markers, refining each corner on its own is biased by the cells beside it. All edges of the pattern together,
+rendered through the pixel's area, give the corners to some hundredths of a pixel, and their covariance.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ _MARGIN_CELLS = 0.7
 _BLUR_MARGIN = 1.5
 _LEAST_MARGIN_CELLS = 0.2
 # The pattern's edges are ramps one texel wide: half a pixel, where a cell has more than a few pixels.
-_TEXELS_A_PIXEL = 2.0
-_TEXELS_A_CELL = (8, 16, 32)
+_TEXELS_PER_PX = 2.0
+_TEXELS_PER_CELL = (8, 16, 32)
 _ITERATIONS = 12
 _CONVERGED_PX = 3e-3
 # A fit explains the pixels when what it leaves is below this fraction of their variance.
@@ -85,13 +84,13 @@ def fit_marker(
     local = (np.stack([columns, rows], -1) + first + 0.5 - centre) / extent
     homography = _homography((corners_px - centre) / extent, cells)
     footprint = _Footprint.of(corners_px, cells, blur_px, first, inside.shape, centre, extent)
-    texture = _texture(dictionary, marker, _texels_a_cell(corners_px, cells))
-    unit_corners = cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    texture = _texture(dictionary, marker, _texels_per_cell(corners_px, cells))
+    unit_corners = _unit_square(cells).astype(float)
     corners = corners_px
     shading = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
     robust = np.ones(len(local))
     for _ in range(_ITERATIONS):
-        rendered, slope = (part[inside] for part in _render(footprint, homography, texture))
+        rendered, by_homography = (part[inside] for part in _render(footprint, homography, texture))
         design = np.concatenate([shading, shading * rendered[:, None]], -1)
         root = np.sqrt(robust)[:, None]
         # Cholesky's factor of the 6 x 6 Gram matrix: as good as QR for these columns, and many times faster.
@@ -106,7 +105,7 @@ def fit_marker(
         if residual @ residual > _HOPELESS_UNEXPLAINED * np.sum((weighted - weighted.mean()) ** 2):
             return None
         white_over_black = shading @ (back @ (basis.T @ weighted))[3:]
-        jacobian = root * white_over_black[:, None] * slope
+        jacobian = root * white_over_black[:, None] * by_homography
         jacobian = jacobian - basis @ (basis.T @ jacobian)
         information = jacobian.T @ jacobian
         try:
@@ -114,14 +113,14 @@ def fit_marker(
         except np.linalg.LinAlgError:
             return None
         homography = homography + step
-        before = corners
+        previous = corners
         corners = _corners(homography, unit_corners) * extent + centre
         if not np.isfinite(corners).all() or np.abs(corners - corners_px).max() > largest_shift_px:
             return None
         raw = residual / root[:, 0]
         sigma = 1.4826 * np.median(np.abs(raw)) + 1e-6
         robust = np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(np.abs(raw), 1e-12))
-        if np.abs(corners - before).max() < _CONVERGED_PX:
+        if np.abs(corners - previous).max() < _CONVERGED_PX:
             break
     # Quantised to 8 bit, no pixel is known better than 1/sqrt(12) of a level.
     variance = max(float(residual @ residual) / max(len(local) - 14, 1), 1.0 / 12.0)
@@ -184,35 +183,35 @@ class _Footprint:
         side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
         narrowest_cell = quad_area(corners_px) / side.max() / cells
         # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
-        a_pixel = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
+        samples_per_px = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
         if blur_px > 0:
-            a_pixel = int(np.clip(np.ceil(2.5 / blur_px), 1, a_pixel))
+            samples_per_px = int(np.clip(np.ceil(2.5 / blur_px), 1, samples_per_px))
         margin = int(np.ceil(_BLUR_REACH * blur_px))
         axes = []
         for start, size, middle in zip(first, shape[::-1], centre, strict=True):
-            samples = start - margin + (np.arange((size + 2 * margin) * a_pixel) + 0.5) / a_pixel
-            away = samples - (start + np.arange(size) + 0.5)[:, None]
+            samples = start - margin + (np.arange((size + 2 * margin) * samples_per_px) + 0.5) / samples_per_px
+            offset = samples - (start + np.arange(size) + 0.5)[:, None]
             if blur_px > 0:
-                weight = ndtr((away + 0.5) / blur_px) - ndtr((away - 0.5) / blur_px)
+                weight = ndtr((offset + 0.5) / blur_px) - ndtr((offset - 0.5) / blur_px)
             else:
-                weight = (np.abs(away) < 0.5).astype(float)
+                weight = (np.abs(offset) < 0.5).astype(float)
             weight /= weight.sum(axis=1, keepdims=True)
             axes.append(((samples - middle) / extent, weight.astype(np.float32)))
         return _Footprint(axes[0][0], axes[1][0], axes[0][1], axes[1][1])
 
 
-def _texels_a_cell(corners_px, cells):
-    texels_a_cell = _TEXELS_A_PIXEL * np.sqrt(quad_area(corners_px)) / cells
-    return min(_TEXELS_A_CELL, key=lambda texels: abs(np.log(texels / texels_a_cell)))
+def _texels_per_cell(corners_px, cells):
+    texels_per_cell = _TEXELS_PER_PX * np.sqrt(quad_area(corners_px)) / cells
+    return min(_TEXELS_PER_CELL, key=lambda texels: abs(np.log(texels / texels_per_cell)))
 
 
 @lru_cache(maxsize=64)
 def _texture(dictionary, marker, texels):
-    """The pattern with a white margin of three cells, and its slopes along u and v (a cell), as three channels."""
+    """Three channels: the pattern with a white margin of three cells, and its derivatives by u and v (per cell)."""
     pattern = np.pad(marker_pattern(dictionary, marker), 3, constant_values=1).astype(np.float32)
     texture = np.kron(pattern, np.ones((texels, texels), np.float32))
-    slopes = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (texels / 2) for dx in (1, 0)]
-    return cv2.merge([texture, *slopes]), np.float32(texels)
+    derivatives = [cv2.Sobel(texture, cv2.CV_32F, dx, 1 - dx, ksize=1) * (texels / 2) for dx in (1, 0)]
+    return cv2.merge([texture, *derivatives]), np.float32(texels)
 
 
 def _render(footprint, homography, texture):
@@ -239,13 +238,13 @@ def _render(footprint, homography, texture):
     du *= inverse_d
     dv *= inverse_d
     over_x, over_y = footprint.over_x.T, footprint.over_y
-    slope = np.empty((len(over_y), over_x.shape[1], 9))
+    jacobian = np.empty((len(over_y), over_x.shape[1], 9))
     for k, derivative in enumerate((du, dv, -(du * u + dv * v))):
         along_x = derivative @ np.concatenate([over_x, over_x * x[:, None]], axis=1)
         total, by_x = np.split(over_y @ along_x, 2, axis=1)
-        slope[..., 3 * k], slope[..., 3 * k + 2] = by_x, total
-        slope[..., 3 * k + 1] = (over_y * y) @ along_x[:, : over_x.shape[1]]
-    return (over_y @ (rendered @ over_x)).astype(float), slope[..., :8]
+        jacobian[..., 3 * k], jacobian[..., 3 * k + 2] = by_x, total
+        jacobian[..., 3 * k + 1] = (over_y * y) @ along_x[:, : over_x.shape[1]]
+    return (over_y @ (rendered @ over_x)).astype(float), jacobian[..., :8]
 
 
 def _corners(homography, unit_corners):
@@ -257,10 +256,10 @@ def _corners(homography, unit_corners):
 def _corner_jacobian(homography, unit_corners):
     """Derivatives of the corners (x0, y0, x1, ...) by the homography, which keeps their cells where they are."""
     h = np.append(homography, 1.0).reshape(3, 3)
-    slopes = []
+    jacobian = []
     for (x, y), (u, v) in zip(_corners(homography, unit_corners), unit_corners, strict=True):
         d = h[2] @ [x, y, 1.0]
         by_pixel = (h[:2, :2] - np.outer([u, v], h[2, :2])) / d
         by_h = np.array([[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]) / d
-        slopes.append(-np.linalg.solve(by_pixel, by_h))
-    return np.concatenate(slopes)
+        jacobian.append(-np.linalg.solve(by_pixel, by_h))
+    return np.concatenate(jacobian)

@@ -21,6 +21,7 @@ from scipy.optimize import minimize_scalar
 
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers
 from hsi_sc_nerf.poses.marker_fit import FittedMarker, fit_marker, quad_area
+from hsi_sc_nerf.poses.result import RejectedMarker
 from hsi_sc_nerf.poses.session_pictures import FramePictures, SessionPictures
 from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
@@ -48,22 +49,12 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
-class Rejected:
-    """A marker in a frame that is not used: its error where it was measured, and the reason."""
-
-    frame: int
-    marker: int
-    error_px: float | None
-    why: str
-
-
-@dataclass(frozen=True)
 class Observed:
     """Markers of all frames, the blur of each frame's best picture, and markers whose pattern was not fitted."""
 
     observations: MarkerObservations
     blur_px: Float[np.ndarray, "frames"]
-    unexplained: tuple[Rejected, ...]
+    unexplained: tuple[RejectedMarker, ...]
 
 
 def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progress: bool) -> Observed:
@@ -97,7 +88,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
     rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
     why = "its pattern does not explain the pixels: hidden, blurred or misread"
     unexplained = tuple(
-        Rejected(i, m, None, why) for i, found in enumerate(fitted) for m, fit in found if fit is None
+        RejectedMarker(i, m, None, why) for i, found in enumerate(fitted) for m, fit in found if fit is None
     )
     of_best = np.array([blur[frame.ranking[0]] for blur, frame in zip(blurs_px, frames, strict=True)])
     return Observed(_observations(rows), of_best, unexplained)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import whitening
-from hsi_sc_nerf.poses.marker_observations import Rejected
+from hsi_sc_nerf.poses.marker_adjustment import whitening
 from hsi_sc_nerf.poses.model_selection import Adjusted, linked_rows, select_model
+from hsi_sc_nerf.poses.result import RejectedMarker
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, MarkerTurntable
 
 DISPLACED = "object, table or camera was displaced in this frame"
@@ -26,7 +26,7 @@ _ROUNDS = 4
 _LARGEST_ANGLE_SIGMA_DEG = 0.5
 
 
-def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[Rejected], list[int]]:
+def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[RejectedMarker], list[int]]:
     """Observations of markers that turn, are seen in two frames or more, and link their frames.
 
     Returns:
@@ -55,7 +55,7 @@ def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[Rejected]
 
 def adjust_without_outliers(
     start: MarkerTurntable, observations: MarkerObservations
-) -> tuple[Adjusted, MarkerObservations, list[Rejected]]:
+) -> tuple[Adjusted, MarkerObservations, list[RejectedMarker]]:
     """Select a model, adjust it, reject outliers, and repeat until nothing changes.
 
     A rejected observation comes back where a better model explains it; a displaced frame does not. Frames and markers
@@ -95,7 +95,7 @@ def adjust_without_outliers(
 
 def without_uncertain_frames(
     adjusted: Adjusted, observations: MarkerObservations
-) -> tuple[Adjusted, MarkerObservations, list[Rejected]]:
+) -> tuple[Adjusted, MarkerObservations, list[RejectedMarker]]:
     """Leave out frames whose markers hardly determine an angle: too small, too slanted or too noisy.
 
     Raises:
@@ -149,11 +149,11 @@ def _linked(observations: MarkerObservations) -> Bool[np.ndarray, "n"]:
 
 def _rejected(
     observations: MarkerObservations, why: str, errors_px: Float[np.ndarray, "n"] | None = None
-) -> list[Rejected]:
+) -> list[RejectedMarker]:
     errors_px = np.full(len(observations), np.nan) if errors_px is None else errors_px
     rows = zip(observations.frame.tolist(), observations.marker.tolist(), errors_px.tolist(), strict=True)
-    return [Rejected(f, m, e if np.isfinite(e) else None, why) for f, m, e in rows]
+    return [RejectedMarker(f, m, e if np.isfinite(e) else None, why) for f, m, e in rows]
 
 
-def _rejected_frames(observations: MarkerObservations, errors_px: dict[int, float]) -> list[Rejected]:
+def _rejected_frames(observations: MarkerObservations, errors_px: dict[int, float]) -> list[RejectedMarker]:
     return _rejected(observations, DISPLACED, np.array([errors_px[f] for f in observations.frame.tolist()]))

@@ -11,16 +11,17 @@ from jaxtyping import Float, UInt8
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.poses import object_frame
-from hsi_sc_nerf.poses.bundle_adjustment import MarkerProblem, loop_closure_deg
+from hsi_sc_nerf.poses.bundle_adjustment import loop_closure_deg
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
-from hsi_sc_nerf.poses.marker_observations import Rejected, observe, observe_expected
+from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.model_selection import Adjusted
-from hsi_sc_nerf.poses.object_frame import Scale
-from hsi_sc_nerf.poses.result import Outlier, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.result import RejectedMarker, Scale, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
@@ -68,7 +69,8 @@ def poses_from_markers(
         >>> poses = poses_from_markers(images, [f"frame_{i:03d}" for i in range(len(images))], info)
         >>> poses.camera_to_world.shape  # (frames, 4, 4), metres
     """
-    _check(images, names, info)
+    check_frames(images, names)
+    _check_scale(info)
     dictionary = info.marker_dictionary or find_dictionary(images)
     observed = observe(images, dictionary, progress) if dictionary else None
     if dictionary is None or observed is None or len(observed.observations) == 0:
@@ -106,9 +108,7 @@ def poses_from_markers(
     return _in_object_frame(adjusted, kept, rejected, info, found)
 
 
-def _check(images, names, info) -> None:
-    if len(images) != len(names) or len({image.shape for image in images}) > 1:
-        raise ValueError("poses_from_markers: needs images of one size and one name an image")
+def _check_scale(info: SessionInfo) -> None:
     if info.marker_side_m is None and info.container_diameter_m is None:
         raise InputError(
             "nothing gives the scale; give marker_side_m, the side of the markers' black square in metres, or "
@@ -118,17 +118,12 @@ def _check(images, names, info) -> None:
         raise InputError(
             f"marker_side_m is {info.marker_side_m}; give the side of the markers' black square in metres"
         )
-    if len(images) < FEWEST_FRAMES:
-        raise InputError(
-            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
-            f"give {FEWEST_FRAMES} or more frames of one session"
-        )
 
 
 def _in_object_frame(
     adjusted: Adjusted,
     observations: MarkerObservations,
-    rejected: Sequence[Rejected],
+    rejected: Sequence[RejectedMarker],
     info: SessionInfo,
     found: _Found,
 ) -> TurntablePoses:
@@ -144,14 +139,10 @@ def _in_object_frame(
     squared_px2 = ((turntable.reproject(observations) - observations.corners_px) ** 2).sum(-1).mean(-1)
     seen = np.bincount(observations.frame, minlength=n)
     used = np.isin(np.arange(n), turntable.frames)
-    angles_deg, angle_sigmas_deg, poses = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 4, 4), np.nan)
-    angles_deg[used] = np.rad2deg(np.unwrap(turntable.angles_rad))
-    angles_deg -= angles_deg[used][0]
-    angle_sigmas_deg[used] = adjusted.angle_sigmas_deg(covariance)
+    angle_sigmas_deg = turntable.over_session(adjusted.angle_sigmas_deg(covariance), n)
     disc_m = object_frame.disc_height_m(turntable)
-    poses[used] = object_frame.object_poses(turntable, disc_m)
-    to_object = rotation_about_z(-object_frame.first_azimuth_deg(turntable))[:3, :3]
-    corners = (turntable.corners() - [0.0, 0.0, disc_m]) @ to_object.T
+    to_object = object_frame.to_object_frame(turntable, disc_m)
+    corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc = object_frame.lie_on_disc(turntable.corners())
     warnings = found.warnings
     if not on_disc.any():
@@ -163,8 +154,8 @@ def _in_object_frame(
         names=found.names,
         intrinsics=PinholeIntrinsics(*found.size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
         distortion=(*turntable.radial, 0.0, 0.0),
-        camera_to_world=poses,
-        angles_deg=angles_deg,
+        camera_to_world=turntable.over_session(to_object @ turntable.camera_to_world(), n),
+        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
         reprojection_error_px=errors_px,
         used=used,
         marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},
@@ -181,7 +172,7 @@ def _in_object_frame(
         warnings=warnings,
         model="turntable" if tilts is None else "free poses",
         wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
-        outliers=tuple(Outlier(found.names[r.frame], r.marker, r.error_px, r.why) for r in rejected),
+        outliers=tuple(rejected),
         scale=_scale(adjusted, covariance, measured_m, info),
         uncertainty=Uncertainty(float(sigmas[0]), float(sigmas[4]), angle_sigmas_deg),
     )
@@ -231,7 +222,7 @@ def _scale(
     )
 
 
-def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[Rejected]) -> dict[str, str]:
+def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[RejectedMarker]) -> dict[str, str]:
     """Why each unused frame is left out: no marker, or what is wrong with most of its markers."""
     reasons: dict[int, Counter[str]] = {}
     for r in rejected:

@@ -1,18 +1,15 @@
 """The simplest turntable model that explains the markers: without or with lens distortion, without or with wobble.
 
-A model with more parameters always leaves smaller residuals. It is selected where an F-test on the weighted sums of
-squares shows that chance alone would hardly lower them as much. The unit of the test is the corners' variance as the
-richer model's residuals tell it, and at least that of the corners' fit. The level is strict, for errors of
-neighbouring corners are not quite independent.
-
-A table that wobbles does so in many frames. Where only a few frames call for motions of their own, the object, the
-table or the camera was displaced in these frames, and they are left out.
+A model with more parameters is selected where an F-test on the weighted sums of squares rejects the simpler one. The
+variance is that of the richer model's residuals, and at least that of the corners' fit. Where only a few frames call
+for motions of their own, the object, the table or the camera was displaced in them, and they are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,11 +17,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import f as f_distribution
 
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, MarkerProblem
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
 
 LOSS_SIGMAS = 3.0
 """Whitened residuals beyond this many standard deviations count by their size, not its square."""
+# Strict, for errors of neighbouring corners are not quite independent.
 _LEVEL = 1e-6
 # A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
 _FIRST_SPREAD = (0.02, 0.01)
@@ -98,7 +97,7 @@ def select_model(start: MarkerTurntable, observations: MarkerObservations) -> Ad
         start: a turntable that has the frames and markers of the observations.
         observations: marker corners.
     """
-    solve = _solver(observations)
+    solve = partial(_solve, observations)
     steady, wobbling = _steady(start, solve)
     if wobbling is None:
         return steady
@@ -157,13 +156,10 @@ def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np
     return label[f] == np.argmax(counts)
 
 
-def _solver(observations: MarkerObservations) -> _Solve:
-    def solve(turntable: MarkerTurntable, free: FreeParameters) -> Adjusted:
-        problem = MarkerProblem(turntable, observations, LOSS_SIGMAS, free)
-        adjusted = problem.minimise(turntable)
-        return Adjusted(adjusted, problem, problem.cost(adjusted))
-
-    return solve
+def _solve(observations: MarkerObservations, turntable: MarkerTurntable, free: FreeParameters) -> Adjusted:
+    problem = MarkerProblem(turntable, observations, LOSS_SIGMAS, free)
+    adjusted = problem.minimise(turntable)
+    return Adjusted(adjusted, problem, problem.cost(adjusted))
 
 
 def _steady(start: MarkerTurntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
@@ -183,7 +179,7 @@ def _without_displaced_frames(start: MarkerTurntable, observations: MarkerObserv
         rest = observations.without_frames(frames)
         if not linked_rows(rest.frame, rest.marker).all():
             return None, None
-        return _steady(start.restricted(rest), _solver(rest))
+        return _steady(start.restricted(rest), partial(_solve, rest))
 
     # Displaced frames bend a turntable that is fitted to them: judge by one without the likeliest.
     likeliest = start.frames[np.sort(np.argsort(frame_motions(start, observations).p_value, kind="stable")[:most])]

@@ -5,7 +5,7 @@ Markers determine the disc. The scale comes from the markers' side, or from the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays, rotation_about_z
-from hsi_sc_nerf.poses.bundle_adjustment import MarkerProblem
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
+from hsi_sc_nerf.poses.result import Scale
+from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable, Turntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
 # in marker sides.
@@ -30,51 +31,17 @@ _FEWEST_VIEWS = 2
 _LEAST_EIGENVALUE = 1e-3
 
 
-@dataclass(frozen=True)
-class Scale:
-    """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
-
-    source: Literal["markers", "container"]
-    marker_side_m: float
-    """As given; as measured against the container where that gives the scale."""
-    uncertainty: float
-    """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
-    marker_sides: dict[int, float]
-    """Each marker's apparent side over the mean of all; empty for a single marker."""
-    marker_side_sigmas: dict[int, float]
-    """Standard deviations of these."""
-    container_diameter_m: float | None
-    """As given."""
-    measured_container_diameter_m: float | None
-    """Of the circle that the upright markers' planes touch; None where there are none.
-
-    A plaque stands off the wall and makes it wider than the container by twice that.
-    """
-
-    @property
-    def disagreement_percent(self) -> float | None:
-        """By how much the container is wider by the markers than as given; None where one is not known."""
-        if self.container_diameter_m is None or self.measured_container_diameter_m is None:
-            return None
-        return 100.0 * (self.measured_container_diameter_m / self.container_diameter_m - 1.0)
-
-
-def object_poses(turntable: MarkerTurntable, disc_m: float) -> Float[np.ndarray, "f 4 4"]:
-    """Camera-to-world in the object frame (OpenGL axes).
+def to_object_frame(turntable: Turntable, disc: float) -> Float[np.ndarray, "4 4"]:
+    """From the object's axes at the angle 0 to the object frame: a turn about z and a shift along it.
 
     Args:
         turntable: adjusted.
-        disc_m: height of the disc in the turntable frame.
+        disc: height of the disc in the turntable frame, in the turntable's unit of length.
     """
-    to_object = rotation_about_z(-first_azimuth_deg(turntable))
-    to_object[2, 3] = -disc_m
-    return to_object @ turntable.camera_to_world()
-
-
-def first_azimuth_deg(turntable: MarkerTurntable) -> float:
-    """Azimuth of the first frame's camera about the axis, in the object's axes at the angle 0."""
     camera = turntable.camera_positions()[0]
-    return float(np.rad2deg(np.arctan2(camera[1], camera[0])))
+    to_object = rotation_about_z(-float(np.rad2deg(np.arctan2(camera[1], camera[0]))))
+    to_object[2, 3] = -disc
+    return to_object
 
 
 def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:

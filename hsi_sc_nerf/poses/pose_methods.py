@@ -114,11 +114,11 @@ def poses_from_known_camera(
     """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
 
     Args:
-        names: the frames' names.
+        names: of the frames.
         size_px: width and height of the images.
-        angles_deg: of each frame, relative to the first, counter-clockwise seen from above.
+        angles_deg: relative to the first frame, counter-clockwise seen from above.
         camera: of the earlier session.
-        info: for the report.
+        info: its nominal step and direction go into the report.
 
     Raises:
         InputError: images of another size than the camera's.
@@ -137,15 +137,8 @@ def poses_from_known_camera(
         angles_deg=np.asarray(angles_deg, dtype=float),
         reprojection_error_px=np.full(n, np.nan),
         used=np.ones(n, bool),
-        marker_corners_m={},
-        dropped={},
-        dictionary=None,
         markers_per_frame=(0,) * n,
         overall_error_px=float("nan"),
-        blur_px=0.0,
-        disc_markers=(),
-        disc_tilt_deg=None,
-        loop_closure_deg=None,
         nominal_step_deg=info.nominal_step_deg,
         nominal_direction=info.direction,
         warnings=("poses are as given, by the camera of an earlier session and the angles; nothing was measured",),

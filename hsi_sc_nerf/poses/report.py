@@ -6,10 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.plotting.figures import save_figure
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 # The paper's target for the reprojection error (section "Pose Estimation").
@@ -93,16 +92,13 @@ def pose_report(poses: TurntablePoses) -> dict:
         "marker_dictionary": poses.dictionary,
         "disc_markers": list(poses.disc_markers),
         "marker_corners_m": {str(m): c.tolist() for m, c in sorted(poses.marker_corners_m.items())},
-        "outliers": [asdict(outlier) for outlier in poses.outliers],
+        "outliers": [asdict(o) | {"frame": poses.names[o.frame]} for o in poses.outliers],
         "warnings": warnings,
     }
 
 
 def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
-    """What was found and how good it is, in a few words each; ``report`` is ``pose_report`` of the poses.
-
-    Axis, camera, loop closure, scale with its uncertainty, and what was thrown out; the warnings are apart.
-    """
+    """What was found and how good it is, in a few words each; ``report`` is ``pose_report`` of the poses."""
     frames, error_px = report["frames"], report["reprojection_error_px"]["overall"]
     parts = [f"{frames['used']} of {frames['total']} frames"]
     if error_px is not None:
@@ -116,7 +112,7 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
         parts.append(f"axis tilts {report['axis_tilt_to_disc_deg']:.2f}° to the disc")
     if report["loop_closure_deg"] is not None:
         parts.append(f"loop closes to {abs(report['loop_closure_deg']):.3f}°")
-    parts += [_describe_scale(poses)]
+    parts.append(_describe_scale(poses))
     if poses.outliers:
         parts.append(f"{len(poses.outliers)} sightings of markers thrown out")
     return parts
@@ -128,10 +124,12 @@ def draw_poses(poses: TurntablePoses, path: Path) -> None:
     Raises:
         InputError: the operating system refused to write.
     """
-    figure = Figure(figsize=(16, 6))
+    figure = Figure(figsize=(16, 6), dpi=110)
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.1, top=0.86, wspace=0.2, hspace=0.35)
-    figure.suptitle(_summary(poses), fontsize=10)
-    FigureCanvasAgg(figure)
+    report = pose_report(poses)
+    # The figures that are not drawn.
+    words = ", ".join(describe_poses(poses, report))
+    figure.suptitle(f"By {poses.method}: {words}\n{len(report['warnings'])} warnings (see poses.json)", fontsize=10)
     eyes = poses.camera_to_world[poses.used, :3, 3]
     arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_FRACTION * np.linalg.norm(eyes[0])
     squares = [np.vstack([corners, corners[:1]]) for corners in poses.marker_corners_m.values()]
@@ -184,8 +182,7 @@ def draw_poses(poses: TurntablePoses, path: Path) -> None:
     turn.set(xlabel="frame", ylabel="step since the last (degrees)")
     turn.legend(loc="upper right", fontsize=8)
 
-    with atomic_write(path) as (temporary,):
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path)
 
 
 def is_full_turn(angles_deg: np.ndarray) -> bool:
@@ -214,10 +211,8 @@ def _model_warnings(poses: TurntablePoses) -> list[str]:
             "pose of its own"
         )
     if poses.uncertainty is not None:
-        for what, sigma in (
-            ("focal length", poses.uncertainty.focal),
-            ("camera's distance", poses.uncertainty.distance),
-        ):
+        known = {"focal length": poses.uncertainty.focal, "camera's distance": poses.uncertainty.distance}
+        for what, sigma in known.items():
             if sigma > _LARGEST_SIGMA:
                 warnings.append(f"the {what} is known to {100.0 * sigma:.1f} % only; show more or larger markers")
     return warnings
@@ -296,10 +291,3 @@ def _describe_scale(poses: TurntablePoses) -> str:
     if scale.source == "markers" and scale.disagreement_percent is not None:
         words += f" (by it the container is {scale.disagreement_percent:+.1f} % off its given diameter)"
     return words
-
-
-def _summary(poses: TurntablePoses) -> str:
-    """The figures that are not drawn, in two lines."""
-    report = pose_report(poses)
-    words = ", ".join(describe_poses(poses, report))
-    return f"By {poses.method}: {words}\n{len(report['warnings'])} warnings (see poses.json)"

@@ -9,17 +9,46 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.poses.object_frame import Scale
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """A marker that was seen in a frame and not used there; ``error_px`` is None where it could not be measured."""
+class RejectedMarker:
+    """A marker that was seen in a frame (its index) and is not used there."""
 
-    frame: str
+    frame: int
     marker: int
     error_px: float | None
+    """None where it could not be measured."""
     why: str
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
+
+    source: Literal["markers", "container"]
+    marker_side_m: float
+    """As given; as measured against the container where that gives the scale."""
+    uncertainty: float
+    """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
+    marker_sides: dict[int, float]
+    """Each marker's apparent side over the mean of all; empty for a single marker."""
+    marker_side_sigmas: dict[int, float]
+    """Standard deviations of these."""
+    container_diameter_m: float | None
+    """As given."""
+    measured_container_diameter_m: float | None
+    """Of the circle that the upright markers' planes touch; None where there are none.
+
+    A plaque stands off the wall and makes it wider than the container by twice that.
+    """
+
+    @property
+    def disagreement_percent(self) -> float | None:
+        """By how much the container is wider by the markers than as given; None where one is not known."""
+        if self.container_diameter_m is None or self.measured_container_diameter_m is None:
+            return None
+        return 100.0 * (self.measured_container_diameter_m / self.container_diameter_m - 1.0)
 
 
 @dataclass(frozen=True)
@@ -52,19 +81,19 @@ class TurntablePoses:
     angles_deg: Float[np.ndarray, "n"]
     reprojection_error_px: Float[np.ndarray, "n"]
     used: Bool[np.ndarray, "n"]
-    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]]
-    dropped: dict[str, str]
-    dictionary: str | None
-    """OpenCV's name; None where the poses rest on no markers."""
-    markers_per_frame: tuple[int, ...]
     overall_error_px: float
-    blur_px: float
-    disc_markers: tuple[int, ...]
-    disc_tilt_deg: float | None
-    loop_closure_deg: float | None
+    markers_per_frame: tuple[int, ...]
+    marker_corners_m: dict[int, Float[np.ndarray, "4 3"]] = field(default_factory=dict)
+    dropped: dict[str, str] = field(default_factory=dict)
+    dictionary: str | None = None
+    """OpenCV's name; None where the poses rest on no markers."""
+    blur_px: float = 0.0
+    disc_markers: tuple[int, ...] = ()
+    disc_tilt_deg: float | None = None
+    loop_closure_deg: float | None = None
     nominal_step_deg: float | None = None
     nominal_direction: Literal["ccw", "cw"] | None = None
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
     chosen: str = ""
@@ -75,7 +104,7 @@ class TurntablePoses:
     """One axis and one angle a frame; or, for a table that wobbles, small motions of each frame beside its angle."""
     wobble_deg: float | None = None
     """Root mean square of the table's tilts off its mean axis, where the poses are free."""
-    outliers: tuple[Outlier, ...] = ()
+    outliers: tuple[RejectedMarker, ...] = ()
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""
     uncertainty: Uncertainty | None = None

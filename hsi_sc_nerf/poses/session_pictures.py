@@ -12,14 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import overload
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
 
 GRAY = "gray"
@@ -143,18 +144,25 @@ class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
     def __len__(self) -> int:
         return len(self.frames)
 
-    @overload
-    def __getitem__(self, at: int) -> UInt8[np.ndarray, "h w"]: ...
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[UInt8[np.ndarray, "h w"]]: ...
-    def __getitem__(self, at):
-        if isinstance(at, slice):
-            return SessionPictures(self.frames[at], self.features)
-        frame = self.frames[at]
+    def __getitem__(self, index):
+        frame = self.frames[index]
         return frame.pictures[frame.ranking[0]]
 
-    def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w"]]:
-        return (self[i] for i in range(len(self)))
+
+def check_frames(images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str]) -> None:
+    """Refuse frames that cannot determine a turntable.
+
+    Raises:
+        InputError: too few frames to fix an axis.
+        ValueError: images of different sizes, or not one name per image.
+    """
+    if len(images) != len(names) or len({image.shape for image in images}) > 1:
+        raise ValueError("poses need images of one size and one name per image")
+    if len(images) < FEWEST_FRAMES:
+        raise InputError(
+            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
+            f"give {FEWEST_FRAMES} or more frames of one session"
+        )
 
 
 def frame_pictures(
@@ -221,17 +229,18 @@ def _picture(
     return to_8_bit(mean)
 
 
-def read_frames(
+def read_pictures(
     cube_paths: Sequence[Path],
     flags_paths: Sequence[Path],
     grays: Sequence[UInt8[np.ndarray, "h w"]],
     gray_nm: tuple[float, float],
-    extra_nm: Mapping[str, float],
-) -> list[FramePictures]:
-    """``frame_pictures`` of all frames, some at the same time."""
+    feature_nm: float | None,
+) -> SessionPictures:
+    """``frame_pictures`` of all frames; features are measured in the band nearest to ``feature_nm``, if given."""
+    extra_nm = {} if feature_nm is None else {f"{feature_nm:g} nm": feature_nm}
     with ThreadPoolExecutor(_WORKERS) as pool:
         one = partial(frame_pictures, gray_nm=gray_nm, extra_nm=extra_nm)
-        return list(pool.map(one, cube_paths, flags_paths, grays))
+        return SessionPictures(list(pool.map(one, cube_paths, flags_paths, grays)), *extra_nm)
 
 
 def group_means(

@@ -1,7 +1,7 @@
 """Structure from motion by COLMAP for a turntable: static pixels are masked, neighbours in the turn are matched.
 
-J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (CVPR 2016). Every frame gets a free pose here;
-``turntable_from_poses`` fits one turntable to them.
+J. L. Schönberger and J.-M. Frahm, "Structure-from-motion revisited" (CVPR 2016). Every frame gets a pose of its own,
+and ``turntable_from_poses`` fits one turntable to them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.moving_pixels import moving_pixels
+from hsi_sc_nerf.morphology import dilate, ellipse_close_open, touching
+from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Tracks
 
 if TYPE_CHECKING:
@@ -29,12 +30,29 @@ if TYPE_CHECKING:
 # glog's level "fatal": errors are reported by the results.
 _QUIET = 3
 _STRETCH_PERCENTILES = (0.5, 99.5)
-# Frames are matched with at least so many neighbours to each side.
+# Frames up to this part of a full turn apart are matched, and at least so many neighbours to each side.
+_NEIGHBOURS_TURN = 0.2
 _FEWEST_NEIGHBOURS = 3
 # Focal length in image widths during mapping. One orbit of a small object hardly tells it from the distance; the
 # bundle adjustment of the turntable finds it.
 _FOCAL_FACTOR = 1.5
 _SEED = 0
+# Standard deviation of the Gaussian that lowers the images' noise, pixels.
+_SMOOTHING_PX = 1.0
+# A pixel moves if its brightness varies over the frames by more than so many times the noise, and by more than this
+# standard deviation, gray levels: rounding to 8 bits alone makes less.
+_NOISE_FACTOR = 3.0
+_LEAST_CHANGE = 1.0
+# Gaps up to this fraction of the image's shorter side are closed: even skin between its patterns.
+_CLOSING_FRACTION = 0.04
+# The moving region is widened by this fraction of the shorter side; little, for the background begins right there.
+_MARGIN_FRACTION = 0.002
+# Moving specks below this fraction of the image's area are left out, such as the jagged rim of an even disc.
+_LEAST_AREA_FRACTION = 0.0005
+# Brightness classes of equal size in which the noise is measured: photon noise grows with the light.
+_BRIGHTNESS_CLASSES = 16
+# At least this fraction of a class stands still; otherwise a brighter class gives its noise.
+_STILL_FRACTION = 0.1
 
 
 @dataclass(frozen=True)
@@ -46,10 +64,6 @@ class FeatureConfig:
     the mean of the visible bands."""
     peak_threshold: float = 0.004
     """Least contrast of a SIFT feature; a smaller one finds more features on smooth skin, and more noise."""
-    neighbours_deg: float = 72.0
-    """Frames up to this far apart are matched, if the frames make one full turn, degrees."""
-    threads: int = -1
-    """Threads of COLMAP; -1 for as many as there are cores. Mapping takes one, so that it is reproducible."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +103,6 @@ def structure_from_motion(
         InputError: nothing moves, or the object has too little texture to pose three frames.
         ValueError: images of different sizes, or not one name per image.
     """
-    config = config or FeatureConfig()
     with _matched(images, names, config, moving) as folder:
         reconstruction = _map(folder)
         if reconstruction is None:
@@ -107,32 +120,50 @@ def matched_tracks(
     Raises:
         InputError, ValueError: as ``structure_from_motion``.
     """
-    with _matched(images, names, config or FeatureConfig(), None) as folder:
+    with _matched(images, names, config, None) as folder:
         tracks = _joined(folder)
     if len(tracks) == 0:
         raise _too_little_texture(names)
     return tracks
 
 
-def neighbour_pairs(frames: int, neighbours_deg: float) -> list[tuple[int, int]]:
-    """Pairs of frames to match: up to ``neighbours_deg`` apart in a full turn, the last a neighbour of the first.
+def moving_pixels(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that show something that turns in some of the frames.
+
+    Structure from motion must not see the static background: it would find a camera that stands still. Only what
+    changes the image is found: an even disc and the outline of a body of revolution do not. The lamps' drift, one
+    factor per frame, is removed first.
+
+    Args:
+        images: one 8-bit gray image per frame, all of one size, linear in reflectance.
+    """
+    stack = np.stack([cv2.GaussianBlur(i.astype(np.float32), (0, 0), _SMOOTHING_PX) for i in images])
+    middle = np.median(stack, axis=0)
+    for image in stack:
+        image /= _lamp_factor(image, middle)
+    mean, spread = stack.mean(axis=0), stack.std(axis=0)
+    moving = spread > np.maximum(_LEAST_CHANGE, _NOISE_FACTOR * _noise_spread(mean, spread))
+    side = min(moving.shape)
+    # Opening first drops single pixels that noise alone lifts above the threshold, before closing joins them.
+    moving = ellipse_close_open(moving, close_px=0, open_px=2)
+    moving = ellipse_close_open(moving, close_px=_odd(_CLOSING_FRACTION * side), open_px=3)
+    moving = touching(moving, moving, min_area_px=round(_LEAST_AREA_FRACTION * moving.size))
+    return dilate(moving, _odd(2 * _MARGIN_FRACTION * side))
+
+
+def neighbour_pairs(frames: int) -> list[tuple[int, int]]:
+    """Pairs of frames to match: up to a fifth of a full turn apart, the last a neighbour of the first.
 
     Frames of a partial turn are nearer to each other than that, and its last and first frame do not match.
     """
-    most = max(_FEWEST_NEIGHBOURS, round(neighbours_deg * frames / 360.0))
+    most = max(_FEWEST_NEIGHBOURS, round(_NEIGHBOURS_TURN * frames))
     return [(i, j) for i in range(frames) for j in range(i + 1, frames) if min(j - i, frames - (j - i)) <= most]
 
 
 @contextmanager
 def _matched(images, names, config, moving) -> Iterator[Path]:
     """A temporary folder with COLMAP's database of features and matches, after checks of the input."""
-    if len(images) != len(names) or len({image.shape for image in images}) > 1:
-        raise ValueError("structure from motion needs images of one size and one name an image")
-    if len(images) < FEWEST_FRAMES:
-        raise InputError(
-            f"{len(images)} frame(s) ({', '.join(names)}) cannot fix a turntable's axis; "
-            f"give {FEWEST_FRAMES} or more frames of one session"
-        )
+    check_frames(images, names)
     moving = moving_pixels(images) if moving is None else moving
     if not moving.any():
         raise InputError(
@@ -148,7 +179,7 @@ def _matched(images, names, config, moving) -> Iterator[Path]:
         for i, image in enumerate(images):
             cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
         cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
-        _match(folder, len(images), images[0].shape, config)
+        _match(folder, len(images), images[0].shape, config or FeatureConfig())
         yield folder
 
 
@@ -179,7 +210,6 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: FeatureCon
     reader.camera_params = f"{_FOCAL_FACTOR * width},{width / 2},{height / 2}"
     reader.camera_mask_path = str(folder / "mask.png")
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = config.threads
     extraction.sift.peak_threshold = config.peak_threshold
     # Images are numbered here, in their order: extraction would number them as its threads come along.
     pycolmap.Database.open(folder / "database.db").close()
@@ -194,12 +224,11 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: FeatureCon
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
     )
-    pairs = neighbour_pairs(frames, config.neighbours_deg)
+    pairs = neighbour_pairs(frames)
     (folder / "pairs.txt").write_text("".join(f"{_file_name(i)} {_file_name(j)}\n" for i, j in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(folder / "pairs.txt")
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = config.threads
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     pycolmap.match_image_pairs(
@@ -275,3 +304,26 @@ def _free_poses(reconstruction: pycolmap.Reconstruction, frames: int) -> FreePos
         points_3d=np.array([reconstruction.points3D[i].xyz for i in ids]).reshape(-1, 3),
         tracks=Tracks(rows[:, 0].astype(int), rows[:, 1].astype(int), rows[:, 2:]),
     )
+
+
+def _lamp_factor(image: Float[np.ndarray, "h w"], middle: Float[np.ndarray, "h w"]) -> float:
+    """Brightness of the image over that of the median image: the median over the pixels that are not dark."""
+    bright = middle >= np.median(middle)
+    return float(np.median(image[bright] / np.maximum(middle[bright], 1.0)))
+
+
+def _noise_spread(mean: Float[np.ndarray, "h w"], spread: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Standard deviation over the frames due to noise alone, at each pixel by its brightness.
+
+    Noise does not fall with brightness, so a class in which too little stands still takes that of a brighter one.
+    """
+    edges = np.quantile(mean, np.linspace(0.0, 1.0, _BRIGHTNESS_CLASSES + 1)[1:-1])
+    brightness_class = np.searchsorted(edges, mean)
+    lower = np.full(_BRIGHTNESS_CLASSES, np.inf)
+    for k in np.unique(brightness_class):
+        lower[k] = np.quantile(spread[brightness_class == k], _STILL_FRACTION)
+    return np.minimum.accumulate(lower[::-1])[::-1][brightness_class]
+
+
+def _odd(size: float) -> int:
+    return 2 * round(size / 2) + 1

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
@@ -200,12 +199,9 @@ def _search_angle(turntable: PointTurntable, seen: Tracks) -> float | None:
     rough = grid[np.argmin(cost(grid, 10.0 * _NEAR_PX))]
     step = np.deg2rad(_SEARCH_STEP_DEG)
     fine = rough + step * np.linspace(-1.0, 1.0, 41)
-    rough = fine[np.argmin(cost(fine, _NEAR_PX))]
-    found = minimize_scalar(
-        lambda angle: float(cost(angle, _NEAR_PX)[0]), bounds=(rough - step / 20, rough + step / 20), method="bounded"
-    )
-    near = float((distances_px(found.x)[0] < _NEAR_PX).mean())
-    return float(found.x) if near >= _NEAR_FRACTION else None
+    angle = float(fine[np.argmin(cost(fine, _NEAR_PX))])
+    near = float((distances_px(angle)[0] < _NEAR_PX).mean())
+    return angle if near >= _NEAR_FRACTION else None
 
 
 def _enough(tracks: Tracks, good: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:

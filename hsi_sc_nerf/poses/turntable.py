@@ -23,23 +23,25 @@ FEWEST_FRAMES = 3
 """Fewer frames do not determine a turntable's axis."""
 
 
+class _Rows:
+    """Arrays with one row per observation."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def select(self, keep: np.ndarray) -> Self:
+        """The rows that ``keep`` (a mask or indices) selects."""
+        return type(self)(*(values[keep] for values in vars(self).values()))
+
+
 @dataclass(frozen=True)
-class MarkerObservations:
+class MarkerObservations(_Rows):
     """Corners of markers in frames, one row per marker and frame. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
     marker: Int[np.ndarray, "n"]
     corners_px: Float[np.ndarray, "n 4 2"]
     covariance_px2: Float[np.ndarray, "n 8 8"]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, keep: np.ndarray) -> MarkerObservations:
-        """The rows that ``keep`` (a mask or indices) selects."""
-        return MarkerObservations(
-            self.frame[keep], self.marker[keep], self.corners_px[keep], self.covariance_px2[keep]
-        )
 
     def append(self, more: MarkerObservations) -> MarkerObservations:
         """These rows followed by others."""
@@ -52,19 +54,12 @@ class MarkerObservations:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class Tracks(_Rows):
     """Points of the object seen in several frames, one row per point and frame. Pixel origin as above."""
 
     frame: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
     pixels: Float[np.ndarray, "n 2"]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, keep: np.ndarray) -> Tracks:
-        """The rows that ``keep`` (a mask or indices) selects."""
-        return Tracks(self.frame[keep], self.point[keep], self.pixels[keep])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +110,17 @@ class Turntable:
         poses[:, :3, :3] = np.swapaxes(self.camera_rotation @ rotations, 1, 2)
         poses[:, :3, 3] = self.camera_positions()
         return poses @ OPENCV_TO_OPENGL
+
+    def relative_angles_deg(self) -> Float[np.ndarray, "f"]:
+        """Angles relative to the first frame, unwrapped."""
+        angles_deg = np.rad2deg(np.unwrap(self.angles_rad))
+        return angles_deg - angles_deg[0]
+
+    def over_session(self, values: Float[np.ndarray, "f *shape"], size: int) -> Float[np.ndarray, "n *shape"]:
+        """Values of the turntable's frames as rows of the session's ``size`` frames, nan for the others."""
+        rows = np.full((size, *values.shape[1:]), np.nan)
+        rows[self.frames] = values
+        return rows
 
     def _selected_frames(self, frame: Int[np.ndarray, "n"]) -> Self:
         keep = np.isin(self.frames, frame)

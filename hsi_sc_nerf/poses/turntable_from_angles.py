@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import closest_point_to_rays
-from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks, adjust_tracks, with_lost_frames
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays, look_at
 from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project, rotations_about_z
 
 # Starts of the search: the camera's elevation, and its focal length in image widths.
@@ -64,7 +63,9 @@ def turntable_from_angles(
     best, best_cost = None, np.inf
     for sign, elevation_deg, focal in product((1.0,) if direction_known else (1.0, -1.0), _ELEVATIONS_DEG, focals):
         angles = sign * angles_rad
-        base = _looking_down(elevation_deg)
+        elevation = np.deg2rad(elevation_deg)
+        camera = look_at(np.array([np.cos(elevation), 0.0, np.sin(elevation)]), np.zeros(3)) @ OPENCV_TO_OPENGL
+        base = camera[:3, :3].T
         turns = np.stack([rotations_about_z(-angles[np.searchsorted(frames, tracks.frame[r])]) for r in rows])
         rays = np.stack([tracks.pixels[r] - centre for r in rows])
 
@@ -97,39 +98,6 @@ def turntable_from_angles(
             "take markers"
         )
     return best
-
-
-def adjusted_from_angles(
-    tracks: Tracks,
-    angles_deg: Float[np.ndarray, "n"],
-    size_px: tuple[int, int],
-    *,
-    free_angles: bool,
-    direction_known: bool,
-) -> AdjustedTracks:
-    """The camera before known angles, adjusted; and then the angles too, if they are free.
-
-    Free angles follow uneven steps, but let features that creep over the object bend the turn.
-
-    Args:
-        tracks: points seen in frames.
-        angles_deg: of every frame, also of those without tracks.
-        size_px: width and height of the images.
-        free_angles: adjust the angles, which otherwise are held.
-        direction_known: as in ``turntable_from_angles``.
-
-    Raises:
-        InputError: as ``turntable_from_angles`` and ``adjust_tracks``.
-    """
-    frames = np.unique(tracks.frame)
-    angles_rad = np.deg2rad(angles_deg[frames])
-    start = turntable_from_angles(tracks, frames, angles_rad, size_px, direction_known=direction_known)
-    held = adjust_tracks(start, tracks, free_angles=False)
-    if not free_angles:
-        return held
-    freed = adjust_tracks(held.turntable, tracks)
-    # Frames that the held angles made useless come back at the angle that fits their points.
-    return adjust_tracks(with_lost_frames(freed.turntable, tracks), tracks)
 
 
 def _pairs(tracks, frames, angles_rad):
@@ -185,9 +153,3 @@ def _with_points(turntable, tracks):
     behind = project(turntable, frame, points_3d[point]).in_camera[:, 2] <= 0.0
     wrong = np.isin(np.arange(len(points)), point[behind])
     return replace(turntable, points=points[~wrong], points_3d=points_3d[~wrong]), 1.0 - float(behind.mean())
-
-
-def _looking_down(elevation_deg):
-    """From the turntable's frame to OpenCV's camera axes, of a camera at (1, 0, 0) that looks down at the axis."""
-    c, s = np.cos(np.deg2rad(elevation_deg)), np.sin(np.deg2rad(elevation_deg))
-    return np.array([[0.0, 1.0, 0.0], [s, 0.0, -c], [-c, 0.0, -s]])

@@ -1,13 +1,11 @@
 """Fit of a turntable (one axis, one angle per frame, a fixed camera) to free poses of single frames.
 
-Structure from motion gives each frame six numbers, where a turntable has one. In its world the object lies still and
-the camera goes round: with B the camera's rotation in the first frame and u the axis, frame i has
+With B the camera's rotation in the first frame and u the axis, frame i has
 
     R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
 
-for the axis stands still before the camera. Both are linear in what is looked for (u, then p and q). The object lies
-about the axis, so q is known well even where a frame's rotation and position are wrong together, as they are where a
-small object is seen from far away.
+for the axis stands still before the camera. Both are linear in the unknowns (u, then p and q). The object lies about
+the axis, so q is known well even where a frame's rotation and position are wrong together.
 """
 
 from __future__ import annotations
@@ -19,7 +17,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix
+from hsi_sc_nerf.geometry.camera import (
+    Similarity,
+    closest_point_to_rays,
+    cross_matrix,
+    rotation_about_z,
+    rotation_angle_deg,
+)
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
@@ -33,29 +37,21 @@ _ROUNDS = 10
 
 @dataclass(frozen=True)
 class TurntableFit:
-    """The turntable nearest to free poses, in the poses' own unit of length.
+    """The turntable nearest to free poses. Angles are relative to the first fitted frame, unwrapped over the frames.
 
-    The turntable's frame: z is the axis, up; the camera sits at (``distance``, 0, 0) at the angle 0. Angles are
-    counter-clockwise seen from above, relative to the first frame that was fitted, unwrapped over the frames. Rows of
-    frames without a pose are nan. A frame that ``contradicts`` the others took no part and has no angle.
+    Attributes:
+        transform: from the poses' world to the turntable frame, with the camera's distance as the unit of length.
+        distance: of the camera from the axis, in the poses' unit of length.
+        camera_rotation: from the turntable frame to OpenCV's camera axes, at the angle 0.
+        angles_rad: counter-clockwise seen from above; nan for frames without a pose and for those that contradict.
+        contradicts: frames whose pose contradicts the others'.
     """
 
-    to_turntable: Float[np.ndarray, "3 3"]
-    """Rotation from the poses' world into the turntable's frame."""
-    origin: Float[np.ndarray, "3"]
-    """The turntable frame's origin in the poses' world: the axis' point at the camera's height."""
+    transform: Similarity
     distance: float
     camera_rotation: Float[np.ndarray, "3 3"]
-    """From the turntable's frame to OpenCV's camera axes, at the angle 0."""
     angles_rad: Float[np.ndarray, "n"]
-    rotation_misfit_deg: Float[np.ndarray, "n"]
-    position_misfit: Float[np.ndarray, "n"]
-    """How far the frame's pose shifts the axis before the camera, in distances of the camera from the axis."""
     contradicts: Bool[np.ndarray, "n"]
-
-    def transform(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Points of the poses' world in the turntable's frame, with the camera's distance as the unit of length."""
-        return (points - self.origin) @ self.to_turntable.T / self.distance
 
     def turntable(
         self, points_3d: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
@@ -96,7 +92,7 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
         axis, base, angles = _about_one_axis(rotations, good)
         on_axis, before_camera = _axis_position(rotations, shifts, axis, good)
         distance = float(np.linalg.norm(_perpendicular(base.T @ before_camera, axis)))
-        misfit_deg = np.rad2deg(_angle_between(rotations, base @ _rotations_about(axis, angles)))
+        misfit_deg = rotation_angle_deg(rotations, base @ _rotations_about(axis, angles))
         misfit = np.linalg.norm(rotations @ on_axis + shifts - before_camera, axis=-1) / max(distance, 1e-12)
         wrong = _is_outlier(misfit_deg, good, _CONTRADICTS_DEG) | _is_outlier(misfit, good, _CONTRADICTS_DISTANCES)
         if not wrong[good].any():
@@ -111,28 +107,21 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     if (base @ axis)[1] > 0.0:  # the image's y points down
         axis, angles = -axis, -angles
     camera = -base.T @ before_camera
-    horizontal = _perpendicular(camera, axis)
-    x = horizontal / np.linalg.norm(horizontal)
+    x = _perpendicular(camera, axis) / distance
+    at_zero = np.stack([x, np.cross(axis, x), axis])
     first = int(np.flatnonzero(good)[0])
-    # The frame's x belongs to the angle 0 of `base`; turn both to the first fitted frame.
-    to_turntable = Rotation.from_rotvec([0.0, 0.0, angles[first]]).as_matrix() @ np.stack(
-        [x, np.cross(axis, x), axis]
-    )
-    camera_rotation = base @ np.stack([x, np.cross(axis, x), axis]).T
-    angles[~good] = np.nan
-    angles[good] = np.unwrap(angles[good]) - angles[first]
-    rows = np.full((3, len(posed)), np.nan)
-    rows[:, posed] = angles, misfit_deg, misfit
-    contradicts = np.zeros(len(posed), bool)
+    # The frame's x belongs to the angle 0 of `base`; turn it to the first fitted frame.
+    to_turntable = rotation_about_z(np.rad2deg(angles[first]))[:3, :3] @ at_zero
+    angles_rad, contradicts = np.full(len(posed), np.nan), np.zeros(len(posed), bool)
+    angles_rad[np.flatnonzero(posed)[good]] = np.unwrap(angles[good]) - angles[first]
     contradicts[posed] = ~good
+    # The axis' point at the camera's height.
+    origin = on_axis + (camera @ axis) * axis
     return TurntableFit(
-        to_turntable=to_turntable,
-        origin=on_axis + (camera @ axis) * axis,
+        transform=Similarity(1.0 / distance, to_turntable, -to_turntable @ origin / distance),
         distance=distance,
-        camera_rotation=camera_rotation,
-        angles_rad=rows[0],
-        rotation_misfit_deg=rows[1],
-        position_misfit=rows[2],
+        camera_rotation=base @ at_zero.T,
+        angles_rad=angles_rad,
         contradicts=contradicts,
     )
 
@@ -202,11 +191,6 @@ def _rotations_about(axis, angles):
 
 def _perpendicular(vector, axis):
     return vector - (vector @ axis) * axis
-
-
-def _angle_between(a, b):
-    chord = np.linalg.norm(a - b, axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
-    return 2.0 * np.arcsin(np.minimum(1.0, chord))
 
 
 def _nearest_rotation(matrix):

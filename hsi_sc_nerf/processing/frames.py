@@ -160,12 +160,11 @@ def process_frame(
         calibration: of this frame.
         paths: files to write.
         fingerprint: of what the frame is made from, kept in its cache.
-        pseudo_rgb_nm: wavelengths shown as red, green and blue.
-        marker_range_nm: bands that are averaged into the gray image.
+        pseudo_rgb_nm, marker_range_nm: as in `pack_frames`.
         buffer: memory to pack in (`pack_counts`), which several frames may use in turn.
 
     Raises:
-        InputError: the raw cube cannot be read, or the operating system refused to write.
+        InputError: as `pack_frames`.
     """
     wavelengths_nm = cube.wavelengths_nm[calibration.bands]
     widths_nm = None if cube.fwhm_nm is None else cube.fwhm_nm[calibration.bands]

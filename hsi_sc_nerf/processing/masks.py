@@ -1,10 +1,9 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
-The reflectance of plant tissue changes strongly between 400 and 1000 nm (pigments, red edge), that of Teflon,
-plastic, paper and ink hardly. A pixel's foreground score is therefore the standard deviation of its spectrum, and
-Otsu's threshold separates the object's scores from the others. Prints and labels below the container's lid are
-excluded by geometry. In shade the score falls with the light, so dark parts next to the object are compared by score
-relative to brightness.
+The reflectance of plant tissue changes strongly between 400 and 1000 nm, that of Teflon, plastic, paper and ink
+hardly. A pixel's foreground score is the standard deviation of its spectrum, and Otsu's threshold separates the
+object's scores from the others. What lies below the container's lid is excluded by geometry. Dark parts next to the
+object are compared by score relative to brightness, for the score falls with the light.
 """
 
 from __future__ import annotations

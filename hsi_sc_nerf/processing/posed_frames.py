@@ -21,7 +21,7 @@ from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
 from hsi_sc_nerf.poses.pose_methods import KnownCamera, PoseMethod
 from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures, read_frames
+from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures, read_pictures
 from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.frames import FramePaths
 
@@ -77,8 +77,12 @@ def pose_frames(
     """
     names = [capture.name for capture in session.frames]
     # Known angles before a known camera need no images.
-    measured = method != "angles" or camera is None
-    pictures = _read_pictures(names, images, config, output_dir, marker_range_nm) if measured else None
+    pictures = None
+    if method != "angles" or camera is None:
+        paths = [FramePaths.of(output_dir, name) for name in names]
+        pictures = read_pictures(
+            [p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm, config.band_nm
+        )
     try:
         poses = find_poses(
             pictures or images,
@@ -135,20 +139,6 @@ def container_under(session: Session, poses: TurntablePoses) -> Container | None
     if diameter_m is None or height_m is None or not poses.metric or not feet_known:
         return None
     return Container(diameter_m, height_m)
-
-
-def _read_pictures(
-    names: Sequence[str],
-    images: Sequence[UInt8[np.ndarray, "h w"]],
-    config: FeatureConfig,
-    output_dir: Path,
-    marker_range_nm: tuple[float, float],
-) -> SessionPictures:
-    """Pictures of all packed frames, for markers and for features."""
-    paths = [FramePaths.of(output_dir, name) for name in names]
-    band = {} if config.band_nm is None else {f"{config.band_nm:g} nm": config.band_nm}
-    frames = read_frames([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm, band)
-    return SessionPictures(frames, *band)
 
 
 def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: TurntablePoses) -> dict:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays
 from hsi_sc_nerf.geometry.visual_hull import visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import Container
@@ -52,7 +52,8 @@ def object_box(
         >>> masks = np.stack([frame.mask() for frame in dataset.frames])
         >>> low_m, high_m = object_box(masks, dataset.camera_to_worlds, dataset.intrinsics)
     """
-    centre = focus_point(camera_to_worlds)
+    # The point that all frames look at.
+    (centre,), _ = closest_point_to_rays(camera_to_worlds[:, :3, 3], camera_to_worlds[:, :3, 2])
     distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).min()
     reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
     low, high = centre - reach, centre + reach
@@ -124,11 +125,3 @@ def assumed_disc(has_markers: bool, container_diameter_m: float | None) -> str |
         f"no marker shows how far the disc reaches: its diameter is taken to be {diameter_mm:.0f} mm, "
         f"{DISC_OVER_CONTAINER} times the container's"
     )
-
-
-def focus_point(camera_to_worlds: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, "3"]:
-    """The point with the least squared distances from the optical axes of all frames."""
-    origins, axes = camera_to_worlds[:, :3, 3], -camera_to_worlds[:, :3, 2]
-    perpendicular = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # Parallel axes, as of a turn by nearly nothing, leave one direction undetermined: the shortest solution is taken.
-    return np.linalg.lstsq(perpendicular.sum(axis=0), np.einsum("nij,nj->i", perpendicular, origins), rcond=None)[0]

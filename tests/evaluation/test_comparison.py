@@ -16,7 +16,7 @@ from hsi_sc_nerf.evaluation.comparison_report import write_comparison
 from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
 from hsi_sc_nerf.evaluation.surface_files import read_surface
-from hsi_sc_nerf.geometry.similarity import Similarity
+from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.simulate.scores.visible_surface import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 

@@ -12,7 +12,7 @@ from hsi_sc_nerf.evaluation.registration import (
     robust_radius,
 )
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.geometry.similarity import Similarity
+from hsi_sc_nerf.geometry.camera import Similarity
 
 
 def surface(lumps: bool, count: int, seed: int) -> np.ndarray:

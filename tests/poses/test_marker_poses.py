@@ -11,11 +11,12 @@ from turntable_scene import MarkerScene
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project, rotation_angle_deg
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, MarkerProblem
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
+from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.model_selection import linked_rows
-from hsi_sc_nerf.poses.object_frame import disc_height_m, lie_on_disc, object_poses
+from hsi_sc_nerf.poses.object_frame import disc_height_m, lie_on_disc, to_object_frame
 from hsi_sc_nerf.poses.report import draw_poses, is_full_turn, pose_report
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 
@@ -70,7 +71,7 @@ def test_exact_corners_give_exact_poses(options):
     scene = MarkerScene(**options)
     turntable = solve(scene, exact_observations(scene))
     assert turntable.focal_px == pytest.approx(scene.intrinsics.fl_x, rel=1e-4)
-    found = object_poses(turntable, disc_height_m(turntable))
+    found = to_object_frame(turntable, disc_height_m(turntable)) @ turntable.camera_to_world()
     rotation, position = pose_errors(found, scene.camera_to_world)
     assert rotation < 1e-2
     assert position < 1e-1
@@ -89,7 +90,7 @@ def test_first_guess_is_all_but_exact_on_exact_corners():
 def test_noisy_corners_give_close_poses():
     scene = MarkerScene(frames=24)
     turntable = solve(scene, exact_observations(scene, noise_px=0.05))
-    found = object_poses(turntable, disc_height_m(turntable))
+    found = to_object_frame(turntable, disc_height_m(turntable)) @ turntable.camera_to_world()
     rotation, position = pose_errors(found, scene.camera_to_world)
     assert rotation < 0.2
     assert position < 1.0
@@ -123,7 +124,7 @@ def test_derivatives_are_those_of_the_residuals(free):
     for row in range(len(observations)):
         own = np.where(columns[row] == layout.motion_size, layout.size, columns[row])
         dense[row, :, own] += values[row].T
-        dense[row, :, layout.landmark[problem.marker[row]]] += by_marker[row].T
+        dense[row, :, layout.landmark[problem.landmark[row]]] += by_marker[row].T
     dense = dense[..., :-1]
     numeric = np.concatenate(
         [

@@ -315,7 +315,6 @@ def test_plain_images_are_sessions_of_one_picture_a_frame():
     assert SessionPictures.of(session) is session
     assert len(session) == 3
     assert [int(image[0, 0]) for image in session] == [0, 1, 2]
-    assert [int(image[0, 0]) for image in session[1:]] == [1, 2]
     assert session.named(session.features)[2] is images[2]
 
 

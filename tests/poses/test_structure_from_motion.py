@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.poses.moving_pixels import moving_pixels
 from hsi_sc_nerf.poses.structure_from_motion import (
     matched_tracks,
+    moving_pixels,
     neighbour_pairs,
     structure_from_motion,
 )
@@ -140,9 +140,9 @@ def test_a_ball_without_patterns_is_refused():
 
 
 def test_last_and_first_frame_are_neighbours():
-    pairs = neighbour_pairs(60, 60.0)
-    assert len(pairs) == 60 * 10
+    pairs = neighbour_pairs(60)
+    assert len(pairs) == 60 * 12
     assert (0, 59) in pairs
-    assert (0, 10) in pairs
-    assert (0, 11) not in pairs
-    assert len(neighbour_pairs(8, 60.0)) == 8 * 3
+    assert (0, 12) in pairs
+    assert (0, 13) not in pairs
+    assert len(neighbour_pairs(8)) == 8 * 3

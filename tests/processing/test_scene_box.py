@@ -13,7 +13,6 @@ from hsi_sc_nerf.processing.scene_box import (
     DISC_OVER_CONTAINER,
     DISC_OVER_MARKERS,
     assumed_disc,
-    focus_point,
     object_box,
     scene_box,
 )
@@ -23,10 +22,6 @@ CONTAINER = Container(diameter_m=0.09, height_m=0.07)
 
 def turn(count: int) -> np.ndarray:
     return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
-
-
-def test_focus_point_is_where_the_cameras_look():
-    np.testing.assert_allclose(focus_point(turn(8)), [0.0, 0.0, 0.1], atol=1e-9)
 
 
 def test_object_box_of_a_sphere():

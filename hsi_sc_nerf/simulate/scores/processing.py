@@ -68,7 +68,7 @@ def score_processing(
     squares, measurements, values = 0.0, 0, 0
     for frame in dataset.frames:
         pose = poses[frame.capture]
-        rotations.append(rotation_angle_deg(frame.camera_to_world, pose))
+        rotations.append(float(rotation_angle_deg(frame.camera_to_world, pose)))
         positions.append(float(np.linalg.norm(frame.camera_to_world[:3, 3] - pose[:3, 3])))
         measured, valid = unpack(frame.cube())
         errors = np.clip(truth.reflectance(frame.capture)[..., bands], *bounds) - measured
