@@ -16,7 +16,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate import assemble, sensor
-from hsi_sc_nerf.simulate.effects.stages import MotionEffect
+from hsi_sc_nerf.simulate.effects.motion import MotionEffect
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import Scene

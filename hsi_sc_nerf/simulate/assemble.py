@@ -11,8 +11,8 @@ from jaxtyping import Float
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh, plants, target
-from hsi_sc_nerf.simulate.effects import of_stage
-from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
+from hsi_sc_nerf.simulate.effect import effect_rng, of_kind
+from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import CameraSettings, Cylinder, MaizeEar, Object, OwnMesh, Scene, Sphere
@@ -26,7 +26,7 @@ def intrinsics(camera: CameraSettings) -> PinholeIntrinsics:
 
 
 def first_camera(camera: CameraSettings) -> Float[np.ndarray, "4 4"]:
-    """CameraSettings-to-world of the first frame: above the x axis, looking at the turntable's axis."""
+    """Camera-to-world pose of the first frame: above the x axis, looking at the turntable's axis."""
     elevation = np.deg2rad(camera.elevation_deg)
     aim = np.array([0.0, 0.0, camera.aim_height_m])
     return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
@@ -43,7 +43,7 @@ def frame_plan(scene: Scene) -> FramePlan:
         nominal_step_deg=360.0 / frames,
         direction=scene.turntable.direction,
     )
-    for effect in of_stage(scene.effects, MotionEffect):
+    for effect in of_kind(scene.effects, MotionEffect):
         plan = effect.replan(plan, effect_rng(scene.seed, effect))
     return plan
 
