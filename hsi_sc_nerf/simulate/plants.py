@@ -217,10 +217,9 @@ def maize_weights(shape: PlantMesh, ear: MaizeEar, rng: np.random.Generator) -> 
 def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
     """Round dots, uniform by area, with diameters within 30 % of ``diameter_m``; 1 inside, 0 outside."""
     vertices, triangles = shape.mesh.vertices, shape.mesh.triangles
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = shape.mesh.triangle_areas_m2()
     count = int(LENTICELS_PER_CM2 * shape.mesh.area_m2() * 1e4)
-    centres = a[rng.choice(len(triangles), count, p=areas / areas.sum())]
+    centres = vertices[triangles[rng.choice(len(triangles), count, p=areas / areas.sum()), 0]]
     radii = diameter_m / 2.0 * rng.uniform(0.7, 1.3, count)
     distance, nearest = cKDTree(centres).query(vertices)
     return smoothstep((radii[nearest] - distance) / (0.4 * diameter_m) + 0.5)
