@@ -29,8 +29,8 @@ METHODS = ("replan", "offset_m", "deform", "cover", "spectra", "factor")
 OURS = [
     cls
     for module in (chamber, illumination, motion, object_effects)
-    for cls in vars(module).values()
-    if isinstance(cls, type) and cls.__module__ == module.__name__ and {*vars(cls)} & {*METHODS}
+    for cls in effects.EFFECTS.values()
+    if cls.__module__ == module.__name__ and {*vars(cls)} & {*METHODS}
 ]
 SMALL = {"frames": 4, "size_px": 40, "bands": 10}
 
