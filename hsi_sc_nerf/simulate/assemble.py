@@ -80,10 +80,10 @@ def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
-    parts = [
-        _plain(target.disc_mesh(scene.turntable, spacing_m), "disc"),
-        _plain(target.container_mesh(scene.container, spacing_m), "container_plastic"),
-    ]
+    disc = cylinder(scene.turntable.disc_diameter_m, target.DISC_THICKNESS_M, spacing_m=spacing_m)
+    disc = disc.moved(np.array([0.0, 0.0, -target.DISC_THICKNESS_M - target.PRINT_HEIGHT_M]))
+    container = cylinder(scene.container.diameter_m, scene.container.height_m, spacing_m=spacing_m)
+    parts = [_plain(disc, "disc"), _plain(container, "container_plastic")]
     on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
         mesh, ink = target.marker_mesh(frame, number, scene.markers)

@@ -20,7 +20,7 @@ from hsi_sc_nerf.simulate.effects.object import Deformation, Drying
 from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
 from hsi_sc_nerf.simulate.light import Light, LightEffect, SurfaceLightEffect, colour_spectra
 from hsi_sc_nerf.simulate.lighting import Lighting, render
-from hsi_sc_nerf.simulate.materials import endmembers, known_materials
+from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import Scene
 
@@ -106,7 +106,7 @@ class Simulation:
             # The pattern replaces the chamber, which is the last material.
             pattern = background.cover(size_px, self.materials, effect_rng(scene.seed, background))
             self._background = pattern - np.eye(len(self.materials))[-1]
-        self._object_materials = [known_materials(scene.materials)[name] for name in scanned.materials]
+        self._object_materials = [(MATERIALS | scene.materials)[name] for name in scanned.materials]
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
         self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
@@ -119,16 +119,6 @@ class Simulation:
         }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
         self._detector_endmembers = self._detector_reflectance(self.materials)
-
-    @property
-    def integration_time_ms(self) -> float:
-        """Integration time of the frames."""
-        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=False)
-
-    @property
-    def white_integration_time_ms(self) -> float:
-        """Integration time of the white tarp's capture."""
-        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=True)
 
     def frame(self, number: int) -> SimulatedFrame:
         """Simulate one frame of the plan."""
@@ -156,17 +146,26 @@ class Simulation:
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
         return SimulatedFrame(
-            counts, dark, light, self.integration_time_ms, weights, rendering.coverage, self.endmembers
+            counts,
+            dark,
+            light,
+            self._integration_time_ms(of_white=False),
+            weights,
+            rendering.coverage,
+            self.endmembers,
         )
 
     def white(self) -> SimulatedCapture:
         """Simulate the capture of the white tarp before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
         light = self._on_sensor(Light(weights, self._detector_reflectance(WHITE_MATERIALS)), elapsed=0.0)
-        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
+        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self._integration_time_ms(of_white=True))
 
     def _exposure_factor(self, of_white: bool) -> float:
         return math.prod(exposure.factor(of_white) for exposure in self._exposures)
+
+    def _integration_time_ms(self, of_white: bool) -> float:
+        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white)
 
     def _detector_reflectance(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
         """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
 
+Counts: TypeAlias = Float[np.ndarray, "lines samples bands"]
 FEW_ELECTRONS = 50.0
 """Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
 
@@ -59,9 +60,7 @@ class ReadoutEffect(Effect):
         """Maps (samples, bands) that are the same in every exposure, by name; stored with the truth."""
         return {}
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Counts under the effect, dark level included, neither rounded nor clipped; may overwrite ``counts``."""
         raise NotImplementedError
 
@@ -133,9 +132,7 @@ class DarkPattern(ReadoutEffect):
         """``dark_offset``: counts to add to the dark level, float32, normal."""
         return {"dark_offset": np.float32(self.spread) * rng.standard_normal((samples, bands), dtype=np.float32)}
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Add the fixed pattern."""
         counts += context.maps["dark_offset"]
         return counts
@@ -172,9 +169,7 @@ class BadPixels(ReadoutEffect):
         of_hot[:, dead_bands] = False
         return {"dead": of_dead, "hot": of_hot}
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Overwrite the counts of bad pixels."""
         counts[:, context.maps["dead"]] = context.dark_level
         counts[:, context.maps["hot"]] = context.largest_count
@@ -187,9 +182,7 @@ class PhotonNoise(ReadoutEffect):
 
     name: ClassVar[str] = "photon_noise"
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Draw the electrons of the signal above the dark level and convert them back to counts."""
         electrons = np.maximum(counts - np.float32(context.dark_level), 0.0, dtype=np.float32)
         electrons *= np.float32(context.electrons_per_count)
@@ -209,9 +202,7 @@ class ReadNoise(ReadoutEffect):
     electrons: float = between(0.0, 1e5, default=40.0)
     """Root mean square, electrons."""
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Add the noise."""
         spread = np.float32(self.electrons / context.electrons_per_count)
         for line in counts:
