@@ -1,4 +1,4 @@
-"""The truth of a simulated session: writing and reading it (layout in docs/architecture.md)."""
+"""The truth of a simulated session: writing and reading it (layout in docs/reference/files.md)."""
 
 from __future__ import annotations
 
