@@ -60,7 +60,7 @@ def test_no_spectra_have_no_shares():
 
 def test_blur_moves_the_edge_of_a_class_by_angle_but_not_by_mixture():
     """A brown spot on green, sharp and then blurred, in light that falls off."""
-    mesh = cylinder(0.04, 0.04, segments=256, step_m=0.0005)
+    mesh = cylinder(0.04, 0.04, segments=256, spacing_m=0.0005)
     distance_m = np.linalg.norm(mesh.vertices - [0.02, 0.0, 0.02], axis=1)
     light = np.linspace(0.2, 1.0, len(mesh.vertices))[:, None]
     library = SpectralLibrary(("green", "brown"), NM, np.stack([GREEN, BROWN]))
@@ -80,7 +80,7 @@ def test_blur_moves_the_edge_of_a_class_by_angle_but_not_by_mixture():
 
 def test_references_of_one_name_are_one_class_of_a_mixture():
     """Two fifths of each of two skins and a fifth of a bruise are skin, not nothing."""
-    mesh = cylinder(0.04, 0.04, segments=32, step_m=0.005)
+    mesh = cylinder(0.04, 0.04, segments=32, spacing_m=0.005)
     spectra = np.tile(np.float32([0.4, 0.2, 0.4]) @ ENDMEMBERS, (len(mesh.vertices), 1)).astype(np.float32)
     surface = SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
     found = classified(surface, SpectralLibrary(("skin", "bruise", "skin"), NM, ENDMEMBERS), 0.1, 1e-6)
@@ -89,7 +89,7 @@ def test_references_of_one_name_are_one_class_of_a_mixture():
 
 
 def test_a_place_of_which_no_class_has_half_is_of_none():
-    mesh = cylinder(0.04, 0.04, segments=32, step_m=0.005)
+    mesh = cylinder(0.04, 0.04, segments=32, spacing_m=0.005)
     spectra = np.tile(np.float32([0.45, 0.3, 0.25]) @ ENDMEMBERS, (len(mesh.vertices), 1)).astype(np.float32)
     surface = SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
     found = classified(surface, SpectralLibrary(("green", "brown", "red"), NM, ENDMEMBERS), np.pi, 1e-6)
@@ -98,7 +98,7 @@ def test_a_place_of_which_no_class_has_half_is_of_none():
 
 
 def test_what_is_no_mixture_of_the_library_is_of_no_class():
-    mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
+    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
     left = mesh.vertices[:, 1:2] > 0.0
     surface = SpectralMesh(mesh, np.where(left, GREEN, RED).astype(np.float32), NM, np.ones(len(left), bool))
     found = classified(surface, SpectralLibrary(("green",), NM, GREEN[None]), 0.1, smallest_region_m2=1e-6)

@@ -117,7 +117,7 @@ def joined(*meshes):
 
 
 def test_a_loose_stem_stays_and_specks_and_bubbles_go():
-    fruit = cylinder(0.06, 0.06, segments=64, step_m=0.002)
+    fruit = cylinder(0.06, 0.06, segments=64, spacing_m=0.002)
     stem = cylinder(0.004, 0.01, segments=16).moved(np.array([0.0, 0.0, 0.07]))
     speck = Mesh(np.array([[0.1, 0, 0], [0.11, 0, 0], [0.1, 0.01, 0], [0.1, 0, 0.01]]), SPECK)
     bubble = cylinder(0.02, 0.02, segments=64).moved(np.array([0.0, 0.0, 0.02]))

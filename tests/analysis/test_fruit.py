@@ -102,7 +102,7 @@ def test_bruise_area_by_mixture_is_within_three_percent_of_where_it_has_most(ide
 
 def small_cloud(path):
     """A green and brown cylinder as the command's input."""
-    mesh: Mesh = cylinder(0.04, 0.05, segments=96, step_m=0.001).moved(np.array([0.0, 0.0, STAND_M]))
+    mesh: Mesh = cylinder(0.04, 0.05, segments=96, spacing_m=0.001).moved(np.array([0.0, 0.0, STAND_M]))
     weights = np.eye(2)[(mesh.vertices[:, 1] > 0.0).astype(int)]
     true = TrueSurface(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
     cloud = true.cloud(6000, eyes_around(), 0.0)

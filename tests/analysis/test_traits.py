@@ -37,7 +37,7 @@ LIBRARY = SpectralLibrary(("green", "brown"), NM, np.stack([GREEN, BROWN]))
 
 def two_halves(seen=True):
     """A cylinder, 4 cm wide and high: green at y > 0, brown below."""
-    mesh = cylinder(0.04, 0.04, segments=128, step_m=0.001)
+    mesh = cylinder(0.04, 0.04, segments=128, spacing_m=0.001)
     spectra = np.where(mesh.vertices[:, 1:2] > 0.0, GREEN, BROWN).astype(np.float32)
     return SpectralMesh(mesh, spectra, NM, np.full(len(spectra), seen))
 
@@ -51,12 +51,12 @@ def test_angles_and_classes_do_not_depend_on_brightness():
 
 
 def test_areas_of_vertices_add_up():
-    mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
+    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
     assert vertex_areas_m2(mesh).sum() == pytest.approx(mesh.area_m2())
 
 
 def test_normals_point_outwards():
-    mesh = cylinder(0.04, 0.04, segments=64, step_m=0.002)
+    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
     middle = mesh.vertices - [0.0, 0.0, 0.02]
     assert ((mesh.vertex_normals() * middle).sum(axis=1) > 0.0).all()
 

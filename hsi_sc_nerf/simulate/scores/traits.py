@@ -21,6 +21,9 @@ from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
+FACET_LIFT_M = 0.0001
+"""Offset of the origin of a line of sight, so that the facets of a concave surface do not hide each other."""
+
 
 @dataclass(frozen=True)
 class TrueSurface:
@@ -69,7 +72,7 @@ class TrueSurface:
     ) -> Bool[np.ndarray, "n"]:
         """Which points of the surface are visible from at least one camera position, occluded by the object only."""
         scene = self._scene()
-        return np.any([unoccluded(scene, points_m, eye_m) for eye_m in eyes_m], axis=0)
+        return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
 
     def cloud(
         self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0

@@ -90,13 +90,16 @@ def seen_points(
 
 
 def unoccluded(
-    scene: RaycastingScene, points_m: Float[np.ndarray, "n 3"], eye_m: Float[np.ndarray, "3"]
+    scene: RaycastingScene,
+    points_m: Float[np.ndarray, "n 3"],
+    eye_m: Float[np.ndarray, "3"],
+    lift_m: float = LIFT_M,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether the mesh of ``scene`` does not hide each point of its surface from the position ``eye_m``."""
+    """Whether the mesh of ``scene``, ``lift_m`` or more from a point of its surface, does not hide it from ``eye_m``."""
     sight = eye_m - points_m
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     rays = np.concatenate([points_m, sight], axis=1, dtype=np.float32)
-    return ~scene.test_occlusions(rays, tnear=LIFT_M).numpy()
+    return ~scene.test_occlusions(rays, tnear=lift_m).numpy()
 
 
 def _in_object_pixels(
