@@ -30,6 +30,9 @@ class Lens(Protocol):
     ) -> Float[np.ndarray, "*n 2"]:
         """Pixel coordinates in the pinhole image of what the lens images at ``pixels``."""
 
+    def __hash__(self) -> int:
+        """Rays are cached by lens."""
+
 
 @dataclass(frozen=True)
 class Part:

@@ -95,7 +95,7 @@ def unoccluded(
     eye_m: Float[np.ndarray, "3"],
     lift_m: float = LIFT_M,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether the mesh of ``scene``, ``lift_m`` or more from a point of its surface, does not hide it from ``eye_m``."""
+    """Whether each point of a surface is visible from ``eye_m``; occluders within ``lift_m`` of it do not count."""
     sight = eye_m - points_m
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     rays = np.concatenate([points_m, sight], axis=1, dtype=np.float32)
