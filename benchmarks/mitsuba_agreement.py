@@ -1,6 +1,6 @@
 """Comparison of the simulator's renderer with Mitsuba 3 on one frame, under each light transport.
 
-    uv run --extra mitsuba python benchmarks/mitsuba_agreement.py --output-dir /tmp/agreement --scene pear
+    uv run python benchmarks/mitsuba_agreement.py --output-dir /tmp/agreement --scene pear
 
 Mitsuba renders each image several times with different seeds. The scatter gives the Monte-Carlo error of the
 difference.
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import mitsuba_rendering
 import numpy as np
 import tyro
 from jaxtyping import Float
@@ -24,15 +25,15 @@ from rich.progress import track
 from rich.table import Table
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.simulate import mitsuba_render
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
+from hsi_sc_nerf.simulate.sensor import band_centres_nm
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
 BOTH = ("chamber_shading", "inter_reflection")
-COMPARISONS: dict[mitsuba_render.Transport, tuple[str, ...]] = {
+COMPARISONS: dict[mitsuba_rendering.Transport, tuple[str, ...]] = {
     "even": (),
     "chamber": ("chamber_shading",),
     "one_bounce": BOTH,
@@ -110,13 +111,13 @@ def render_ours(scene: Scene, frame: int) -> Ours:
 
 
 def compare(
-    scene: Scene, frame: int, transport: mitsuba_render.Transport, ours: Ours, rays_per_pixel: int, repeats: int
+    scene: Scene, frame: int, transport: mitsuba_rendering.Transport, ours: Ours, rays_per_pixel: int, repeats: int
 ) -> Agreement:
     """Render one frame with Mitsuba and hold it against ours."""
     start = time.perf_counter()
     renders = np.stack(
         [
-            mitsuba_render.render(scene, frame, transport, rays_per_pixel=rays_per_pixel, seed=seed)
+            mitsuba_rendering.render(scene, frame, transport, rays_per_pixel=rays_per_pixel, seed=seed)
             for seed in track(range(repeats), f"{scene.name}, {transport}", transient=True)
         ]
     )
@@ -192,17 +193,17 @@ class MitsubaAgreement:
         _picture(found, scene, stem.with_suffix(".png"))
         _print(found)
 
-    def _report(self, found: dict[mitsuba_render.Transport, Agreement]) -> dict[str, Any]:
+    def _report(self, found: dict[mitsuba_rendering.Transport, Agreement]) -> dict[str, Any]:
         numbers = ("rms", "monte_carlo", "ray_grid", "expected", "bias", "bias_of_material", "seconds")
         settings = {key: value for key, value in dataclasses.asdict(self).items() if key != "output_dir"}
         return {
             **settings,
-            "mitsuba": mitsuba_render.mi.__version__,
+            "mitsuba": mitsuba_rendering.mi.__version__,
             "transports": {name: {key: getattr(each, key) for key in numbers} for name, each in found.items()},
         }
 
 
-def _print(found: dict[mitsuba_render.Transport, Agreement]) -> None:
+def _print(found: dict[mitsuba_rendering.Transport, Agreement]) -> None:
     table = Table("1e-3", "RMS", "expected", "Monte Carlo", "ray grid", "bias", "our s", "its s")
     of_material = Table("bias, 1e-3", *found)
     for transport, each in found.items():
@@ -220,9 +221,9 @@ def _print(found: dict[mitsuba_render.Transport, Agreement]) -> None:
     Console().print(of_material)
 
 
-def _picture(found: dict[mitsuba_render.Transport, Agreement], scene: Scene, path: Path) -> None:
+def _picture(found: dict[mitsuba_rendering.Transport, Agreement], scene: Scene, path: Path) -> None:
     """Ours, Mitsuba's and the difference, a row for each transport."""
-    centres_nm = mitsuba_render.sensor.band_centres_nm(scene.sensor.bands)
+    centres_nm = band_centres_nm(scene.sensor.bands)
     rgb = [int(np.abs(centres_nm - wanted_nm).argmin()) for wanted_nm in paper.PSEUDO_RGB_NM]
     figure, axes = plt.subplots(len(found), 3, figsize=(7.0, 2.3 * len(found)), layout="constrained", squeeze=False)
     for row, (transport, each) in zip(axes, found.items(), strict=True):

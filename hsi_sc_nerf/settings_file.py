@@ -6,7 +6,9 @@ Every error is one sentence that names the file and the key.
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
+from collections.abc import Iterator
 from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -15,7 +17,7 @@ from hsi_sc_nerf.errors import InputError
 
 
 def between(low: float, high: float, **kwargs: Any) -> Any:
-    """A dataclass field whose value must lie in [low, high]."""
+    """A dataclass field whose value must lie in [low, high]; ``high`` may be infinite."""
     return field(metadata={"range": (low, high)}, **kwargs)
 
 
@@ -101,14 +103,32 @@ def check_ranges(values: Any, source: str, prefix: str) -> None:
     Raises:
         InputError: a value lies outside its range.
     """
+    for name, value, limits in _outside_range(values, prefix):
+        raise InputError(f"{source}: {name} is {value:g}, but must {limits}.")
+
+
+def check_options(command: Any) -> None:
+    """Check the ranges of a command's options, which are fields made by `between`.
+
+    Raises:
+        InputError: an option lies outside its range.
+    """
+    for name, value, limits in _outside_range(command, "--"):
+        raise InputError(f"{name.replace('_', '-')} is {value}; it must {limits}.")
+
+
+def _outside_range(values: Any, prefix: str) -> Iterator[tuple[str, float, str]]:
+    """Name, value and description of the range of each field outside its range."""
     for f in dataclasses.fields(values):
         value = getattr(values, f.name)
         if dataclasses.is_dataclass(value):
-            check_ranges(value, source, f"{prefix}{f.name}.")
+            yield from _outside_range(value, f"{prefix}{f.name}.")
         elif "range" in f.metadata and value is not None:
             low, high = f.metadata["range"]
             # Written so that NaN fails as well.
             if not low <= value <= high:
-                raise InputError(
-                    f"{source}: {prefix}{f.name} is {value:g}, but must lie between {low:g} and {high:g}."
+                yield (
+                    prefix + f.name,
+                    value,
+                    f"lie between {low:g} and {high:g}" if high < math.inf else f"be at least {low:g}",
                 )

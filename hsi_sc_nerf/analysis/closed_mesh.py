@@ -13,6 +13,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.settings_file import between
 
 # Smoothing radius over the spacing of thinned points: about thirty points determine a quadric.
 _THINNING = 3.0
@@ -31,9 +32,9 @@ _RIDGE = 1e-6
 class MeshConfig:
     """How a cloud is closed to a mesh."""
 
-    octree_depth: int = paper.POISSON_DEPTH
+    octree_depth: int = between(4, 12, default=paper.POISSON_DEPTH)
     """Depth of the Poisson reconstruction's octree: each step halves the mesh's triangles in size."""
-    smoothing_radius_m: float = 0.002
+    smoothing_radius_m: float = between(1e-6, 1.0, default=0.002)
     """Surface details smaller than this, in metres, are smoothed away as noise of the reconstruction."""
     base_height_m: float | None = None
     """Height of the object's base above the turntable's disc, in metres (the container's height), where the unseen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import sys
 import tempfile
@@ -32,6 +33,7 @@ from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, write_json
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
+from hsi_sc_nerf.settings_file import between, check_options
 
 
 @dataclass(frozen=True)
@@ -55,18 +57,18 @@ class BenchmarkCommand:
     common: str = ""
     """Words for every configuration, joined to the option by an equals sign, for example
     --common="--pipeline.datamanager.train-num-rays-per-batch 1024"."""
-    train_seconds: float = 600.0
+    train_seconds: float = between(0.001, math.inf, default=600.0)
     """Training time of each configuration; a short rehearsal determines how many iterations fit."""
     clock: Clock = "wall"
     """Unit of --train-seconds and the picture: wall time, or processor time over all threads (cpu), which is fairer
     on a machine that also does other work."""
-    iterations: int | None = None
+    iterations: int | None = between(1, math.inf, default=None)
     """The same number of iterations for each configuration instead of the same time."""
     checkpoints: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0)
     """Fractions of a run at which held-out views are evaluated; the end of each stage always is."""
-    held_out_views: int | None = None
+    held_out_views: int | None = between(1, math.inf, default=None)
     """Evaluate this many of the held-out views, evenly spread, instead of all."""
-    threads: int | None = None
+    threads: int | None = between(1, math.inf, default=None)
     """CPU threads of each run. Default: all cores."""
 
     def main(self) -> None:
@@ -140,6 +142,7 @@ def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> l
 
 def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -> None:
     """Refuse settings that would fail later."""
+    check_options(command)
     names = [configuration.name for configuration in configurations]
     twice = {name for name in names if names.count(name) > 1}
     if not names or twice:
@@ -148,15 +151,6 @@ def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -
             if twice
             else "nothing to train: --configurations and --sets are both empty; name one configuration at least."
         )
-    given = {
-        "--train-seconds": command.train_seconds,
-        "--iterations": command.iterations,
-        "--held-out-views": command.held_out_views,
-        "--threads": command.threads,
-    }
-    for option, value in given.items():
-        if value is not None and value <= 0:
-            raise InputError(f"{option} is {value}; it must be more than 0.")
     if not all(0 < fraction <= 1 for fraction in command.checkpoints):
         raise InputError(f"--checkpoints are fractions of a run, above 0 and at most 1, not {command.checkpoints}.")
     for configuration in configurations:

@@ -53,10 +53,9 @@ class DemoCommand:
             InputError: a step failed, or the folder cannot be used.
         """
         # Deferred because Open3D takes seconds to import.
-        from hsi_sc_nerf.cli.demo_report import draw_pictures, score, score_dataset, show_table, write_summary
+        from hsi_sc_nerf.cli.demo_report import draw_pictures, score, show_table, write_summary
 
-        console = Console()
-        out = self.output_dir
+        console, out = Console(), self.output_dir
         logs = out / "logs"
         make_folder(out)
         if any(out.iterdir()) and not (out / MARK).is_file():
@@ -97,9 +96,9 @@ class DemoCommand:
         for number, (name, argv) in enumerate(commands.items(), start=1):
             console.print(f"[bold]{number}/{len(commands) + 1} {name}")
             costs.append(run_step(name, argv, logs / f"{name}.log"))
-        console.print(f"[bold]{len(commands) + 1}/{len(commands) + 1} compare")
+        console.print(f"[bold]{len(costs) + 1}/{len(commands) + 1} compare")
         started = time.perf_counter()
-        metrics, processing = score(out), score_dataset(out)
+        metrics, processing = score(out)
         draw_pictures(out)
         costs.append(own_cost("compare", started))
         write_summary(out, metrics, processing, costs)

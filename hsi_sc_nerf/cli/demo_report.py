@@ -34,24 +34,24 @@ REFERENCE_POINTS = 100_000
 MARKED_POINTS = 4
 FRONT_LAYER_M = 0.005
 # The paper's results of the apple, its hardest object, for comparison.
-PAPER_APPLE = {"sam": 0.0642, "rmse": 0.0438, "ssim": 0.742, "psnr": 24.49, "f_score": None}
+PAPER_APPLE = {"sam": 0.0642, "rmse": 0.0438, "ssim": 0.742, "psnr": 24.49}
 
 
-def score(out: Path) -> dict[str, float]:
-    """Held-out metrics of ``ns-eval``, and F-score of the cloud against the true mesh without alignment."""
+def score(out: Path) -> tuple[dict[str, float], ProcessingScore]:
+    """Metrics of the result, and errors of the processed dataset.
+
+    The metrics are those of ``ns-eval`` on held-out views, and precision, recall and F-score of the cloud against the
+    true mesh without alignment.
+    """
     results = json.loads((out / "eval.json").read_text(encoding="utf-8"))["results"]
     metrics = {f"{key}{end}": results[f"{key}{end}"] for key in SPECTRAL_METRICS for end in ("", "_std")}
-    mesh = load_truth(out / "session").mesh()
+    truth = load_truth(out / "session")
+    mesh, cloud = truth.mesh(), read_spectral_ply(out / "point_cloud.ply")
     reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
-    cloud = read_spectral_ply(out / "point_cloud.ply")
     spatial, spread = f_score_with_spread(cloud.points, reference, paper.F_SCORE_THRESHOLD_M)
     metrics |= {"f_score": spatial.f_score, "f_score_std": spread}
-    return metrics | {"precision": spatial.precision, "recall": spatial.recall}
-
-
-def score_dataset(out: Path) -> ProcessingScore:
-    """Errors of poses, camera, reflectance and masks."""
-    return score_processing(open_packed(out / "data"), load_truth(out / "session"))
+    metrics |= {"precision": spatial.precision, "recall": spatial.recall}
+    return metrics, score_processing(open_packed(out / "data"), truth)
 
 
 def write_summary(
@@ -76,19 +76,17 @@ def show_table(
     console: Console, out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
 ) -> None:
     """Print metrics, errors and costs."""
-    quality = Table(title="Held-out views, masked to the object; cloud against the true mesh")
-    for title in ("metric", "mean ± SD", "paper's apple"):
-        quality.add_column(title)
+    quality = Table(
+        *("metric", "mean ± SD", "paper's apple"),
+        title="Held-out views, masked to the object; cloud against the true mesh",
+    )
     units = {"sam": "SAM, rad", "rmse": "RMSE", "ssim": "SSIM", "psnr": "PSNR, dB", "f_score": "F-score at 2 mm, %"}
     for key, title in units.items():
         digits = 1 if key in ("psnr", "f_score") else 4
-        published = PAPER_APPLE[key]
-        value = f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}"
-        quality.add_row(title, value, "-" if published is None else f"{published:.{digits}f}")
-    errors_table = Table(title="Processing against the truth")
-    for title in ("error", "value", "target"):
-        errors_table.add_column(title)
-    for title, value, target in (
+        published = f"{PAPER_APPLE[key]:.{digits}f}" if key in PAPER_APPLE else "-"
+        quality.add_row(title, f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}", published)
+    errors_table = Table("error", "value", "target", title="Processing against the truth")
+    for row in (
         ("rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"),
         ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
         ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
@@ -96,10 +94,8 @@ def show_table(
         ("values flagged, %", f"{100 * processing.flagged_fraction:.2f}", "-"),
         ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
     ):
-        errors_table.add_row(title, value, target)
-    cost_table = Table(title="Cost")
-    for title in ("step", "seconds", "peak memory, MiB"):
-        cost_table.add_column(title, justify="left" if title == "step" else "right")
+        errors_table.add_row(*row)
+    cost_table = Table("step", "seconds", "peak memory, MiB", title="Cost")
     for cost in costs:
         cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
     cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between, check_options
 
 
 @dataclass(frozen=True)
@@ -31,16 +33,16 @@ class RenderCommand:
     the object before the session's camera."""
     camera_path: Path | None = None
     """Render these cameras instead: a path that nerfstudio's viewer exported (JSON)."""
-    orbit_views: int = 60
+    orbit_views: int = between(1, math.inf, default=60)
     """Number of views of an orbit."""
-    orbit_size: float = 1.0
+    orbit_size: float = between(0.01, 100.0, default=1.0)
     """Factor on the size of an orbit's images; 2 doubles the pixels in each direction."""
     cubes: Literal["float32", "uint16", "none"] = "float32"
     """Type of the numbers in the cubes. float32: reflectance. uint16: reflectance times the header's scale factor, in
     half the space. none: no cubes."""
     video: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Name of a composite or an index to make a video (MP4) of, such as CIR or NDVI; may be given several times."""
-    frames_per_second: int = 15
+    frames_per_second: int = between(1, 1000, default=15)
     """Frame rate of the videos."""
 
     def main(self) -> None:
@@ -49,8 +51,7 @@ class RenderCommand:
         Raises:
             InputError: the run, a camera path or a name cannot be used, or a result cannot be written.
         """
-        if min(self.orbit_views, self.frames_per_second) < 1 or self.orbit_size <= 0.0:
-            raise InputError("--orbit-views, --orbit-size and --frames-per-second have to be positive; correct them.")
+        check_options(self)
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         from hsi_sc_nerf.files import atomic_write

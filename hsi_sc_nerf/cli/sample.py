@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between, check_options
 
 _METRES = {"m": 1.0, "mm": 1e-3}
 _EXTRA = ("sampled_views", "sampled_std")
@@ -33,9 +35,9 @@ class SampleCommand:
     """File to write. By default NAME-spectral.ply in the folder of the points."""
     unit: Literal["m", "mm"] = "m"
     """Unit of the coordinates in the file; they are written in the same unit."""
-    max_distance_mm: float = 3.0
+    max_distance_mm: float = between(0.001, 1000.0, default=3.0)
     """Largest distance of a point from the run's surface, in millimetres; points further away get no spectrum."""
-    views: int = 4
+    views: int = between(1, math.inf, default=4)
     """Training views to average at each point, the most frontal first. More take longer."""
 
     def main(self) -> None:
@@ -45,13 +47,11 @@ class SampleCommand:
             InputError: the points or the run cannot be used, no point lies on the object, or the result cannot be
                 written.
         """
-        if self.max_distance_mm <= 0.0 or self.views < 1:
-            raise InputError("--max-distance-mm has to be greater than 0 and --views at least 1; correct them.")
+        check_options(self)
         from hsi_sc_nerf.export.sampled_ply import SpectralColumns, read_points
 
         given = read_points(self.points)
         normals = given.normals()
-        output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
 
         from hsi_sc_nerf.export.sample_points import sample_points
         from hsi_sc_nerf.models.trained_run import open_run
@@ -73,6 +73,7 @@ class SampleCommand:
                 f"{self.points}: none of its points lies on the object; give them in the object's frame (origin on "
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
+        output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
         columns.write(output)
         console = Console()
         if no_spectrum:

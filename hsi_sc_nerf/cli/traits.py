@@ -15,6 +15,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
+from hsi_sc_nerf.settings_file import between, check_options
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.analysis.size import Size
@@ -38,7 +39,7 @@ class TraitsCommand:
     --mesh.base-height-m."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """Settings of the mesh."""
-    splits: int = 6
+    splits: int = between(0, math.inf, default=6)
     """Number of random splits of the cloud into halves, which are meshed separately for the uncertainty of the sizes;
     0 for none."""
     max_incidence_deg: float = MAX_INCIDENCE_DEG
@@ -49,7 +50,7 @@ class TraitsCommand:
     nm, then a column a spectrum). Spectra of one name are references of one class."""
     classes: tuple[str, ...] = ()
     """Names of the library's spectra to use. Default: all."""
-    angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD
+    angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
     """Largest spectral angle, in radians, between a spectrum and its class."""
     smallest_region_cm2: float = 0.05
     """Connected regions of a class below this area are not listed (their area still counts)."""
@@ -73,7 +74,9 @@ class TraitsCommand:
         from hsi_sc_nerf.export.ply import read_spectral_ply
         from hsi_sc_nerf.progress import progress_bar
 
-        self._check()
+        check_options(self)
+        if self.classes and self.library is None:
+            raise InputError("--classes names spectra of a library; give it with --library.")
         picked = [region_of_interest(*words) for words in self.roi]
         picked += read_regions(self.roi_file) if self.roi_file else []
         library = read_library(self.library) if self.library else None
@@ -98,19 +101,6 @@ class TraitsCommand:
         with console.status("tables and pictures"):
             self._write(surface, size, spread, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
-
-    def _check(self) -> None:
-        """Refuse settings that would fail later."""
-        if self.splits < 0:
-            raise InputError(f"--splits is {self.splits}; give 0 for none, or more.")
-        if not 4 <= self.mesh.octree_depth <= 12:
-            raise InputError(f"--mesh.octree-depth is {self.mesh.octree_depth}; it must be from 4 to 12.")
-        if not self.mesh.smoothing_radius_m > 0.0:
-            raise InputError(f"--mesh.smoothing-radius-m is {self.mesh.smoothing_radius_m}; it must be more than 0.")
-        if not 0.0 < self.angle_rad <= math.pi:
-            raise InputError(f"--angle-rad is {self.angle_rad}; give more than 0 and at most pi (0.1 is usual).")
-        if self.classes and self.library is None:
-            raise InputError("--classes names spectra of a library; give it with --library.")
 
     def _base_height_m(self) -> float | None:
         """Height of the object's base above the turntable, if it is known."""

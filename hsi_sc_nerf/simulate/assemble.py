@@ -11,8 +11,8 @@ from jaxtyping import Float
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh, plants, target
-from hsi_sc_nerf.simulate.effects import of_stage
-from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, effect_rng
+from hsi_sc_nerf.simulate.effect import effect_rng, of_kind
+from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import CameraSettings, Cylinder, MaizeEar, Object, OwnMesh, Scene, Sphere
@@ -26,7 +26,7 @@ def intrinsics(camera: CameraSettings) -> PinholeIntrinsics:
 
 
 def first_camera(camera: CameraSettings) -> Float[np.ndarray, "4 4"]:
-    """CameraSettings-to-world of the first frame: above the x axis, looking at the turntable's axis."""
+    """Camera-to-world pose of the first frame: above the x axis, looking at the turntable's axis."""
     elevation = np.deg2rad(camera.elevation_deg)
     aim = np.array([0.0, 0.0, camera.aim_height_m])
     return look_at(aim + camera.distance_m * np.array([np.cos(elevation), 0.0, np.sin(elevation)]), aim)
@@ -43,7 +43,7 @@ def frame_plan(scene: Scene) -> FramePlan:
         nominal_step_deg=360.0 / frames,
         direction=scene.turntable.direction,
     )
-    for effect in of_stage(scene.effects, MotionEffect):
+    for effect in of_kind(scene.effects, MotionEffect):
         plan = effect.replan(plan, effect_rng(scene.seed, effect))
     return plan
 
@@ -80,10 +80,10 @@ def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
-    parts = [
-        _plain(target.disc_mesh(scene.turntable, spacing_m), "disc"),
-        _plain(target.container_mesh(scene.container, spacing_m), "container_plastic"),
-    ]
+    disc = cylinder(scene.turntable.disc_diameter_m, target.DISC_THICKNESS_M, spacing_m=spacing_m)
+    disc = disc.moved(np.array([0.0, 0.0, -target.DISC_THICKNESS_M - target.PRINT_HEIGHT_M]))
+    container = cylinder(scene.container.diameter_m, scene.container.height_m, spacing_m=spacing_m)
+    parts = [_plain(disc, "disc"), _plain(container, "container_plastic")]
     on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
         mesh, ink = target.marker_mesh(frame, number, scene.markers)

@@ -11,11 +11,16 @@ from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble, sensor
-from hsi_sc_nerf.simulate.effects import of_stage, stages
-from hsi_sc_nerf.simulate.effects.stages import effect_rng
-from hsi_sc_nerf.simulate.light import Light, colour_spectra
-from hsi_sc_nerf.simulate.lighting import Lighting
-from hsi_sc_nerf.simulate.materials import endmembers, known_materials
+from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
+from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
+from hsi_sc_nerf.simulate.effects.detector import ExposureEffect, ReadoutContext, ReadoutEffect, SpectralSmile
+from hsi_sc_nerf.simulate.effects.illumination import IlluminationEffect
+from hsi_sc_nerf.simulate.effects.motion import OffCentre
+from hsi_sc_nerf.simulate.effects.object import Deformation, Drying
+from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
+from hsi_sc_nerf.simulate.light import Light, LightEffect, SurfaceLightEffect, colour_spectra
+from hsi_sc_nerf.simulate.lighting import Lighting, render
+from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import Scene
 
@@ -74,133 +79,120 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene) -> None:
-        effects = scene.effects
+        effects, size_px = scene.effects, scene.camera.size_px
         self.scene = scene
         self.plan = assemble.frame_plan(scene)
         self.intrinsics = assemble.intrinsics(scene.camera)
-        self.offset_m = sum((e.offset_m() for e in of_stage(effects, stages.PlacementEffect)), np.zeros(3))
-        self._light = of_stage(effects, stages.LightEffect)
-        covers = of_stage(effects, stages.ChamberEffect)
+        off_centre = find_effect(effects, OffCentre)
+        self.offset_m = off_centre.offset_m() if off_centre else np.zeros(3)
+        self.lens = find_effect(effects, LensDistortion)
+        self._blur = find_effect(effects, OpticalBlur)
+        self._rotation = find_effect(effects, ImageRotation)
+        self._drying = find_effect(effects, Drying)
+        self._deformation = find_effect(effects, Deformation)
+        self._light = tuple(effect for effect in effects if isinstance(effect, LightEffect))
+        self._illumination = of_kind(effects, IlluminationEffect)
+        self._exposures = of_kind(effects, ExposureEffect)
+        self._readout = of_kind(effects, ReadoutEffect)
+
         scanned = assemble.object_part(scene)
         self.object_part = replace(scanned, mesh=scanned.mesh.moved(self.offset_m))
-        self._chamber_materials = [name for cover in covers for name in cover.materials]
-        self.renderer = self._renderer_of(self.object_part)
-        self._lighting = self._lit(self.renderer)
+        background = find_effect(effects, TexturedBackground)
+        self._background_materials = background.materials if background else ()
+        self.renderer, self._lighting = self._renderer_and_light(self.object_part)
         self.materials = self.renderer.materials
-        self._chamber = [
-            cover.cover(scene.camera.size_px, self.materials, effect_rng(scene.seed, cover)) for cover in covers
-        ]
-        lenses = of_stage(effects, stages.LensEffect)
-        self.lens = lenses[0] if lenses else None
-        self._optics = of_stage(effects, stages.OpticsEffect)
-        self._material = of_stage(effects, stages.MaterialEffect)
-        self._object_materials = [known_materials(scene.materials)[name] for name in scanned.materials]
-        self._illumination = of_stage(effects, stages.IlluminationEffect)
-        self._readout = of_stage(effects, stages.ReadoutEffect)
-        self._orientation = of_stage(effects, stages.OrientationEffect)
-        self._deformation = of_stage(effects, stages.DeformationEffect)
+        self._background = None
+        if background:
+            # The pattern replaces the chamber, which is the last material.
+            pattern = background.cover(size_px, self.materials, effect_rng(scene.seed, background))
+            self._background = pattern - np.eye(len(self.materials))[-1]
+        self._object_materials = [(MATERIALS | scene.materials)[name] for name in scanned.materials]
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
         self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
-        self._detector_nm = self.wavelengths_nm
-        for detector in of_stage(effects, stages.DetectorEffect):
-            self._detector_nm = detector.wavelengths_nm(self._detector_nm, scene.camera.size_px)
+        smile = find_effect(effects, SpectralSmile)
+        self._detector_nm = smile.wavelengths_nm(self.wavelengths_nm, size_px) if smile else self.wavelengths_nm
         self._signal_of_white = sensor.white_signal(scene.sensor, self._detector_nm)
-        self._exposures = of_stage(effects, stages.ExposureEffect)
         self.detector_maps = {
-            effect.name: effect.detector_maps(
-                scene.camera.size_px, scene.sensor.bands, effect_rng(scene.seed, effect)
-            )
+            effect.name: effect.detector_maps(size_px, scene.sensor.bands, effect_rng(scene.seed, effect))
             for effect in self._readout
         }
         self.endmembers = endmembers(self.materials, self.wavelengths_nm, scene.materials)
         self._detector_endmembers = self._detector_reflectance(self.materials)
 
-    @property
-    def integration_time_ms(self) -> float:
-        """Integration time of the frames."""
-        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=False)
-
-    @property
-    def white_integration_time_ms(self) -> float:
-        """Integration time of the white tarp's capture."""
-        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white=True)
-
     def frame(self, number: int) -> SimulatedFrame:
         """Simulate one frame of the plan."""
         elapsed = float(self.plan.elapsed[number])
         view = (self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens)
-        renderer, lighting = (self.renderer, self._lighting) if not self._deformation else self._deformed(elapsed)
-        if lighting is None:
-            weights, coverage = renderer.render(*view)
-        else:
-            rendering = lighting.render(*view)
-            weights, coverage, light_weights = rendering.material_weights, rendering.coverage, rendering.light_weights
-        for cover in self._chamber:
-            # The pattern replaces the fraction of the wall.
-            covered = weights + weights[..., -1:] * (cover - np.eye(len(self.materials))[-1])
-            weights = exact_weights(covered.reshape(-1, len(self.materials))).reshape(weights.shape)
+        renderer, lighting = self._deformed(elapsed) if self._deformation else (self.renderer, self._lighting)
+        rendering = render(renderer, *view, lighting)
+        weights, light_weights = rendering.material_weights, rendering.light_weights
+        if self._background is not None:
+            count = len(self.materials)
             if lighting is not None:
-                wall = light_weights[..., len(self.materials) - 1, None]
-                light_weights[..., : len(self.materials)] += wall * (cover - np.eye(len(self.materials))[-1])
+                light_weights[..., :count] += light_weights[..., count - 1, None] * self._background
+            weights = exact_weights((weights + weights[..., -1:] * self._background).reshape(-1, count))
+            weights = weights.reshape(*rendering.coverage.shape, count)
+            if lighting is None:
+                light_weights = weights
         spectra = self._detector_endmembers
-        if self._material:
+        if self._drying:
             of_object = [self.materials.index(name) for name in self.object_part.materials]
             spectra = spectra.copy()
-            for effect in self._material:
-                spectra[..., of_object, :] = effect.spectra(
-                    spectra[..., of_object, :], self._object_materials, self._detector_nm, elapsed
-                )
-        if lighting is None:
-            light = Light(weights, spectra)
-        else:
-            light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._detector_nm))
+            spectra[..., of_object, :] = self._drying.spectra(
+                spectra[..., of_object, :], self._object_materials, self._detector_nm, elapsed
+            )
+        light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._detector_nm))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
-        return SimulatedFrame(counts, dark, light, self.integration_time_ms, weights, coverage, self.endmembers)
+        return SimulatedFrame(
+            counts,
+            dark,
+            light,
+            self._integration_time_ms(of_white=False),
+            weights,
+            rendering.coverage,
+            self.endmembers,
+        )
 
     def white(self) -> SimulatedCapture:
         """Simulate the capture of the white tarp before the first frame."""
         weights = white_capture_weights(self.scene.camera.size_px)
         light = self._on_sensor(Light(weights, self._detector_reflectance(WHITE_MATERIALS)), elapsed=0.0)
-        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self.white_integration_time_ms)
+        return SimulatedCapture(*self._expose(light, WHITE_EXPOSURE), light, self._integration_time_ms(of_white=True))
 
     def _exposure_factor(self, of_white: bool) -> float:
         return math.prod(exposure.factor(of_white) for exposure in self._exposures)
+
+    def _integration_time_ms(self, of_white: bool) -> float:
+        return paper.INTEGRATION_TIME_MS * self._exposure_factor(of_white)
 
     def _detector_reflectance(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
         """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""
         return np.moveaxis(endmembers(names, self._detector_nm, self.scene.materials), 0, -2)
 
-    def _renderer_of(self, scanned: Part) -> Renderer:
-        """The renderer of the object, which may be deformed, on its support."""
-        spacing_m = LIGHT_SPACING_M if of_stage(self._light, stages.SurfaceLightEffect) else None
-        return assemble.build_renderer(self.scene, scanned, self.offset_m, self._chamber_materials, spacing_m)
-
-    def _lit(self, renderer: Renderer) -> Lighting | None:
-        """The light on the parts of a renderer; None if it is even."""
-        return Lighting(renderer, self._light) if self._light else None
+    def _renderer_and_light(self, scanned: Part) -> tuple[Renderer, Lighting | None]:
+        """The renderer of the object, which may be deformed, on its support, and its light; None if it is even."""
+        spacing_m = LIGHT_SPACING_M if of_kind(self._light, SurfaceLightEffect) else None
+        renderer = assemble.build_renderer(self.scene, scanned, self.offset_m, self._background_materials, spacing_m)
+        return renderer, Lighting(renderer, self._light) if self._light else None
 
     def _deformed(self, elapsed: float) -> tuple[Renderer, Lighting | None]:
         """The renderer of the deformed object at time ``elapsed``, and its light."""
-        vertices = self.object_part.mesh.vertices
+        assert self._deformation is not None
+        mesh = self.object_part.mesh
         foot_m = self.offset_m + np.array([0.0, 0.0, self.scene.container.height_m])
-        for effect in self._deformation:
-            vertices = effect.deform(vertices, foot_m, elapsed)
-        deformed = replace(self.object_part, mesh=replace(self.object_part.mesh, vertices=vertices))
-        renderer = self._renderer_of(deformed)
-        return renderer, self._lit(renderer)
+        deformed = replace(mesh, vertices=self._deformation.deform(mesh.vertices, foot_m, elapsed))
+        return self._renderer_and_light(replace(self.object_part, mesh=deformed))
 
     def _on_sensor(self, light: Light, elapsed: float) -> Light:
         """The light after optics and illumination at time ``elapsed``, rotated as in the file."""
-        weights = light.weights
-        for effect in self._optics:
-            weights = effect.image(weights)
+        weights = self._blur.image(light.weights) if self._blur else light.weights
         size_px = self.scene.camera.size_px
         lamp_k = self.scene.sensor.lamp_temperature_k
         factors = tuple(e.factor(size_px, self.wavelengths_nm, lamp_k, elapsed) for e in self._illumination)
-        for rotation in self._orientation:
-            weights, factors = rotation.orient(weights), tuple(map(rotation.orient, factors))
+        if self._rotation:
+            weights, factors = self._rotation.orient(weights), tuple(map(self._rotation.orient, factors))
         return replace(light, weights=weights, illumination=factors)
 
     def _expose(
@@ -228,7 +220,7 @@ class Simulation:
         counts += self.scene.sensor.dark_level
         largest = sensor.largest_count(self.scene.sensor)
         for effect, rng in zip(self._readout, random, strict=True):
-            context = stages.ReadoutContext(
+            context = ReadoutContext(
                 largest_count=largest,
                 dark_level=self.scene.sensor.dark_level,
                 electrons_per_count=self.scene.sensor.full_well_electrons / largest,

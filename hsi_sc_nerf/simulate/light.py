@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.render import Hits, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
 
 SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
@@ -139,8 +142,31 @@ class HitLight:
     mirrored: tuple[tuple[Colour, Float[np.ndarray, "hits"]], ...] = ()
 
 
+class SurfaceLightEffect(Effect):
+    """Changes the light that leaves the surface equally in all directions and rotates with the object."""
+
+    def on_surface(self, light: SurfaceLight) -> SurfaceLight:
+        """The light of the surface under the effect."""
+        raise NotImplementedError
+
+
+class ViewLightEffect(Effect):
+    """Changes light that depends on the view; acts after all `SurfaceLightEffect`."""
+
+    def at_hits(self, hits: Hits, light: HitLight, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
+        """The light under the effect at the hits of the camera's rays."""
+        raise NotImplementedError
+
+
+LightEffect: TypeAlias = SurfaceLightEffect | ViewLightEffect
+
+
 def even_light(surface: Surface) -> SurfaceLight:
     """The light of a surface under the irradiance 1 at every point."""
     materials = surface.renderer.weights[surface.vertex]
-    colours = tuple(Colour((i,)) for i in range(len(surface.renderer.materials)))
-    return SurfaceLight(surface, colours, materials, materials)
+    return SurfaceLight(surface, single_colours(surface.renderer), materials, materials)
+
+
+def single_colours(renderer: Renderer) -> tuple[Colour, ...]:
+    """The colours of single materials, in the renderer's order."""
+    return tuple(Colour((i,)) for i in range(len(renderer.materials)))

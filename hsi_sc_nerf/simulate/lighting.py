@@ -19,20 +19,28 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.effects.stages import LightEffect, SurfaceLightEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.light import Colour, HitLight, even_light
+from hsi_sc_nerf.simulate.effect import of_kind
+from hsi_sc_nerf.simulate.light import (
+    Colour,
+    HitLight,
+    LightEffect,
+    SurfaceLightEffect,
+    ViewLightEffect,
+    even_light,
+    single_colours,
+)
 from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An image under uneven light.
+    """An image and its light.
 
     Attributes:
         material_weights: fraction of each material in each pixel, summing to exactly 1.
         coverage: fraction of each pixel that the object covers.
-        light_weights: amount of each colour in the light of each pixel.
+        light_weights: amount of each colour in the light of each pixel; in even light ``material_weights`` itself.
         colours: colours of the light; those of single materials come first.
     """
 
@@ -42,35 +50,46 @@ class Rendering:
     colours: tuple[Colour, ...]
 
 
+def render(
+    renderer: Renderer,
+    intrinsics: PinholeIntrinsics,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    supersampling: int,
+    lens: Lens | None = None,
+    lighting: Lighting | None = None,
+) -> Rendering:
+    """An image of a camera; a pixel is the mean over ``supersampling``² evenly spaced rays (a box filter).
+
+    Args:
+        renderer: the parts.
+        intrinsics: of the camera.
+        camera_to_world: pose of the camera, OpenGL axes, metres.
+        supersampling: rays per pixel along each side.
+        lens: bends the rays of the pinhole camera.
+        lighting: light on the parts of ``renderer``; even light by default.
+    """
+    size = intrinsics.h, intrinsics.w
+    weights = np.empty((*size, len(renderer.materials)), np.float32)
+    coverage = np.empty(size, np.float32)
+    colours, light_of_rows = single_colours(renderer), []
+    for rows, hits in renderer.camera_hits(intrinsics, camera_to_world, supersampling, lens):
+        weights[rows] = renderer.material_weights(hits).reshape(-1, intrinsics.w, len(renderer.materials))
+        coverage[rows] = hits.mean(hits.is_object).reshape(-1, intrinsics.w)
+        if lighting is not None:
+            light, colours = lighting.light(hits, camera_to_world)
+            light_of_rows.append(light.reshape(-1, intrinsics.w, len(colours)))
+    return Rendering(weights, coverage, np.concatenate(light_of_rows) if lighting else weights, colours)
+
+
 class Lighting:
     """The light on the parts of a renderer under some effects; view-independent light is computed once, here."""
 
     def __init__(self, renderer: Renderer, effects: Sequence[LightEffect]) -> None:
-        on_surface = [effect for effect in effects if isinstance(effect, SurfaceLightEffect)]
-        self._on_view = [effect for effect in effects if isinstance(effect, ViewLightEffect)]
+        self._on_view = of_kind(effects, ViewLightEffect)
         self._renderer = renderer
         self._light = even_light(Surface(self._renderer))
-        for effect in on_surface:
+        for effect in of_kind(effects, SurfaceLightEffect):
             self._light = effect.on_surface(self._light)
-
-    def render(
-        self,
-        intrinsics: PinholeIntrinsics,
-        camera_to_world: Float[np.ndarray, "4 4"],
-        supersampling: int,
-        lens: Lens | None = None,
-    ) -> Rendering:
-        """An image and its light; arguments as in `Renderer.render`."""
-        size, materials = (intrinsics.h, intrinsics.w), len(self._renderer.materials)
-        weights = np.empty((*size, materials), np.float32)
-        coverage = np.empty(size, np.float32)
-        light_of_rows = []
-        for rows, hits in self._renderer.camera_hits(intrinsics, camera_to_world, supersampling, lens):
-            weights[rows] = self._renderer.material_weights(hits).reshape(-1, intrinsics.w, materials)
-            coverage[rows] = hits.mean(hits.is_object).reshape(-1, intrinsics.w)
-            light, colours = self.light(hits, camera_to_world)
-            light_of_rows.append(light.reshape(-1, intrinsics.w, len(colours)))
-        return Rendering(weights, coverage, np.concatenate(light_of_rows), colours)
 
     def light(
         self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]

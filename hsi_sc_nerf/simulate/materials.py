@@ -100,11 +100,6 @@ KINDS = {"plant": PlantTissue, "plain": Plain}
 COLUMNS = ("wavelength_nm", "reflectance")
 
 
-def known_materials(own: Mapping[str, Material]) -> dict[str, Material]:
-    """All materials by name; ``own`` materials replace built-in ones of the same name."""
-    return {**MATERIALS, **own}
-
-
 def endmembers(
     names: Sequence[str], wavelengths_nm: Spectrum, own: Mapping[str, Material] | None = None
 ) -> Float[np.ndarray, "materials bands"]:
@@ -115,7 +110,7 @@ def endmembers(
     Raises:
         KeyError: a name is neither in ``own`` nor in `MATERIALS`.
     """
-    known = known_materials(own or {})
+    known = {**MATERIALS, **(own or {})}
     return np.stack([reflectance(known[name], np.asarray(wavelengths_nm, float)) for name in names])
 
 

@@ -10,12 +10,12 @@ import trimesh
 from jaxtyping import Float, Int
 from PIL import Image
 from plyfile import PlyData
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import snapped, subdivided, welded
 from hsi_sc_nerf.simulate.scene import OwnMesh
-from hsi_sc_nerf.simulate.texture import padded_fractions, sampled
 
 Y_UP_FORMATS = (".gltf", ".glb")
 """The y axis of glTF is vertical by specification; most tools write PLY and OBJ with a vertical z axis."""
@@ -29,6 +29,8 @@ TEXTURE_SPACING_M = 0.001
 """Largest edge length after the subdivision for sampling a texture at the vertices."""
 CHANNELS = 3
 """Colour channels of vertex colours and textures, each the fraction of one material."""
+PADDING_PX = 8
+"""Distance by which painted islands of a weight texture are dilated."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,25 @@ def _weights_from_texture(
     fine, triangles = subdivided(np.column_stack([vertices, surface.uv]), surface.triangles, TEXTURE_SPACING_M)
     weights = sampled(padded_fractions(pixels), fine[:, 3:])
     return fine[:, :3], triangles, _normalised_weights(weights, f"{path}: the texture where some of the surface lies")
+
+
+def padded_fractions(image: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "h w m"]:
+    """Normalise the channels of an image to fractions that sum to 1; unpainted texels stay 0.
+
+    Texels within `PADDING_PX` of a painted one get its fractions, because UV islands end between texels.
+    """
+    total = image.sum(axis=-1, keepdims=True)
+    fractions = np.divide(image, total, out=np.zeros_like(image), where=total > 0.0)
+    distance_px, nearest = distance_transform_edt(total[..., 0] == 0.0, return_indices=True)
+    return np.where((distance_px <= PADDING_PX)[..., None], fractions[tuple(nearest)], 0.0)
+
+
+def sampled(image: Float[np.ndarray, "h w m"], uv: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v m"]:
+    """Bilinear samples at UVs with the origin in the lower left corner; the image repeats outside [0, 1]."""
+    height, width = image.shape[:2]
+    texels = [(1.0 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5]
+    channels = np.moveaxis(image, -1, 0)
+    return np.stack([map_coordinates(channel, texels, order=1, mode="grid-wrap") for channel in channels], axis=-1)
 
 
 def _vertex_weights(settings: OwnMesh) -> Float[np.ndarray, "v materials"] | None:

@@ -76,7 +76,8 @@ def maize(height_m: float, rng: np.random.Generator) -> PlantMesh:
     """A husked maize ear on its shank; staggered rows of kernels are part of the relief."""
     profile = _resample(_smooth(MAIZE_EAR, closed_top=True) * height_m)
     mesh = revolve(profile, SEGMENTS)
-    radius, azimuth, z = _cylindrical(mesh.vertices)
+    x, y, z = mesh.vertices.T
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x) % (2.0 * np.pi)
 
     row_position = azimuth / (2.0 * np.pi) * MAIZE_ROWS + 0.25 * np.sin(2.0 * np.pi * z / height_m)
     row = np.floor(row_position).astype(int) % MAIZE_ROWS
@@ -120,7 +121,7 @@ def _fruit(
     first_stem_vertex = 1 + (len(body_profile) - 1) * SEGMENTS
     on_stem = np.arange(len(mesh.vertices)) >= first_stem_vertex
 
-    _, azimuth, _ = _cylindrical(mesh.vertices)
+    azimuth = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0]) % (2.0 * np.pi)
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     swell = 1.0 + 0.02 * np.cos(2.0 * azimuth + phase[0]) + lobe_depth * np.cos(lobes * azimuth + phase[1])
     vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
@@ -162,12 +163,6 @@ def _resample(profile: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     return np.stack([np.interp(sampled, position, profile[:, i]) for i in range(2)], axis=-1)
 
 
-def _cylindrical(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Radius, azimuth in [0, 2 pi) and height."""
-    x, y, z = points.T
-    return np.hypot(x, y), np.arctan2(y, x) % (2.0 * np.pi), z
-
-
 def fruit_weights(shape: PlantMesh, fruit: Fruit, rng: np.random.Generator) -> Float[np.ndarray, "v 5"]:
     """Fractions of skin, blush, lenticel, bruise and stem (in the order of `FRUIT_MATERIALS`)."""
     points = shape.mesh.vertices
@@ -189,9 +184,9 @@ def fruit_weights(shape: PlantMesh, fruit: Fruit, rng: np.random.Generator) -> F
         weights = over(weights, lenticel, 0.85 * speckle(shape, fruit.lenticel_diameter_m, rng))
     if fruit.bruise_diameter_m > 0.0:
         azimuth = sun + np.pi * rng.uniform(0.6, 0.9)
-        side = np.argmin(
-            np.abs(_wrapped(np.arctan2(points[:, 1], points[:, 0]) - azimuth)) + 8.0 * np.abs(height - 0.48)
-        )
+        # Wrapped to (-pi, pi].
+        off_side = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - azimuth)))
+        side = np.argmin(np.abs(off_side) + 8.0 * np.abs(height - 0.48))
         distance = np.linalg.norm(points - points[side], axis=1)
         ragged = distance * (1.0 + 0.18 * smooth_noise(points, 0.012, rng))
         weights = over(weights, bruise, 0.9 * smoothstep((fruit.bruise_diameter_m / 2.0 - ragged) / 0.004 + 0.5))
@@ -217,15 +212,9 @@ def maize_weights(shape: PlantMesh, ear: MaizeEar, rng: np.random.Generator) -> 
 def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Float[np.ndarray, "v"]:
     """Round dots, uniform by area, with diameters within 30 % of ``diameter_m``; 1 inside, 0 outside."""
     vertices, triangles = shape.mesh.vertices, shape.mesh.triangles
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = shape.mesh.triangle_areas_m2()
     count = int(LENTICELS_PER_CM2 * shape.mesh.area_m2() * 1e4)
-    centres = a[rng.choice(len(triangles), count, p=areas / areas.sum())]
+    centres = vertices[triangles[rng.choice(len(triangles), count, p=areas / areas.sum()), 0]]
     radii = diameter_m / 2.0 * rng.uniform(0.7, 1.3, count)
     distance, nearest = cKDTree(centres).query(vertices)
     return smoothstep((radii[nearest] - distance) / (0.4 * diameter_m) + 0.5)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angle in radians wrapped to (-pi, pi]."""
-    return np.angle(np.exp(1j * angle))

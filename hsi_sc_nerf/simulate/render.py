@@ -30,6 +30,9 @@ class Lens(Protocol):
     ) -> Float[np.ndarray, "*n 2"]:
         """Pixel coordinates in the pinhole image of what the lens images at ``pixels``."""
 
+    def __hash__(self) -> int:
+        """Rays are cached by lens."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -168,24 +171,6 @@ class Renderer:
         a, b, c = (self.vertices[corner] for corner in self.triangles.T)
         doubled = np.cross(b - a, c - a)
         return (doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-30)).astype(np.float32)
-
-    def render(
-        self,
-        intrinsics: PinholeIntrinsics,
-        camera_to_world: Float[np.ndarray, "4 4"],
-        supersampling: int,
-        lens: Lens | None = None,
-    ) -> tuple[Float[np.ndarray, "h w materials"], Float[np.ndarray, "h w"]]:
-        """Material weights of each pixel (float32, summing to exactly 1) and the fraction that the object covers.
-
-        A pixel is the mean over ``supersampling`` x ``supersampling`` evenly spaced rays (a box filter).
-        """
-        weights = np.empty((intrinsics.h, intrinsics.w, len(self.materials)), np.float32)
-        coverage = np.empty((intrinsics.h, intrinsics.w), np.float32)
-        for rows, hits in self.camera_hits(intrinsics, camera_to_world, supersampling, lens):
-            weights[rows] = self.material_weights(hits).reshape(-1, intrinsics.w, len(self.materials))
-            coverage[rows] = hits.mean(hits.is_object).reshape(-1, intrinsics.w)
-        return weights, coverage
 
     def camera_hits(
         self,

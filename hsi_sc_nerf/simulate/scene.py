@@ -6,10 +6,9 @@ and the effects: departures from a matte object, even light and a perfect sensor
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -170,7 +169,7 @@ class Scene:
     camera: CameraSettings
     turntable: TurntableSettings
     markers: MarkerSettings
-    materials: dict[str, Material] = dataclasses.field(default_factory=dict)
+    materials: dict[str, Material] = field(default_factory=dict)
     """Materials of the scene; they replace built-in materials of the same name."""
     container: ContainerSettings = ContainerSettings()
     sensor: SensorSettings = SensorSettings()
@@ -230,7 +229,7 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
         values.setdefault("name", name)
         values["materials"] = read_materials(values.get("materials", {}), source, folder)
     scene = read_dataclass(Scene, values, source, "")
-    scene = dataclasses.replace(scene, effects=read_effects(scene.effects, source))
+    scene = replace(scene, effects=read_effects(scene.effects, source))
     check_ranges(scene, source, "")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", scene.name):
         raise InputError(
@@ -239,7 +238,7 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
         )
     _check_materials(scene, source)
     if isinstance(scene.object, OwnMesh):
-        scene = dataclasses.replace(scene, object=scene.object.in_folder(folder))
+        scene = replace(scene, object=scene.object.in_folder(folder))
     return scene
 
 
@@ -288,17 +287,13 @@ def override(
     Raises:
         InputError: a value is out of range.
     """
-    if frames is not None:
-        scene = dataclasses.replace(scene, turntable=dataclasses.replace(scene.turntable, frames=frames))
-    if size_px is not None:
-        scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, size_px=size_px))
-    if bands is not None:
-        scene = dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, bands=bands))
+    changes = {"frames": ("turntable", frames), "size_px": ("camera", size_px), "bands": ("sensor", bands)}
+    for name, (group, value) in changes.items():
+        if value is not None:
+            scene = replace(scene, **{group: replace(getattr(scene, group), **{name: value})})
     if seed is not None:
-        scene = dataclasses.replace(scene, seed=seed)
+        scene = replace(scene, seed=seed)
     if effects is not None:
-        scene = dataclasses.replace(
-            scene, effects=read_effects([yaml.safe_load(text) for text in effects], "--effects")
-        )
+        scene = replace(scene, effects=read_effects([yaml.safe_load(text) for text in effects], "--effects"))
     check_ranges(scene, scene.name, "")
     return scene

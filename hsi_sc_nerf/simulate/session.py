@@ -17,6 +17,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import truth
+from hsi_sc_nerf.simulate.effect import find_effect
 from hsi_sc_nerf.simulate.effects.optics import ImageRotation
 from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
@@ -143,7 +144,7 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
 def _session_values(simulation: Simulation) -> dict[str, object]:
     """Content of ``session.json``: what a user knows and the instrument does not."""
     scene, plan = simulation.scene, simulation.plan
-    quarter_turns = sum(effect.quarter_turns for effect in scene.effects if isinstance(effect, ImageRotation))
+    rotation = find_effect(scene.effects, ImageRotation)
     return {
         "object": scene.name,
         "nominal_step_deg": plan.nominal_step_deg,
@@ -153,7 +154,7 @@ def _session_values(simulation: Simulation) -> dict[str, object]:
         "container_diameter_m": scene.container.diameter_m,
         "container_height_m": scene.container.height_m,
         "white_reference": WHITE_REFERENCE,
-        "image_rotation_deg": 90 * quarter_turns % 360,
+        "image_rotation_deg": 90 * rotation.quarter_turns if rotation else 0,
     }
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
 CREASE_DEG = 40.0
@@ -51,22 +52,15 @@ class Surface:
         self._surroundings: dict[int, Surroundings] = {}
 
     @cached_property
-    def positions(self) -> Float[np.ndarray, "p 3"]:
-        """Position of each point, metres."""
-        return self.renderer.vertices[self.vertex]
-
-    @cached_property
-    def normals(self) -> Float[np.ndarray, "p 3"]:
-        """Outward unit normal of each point: the area-weighted mean of its facets' normals."""
-        doubled = self._doubled_normals()
-        total = self._over_corners(np.repeat(doubled, 3, axis=0))
-        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    def mesh(self) -> Mesh:
+        """The points as a mesh, metres."""
+        return Mesh(self.renderer.vertices[self.vertex], self.triangles)
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "p"]:
         """Area of each point: a third of the area of each of its triangles."""
-        thirds = np.linalg.norm(self._doubled_normals(), axis=1) / 6.0
-        return self._over_corners(np.repeat(thirds, 3)[:, None])[:, 0]
+        thirds = np.repeat(self.mesh.triangle_areas_m2() / 3.0, 3)
+        return np.bincount(self.triangles.ravel(), thirds, minlength=len(self.vertex))
 
     @cached_property
     def is_object(self) -> Bool[np.ndarray, "p"]:
@@ -98,26 +92,16 @@ class Surface:
             self._surroundings[directions] = self._sample_surroundings(directions)
         return self._surroundings[directions]
 
-    def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
-        a, b, c = (self.renderer.vertices[corner] for corner in self.renderer.triangles.T)
-        return np.cross(b - a, c - a)
-
-    def _over_corners(self, of_corner: Float[np.ndarray, "3t n"]) -> Float[np.ndarray, "p n"]:
-        point, points = self.triangles.ravel(), len(self.vertex)
-        return np.stack([np.bincount(point, column, minlength=points) for column in of_corner.T], axis=-1)
-
     def _sample_surroundings(self, directions: int) -> Surroundings:
-        points = len(self.vertex)
+        points, positions, normals = len(self.vertex), self.mesh.vertices, self.mesh.vertex_normals()
         visibility, covered, factors = np.empty(points), np.empty(points, bool), []
         # Rotated from point to point, so that errors of neighbours are independent.
         turn = GOLDEN_ANGLE * np.arange(points)
         for first in range(0, points, POINTS_AT_ONCE):
             some = slice(first, min(first + POINTS_AT_ONCE, points))
             above = cosine_directions(directions, turn[some]).astype(np.float32)
-            along = np.einsum("pdk,pkj->pdj", above, _frames(self.normals[some]).astype(np.float32)).reshape(-1, 3)
-            start = np.repeat(
-                (self.positions[some] + RAY_START_M * self.normals[some]).astype(np.float32), directions, axis=0
-            )
+            along = np.einsum("pdk,pkj->pdj", above, _frames(normals[some]).astype(np.float32)).reshape(-1, 3)
+            start = np.repeat((positions[some] + RAY_START_M * normals[some]).astype(np.float32), directions, axis=0)
             hits = self.renderer.cast(start, along, directions)
             count = some.stop - some.start
             visibility[some] = 1.0 - np.bincount(hits.pixel, minlength=count) / directions

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.mesh import cylinder, quads
+from hsi_sc_nerf.simulate.mesh import quads
 from hsi_sc_nerf.simulate.scene import ContainerSettings, MarkerSettings, TurntableSettings
 
 PLAQUE_STANDOFF_M = 0.0005
@@ -49,11 +49,9 @@ def marker_frames(
             f"{markers.on_container} markers of {markers.side_m:g} m do not fit around the container; "
             "make markers.side_m or markers.on_container smaller."
         )
-    on_container = {}
+    on_container: dict[int, MarkerFrame] = {}
     for number in range(markers.on_container):
-        azimuth = 2.0 * np.pi * number / markers.on_container
-        outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        outwards, sideways = _directions(2.0 * np.pi * number / markers.on_container)
         centre = apothem * outwards + np.array([0.0, 0.0, container.height_m / 2.0])
         on_container[number] = (centre, sideways, np.array([0.0, 0.0, 1.0]))
 
@@ -66,14 +64,17 @@ def marker_frames(
             f"{markers.on_disc} markers of {markers.side_m:g} m do not fit on the disc around the container; "
             "make markers.side_m smaller or turntable.disc_diameter_m larger."
         )
-    on_disc = {}
+    on_disc: dict[int, MarkerFrame] = {}
     for number in range(markers.on_disc):
-        azimuth = 2.0 * np.pi * (number + 0.5) / markers.on_disc
-        outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        sideways = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        outwards, sideways = _directions(2.0 * np.pi * (number + 0.5) / markers.on_disc)
         # Upright for a reader outside of the disc.
         on_disc[markers.on_container + number] = ((inner_edge + paper / 2.0) * outwards, sideways, -outwards)
     return on_container, on_disc
+
+
+def _directions(azimuth: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Unit vectors away from the axis and counter-clockwise around it, at an azimuth in radians."""
+    return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
 
 
 def marker_layout(
@@ -92,15 +93,13 @@ def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tup
     dictionary = aruco_dictionary(markers)
     modules = dictionary.markerSize + 2
     image = cv2.aruco.generateImageMarker(dictionary, number, modules, borderBits=1)
-    edges = np.linspace(-0.5, 0.5, modules + 1)
     quiet = paper_side_in_markers(markers) / 2.0
-    edges = np.concatenate([[-quiet], edges, [quiet]])
+    edges = np.concatenate([[-quiet], np.linspace(-0.5, 0.5, modules + 1), [quiet]])
     ink = np.pad(image == 0, 1)
-    left, right = np.meshgrid(edges[:-1], edges[:-1])[0], np.meshgrid(edges[1:], edges[1:])[0]
-    top, bottom = -np.meshgrid(edges[:-1], edges[:-1])[1], -np.meshgrid(edges[1:], edges[1:])[1]
-    in_plane = np.stack(
-        [np.stack(corner, axis=-1) for corner in ((left, bottom), (right, bottom), (right, top), (left, top))], axis=2
-    ).reshape(-1, 4, 2)
+    left, top = np.meshgrid(edges[:-1], -edges[:-1])
+    right, bottom = np.meshgrid(edges[1:], -edges[1:])
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    in_plane = np.stack([np.stack(corner, axis=-1) for corner in corners], axis=2).reshape(-1, 4, 2)
     return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
 
 
@@ -110,18 +109,6 @@ def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
     behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
     corners = _to_object_frame(UNIT_CORNERS * paper_side_in_markers(markers), behind, markers.side_m)
     return quads(corners[None])
-
-
-def container_mesh(container: ContainerSettings, spacing_m: float | None = None) -> Mesh:
-    """The container with its flat lid on the disc; ``spacing_m`` as in `mesh.cylinder`."""
-    return cylinder(container.diameter_m, container.height_m, spacing_m=spacing_m)
-
-
-def disc_mesh(turntable: TurntableSettings, spacing_m: float | None = None) -> Mesh:
-    """The turntable's disc just below z = 0; ``spacing_m`` as in `mesh.cylinder`."""
-    return cylinder(turntable.disc_diameter_m, DISC_THICKNESS_M, spacing_m=spacing_m).moved(
-        np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M])
-    )
 
 
 def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:

@@ -1,35 +1,9 @@
-"""Procedural and image textures: mixing of materials, smooth noise, and sampling of images."""
+"""Procedural textures: mixing of materials and smooth noise."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
-
-PADDING_PX = 8
-"""Distance by which painted islands of a weight texture are dilated."""
-
-
-def padded_fractions(image: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "h w m"]:
-    """Normalise the channels of an image to fractions that sum to 1; unpainted texels stay 0.
-
-    Texels within `PADDING_PX` of a painted one get its fractions, because UV islands end between texels.
-    """
-    total = image.sum(axis=-1, keepdims=True)
-    fractions = np.divide(image, total, out=np.zeros_like(image), where=total > 0.0)
-    distance_px, nearest = distance_transform_edt(total[..., 0] == 0.0, return_indices=True)
-    return np.where((distance_px <= PADDING_PX)[..., None], fractions[tuple(nearest)], 0.0)
-
-
-def sampled(image: Float[np.ndarray, "h w m"], uv: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v m"]:
-    """Bilinear samples at UVs with the origin in the lower left corner; the image repeats outside [0, 1]."""
-    height, width = image.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    right, below = (x - left)[:, None], (y - top)[:, None]
-    rows, columns = (top % height, (top + 1) % height), (left % width, (left + 1) % width)
-    upper, lower = (image[row, columns[0]] * (1.0 - right) + image[row, columns[1]] * right for row in rows)
-    return upper * (1.0 - below) + lower * below
 
 
 def over(

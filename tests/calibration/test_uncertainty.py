@@ -8,8 +8,7 @@ import pytest
 from hsi_sc_nerf.calibration.noise import NoiseModel, reflectance_uncertainty
 from hsi_sc_nerf.calibration.report import draw_uncertainty
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
-from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise
-from hsi_sc_nerf.simulate.effects.stages import ReadoutContext
+from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, ReadoutContext
 
 DARK_LEVEL, ELECTRONS_PER_COUNT, READ_ELECTRONS = 120.0, 7.3, 40.0
 BANDS = 12

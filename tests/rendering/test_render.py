@@ -118,7 +118,7 @@ def test_a_camera_path_is_nerfstudios(tmp_path):
 
 def test_what_cannot_be_rendered_is_refused_before_anything_is_loaded(tmp_path):
     for options in ({"orbit_views": 0}, {"orbit_size": 0.0}, {"frames_per_second": 0}):
-        with pytest.raises(InputError, match="have to be positive"):
+        with pytest.raises(InputError, match="it must"):
             RenderCommand(tmp_path / "config.yml", tmp_path, **options).main()
     with pytest.raises(InputError, match="nothing to do"):
         RenderCommand(tmp_path / "config.yml", tmp_path, cubes="none").main()

@@ -10,10 +10,9 @@ from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection
 from hsi_sc_nerf.simulate.effects.illumination import Lamp
 from hsi_sc_nerf.simulate.effects.object import Gloss, Translucency, fresnel, mean_fresnel
-from hsi_sc_nerf.simulate.effects.stages import LightEffect
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.light import Colour, colour_spectra, even_light
-from hsi_sc_nerf.simulate.lighting import Lighting
+from hsi_sc_nerf.simulate.light import Colour, LightEffect, colour_spectra, even_light
+from hsi_sc_nerf.simulate.lighting import Lighting, render
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -48,7 +47,7 @@ def still_life():
 def picture(renderer, effects, camera_to_world=None):
     if camera_to_world is None:
         camera_to_world = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05])
-    rendering = Lighting(renderer, effects).render(CAMERA, camera_to_world, 2)
+    rendering = render(renderer, CAMERA, camera_to_world, 2, lighting=Lighting(renderer, effects))
     return rendering.light_weights, rendering.colours
 
 
@@ -378,12 +377,12 @@ def test_gloss_dims_what_the_chamber_effects_give_and_adds_the_same_mirror(still
     place = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05])
 
     def one_ray_a_pixel(effects):
-        rendering = Lighting(still_life, effects).render(CAMERA, place, 1)
+        rendering = render(still_life, CAMERA, place, 1, lighting=Lighting(still_life, effects))
         return dict(zip(rendering.colours, np.moveaxis(rendering.light_weights, -1, 0), strict=True)), rendering
 
     both, _ = one_ray_a_pixel([baked, Gloss()])
     alone, rendering = one_ray_a_pixel([baked])
-    gloss = Lighting(still_life, [Gloss()]).render(CAMERA, place, 1).light_weights
+    gloss = render(still_life, CAMERA, place, 1, lighting=Lighting(still_life, [Gloss()])).light_weights
     body = gloss[..., : len(still_life.materials) - 1].sum(axis=-1)
     object_only = rendering.coverage > 0.0
     wall = Colour((len(still_life.materials) - 1,))

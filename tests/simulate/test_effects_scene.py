@@ -16,6 +16,7 @@ from hsi_sc_nerf.simulate import assemble, effects
 from hsi_sc_nerf.simulate.effects import chamber, illumination, motion
 from hsi_sc_nerf.simulate.effects import object as object_effects
 from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.lighting import render
 from hsi_sc_nerf.simulate.materials import MATERIALS, PlantTissue, endmembers
 from hsi_sc_nerf.simulate.render import Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -28,8 +29,8 @@ METHODS = ("replan", "offset_m", "deform", "cover", "spectra", "factor")
 OURS = [
     cls
     for module in (chamber, illumination, motion, object_effects)
-    for cls in vars(module).values()
-    if isinstance(cls, type) and cls.__module__ == module.__name__ and {*vars(cls)} & {*METHODS}
+    for cls in effects.EFFECTS.values()
+    if cls.__module__ == module.__name__ and {*vars(cls)} & {*METHODS}
 ]
 SMALL = {"frames": 4, "size_px": 40, "bands": 10}
 
@@ -164,7 +165,8 @@ def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
         for part in parts:
             vertices = (part.mesh.vertices + shift) @ to_room[:3, :3].T + to_room[:3, 3]
             placed.append(type(part)(type(part.mesh)(vertices, part.mesh.triangles), part.materials, part.weights))
-        expected, _ = Renderer(placed).render(simulation.intrinsics, camera, moved.camera.supersampling)
+        camera_view = simulation.intrinsics, camera, moved.camera.supersampling
+        expected = render(Renderer(placed), *camera_view).material_weights
         seen = simulation.frame(i).material_weights
         # Rays along an edge may fall on either side of it in float32.
         assert np.abs(seen - expected).mean() < 2e-5
@@ -256,7 +258,8 @@ def test_deformation_shrinks_about_the_foot_and_keeps_poses_and_the_mesh_of_the_
     # In the last frame, what the camera sees is the mesh shrunk by hand.
     part = type(rigid.object_part)(small, rigid.object_part.materials, rigid.object_part.weights, is_object=True)
     by_hand = assemble.build_renderer(shrinking, part, np.array([0.01, 0.0, 0.0]))
-    _, coverage = by_hand.render(rigid.intrinsics, rigid.camera_to_world[3], shrinking.camera.supersampling)
+    view = rigid.intrinsics, rigid.camera_to_world[3], shrinking.camera.supersampling
+    coverage = render(by_hand, *view).coverage
     seen = simulation.frame(3).coverage
     assert np.abs(seen - coverage).mean() < 1e-4
     assert seen.sum() < 0.75 * rigid.frame(3).coverage.sum()

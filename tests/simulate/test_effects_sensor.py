@@ -16,11 +16,12 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble, frames, sensor
+from hsi_sc_nerf.simulate.effect import effect_rng
 from hsi_sc_nerf.simulate.effects import EFFECTS, read_effects
 from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
 from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur, distort, gaussian_kernel, undistort
-from hsi_sc_nerf.simulate.effects.stages import effect_rng
 from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.lighting import render
 from hsi_sc_nerf.simulate.materials import Measured, endmembers
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -380,7 +381,8 @@ def by_definition(changed, renderer, exposure):
     """Counts of a frame from what each effect says it is, written down once more without the stages."""
     on = {effect.name: effect for effect in changed.effects}
     camera = assemble.intrinsics(changed.camera), assemble.first_camera(changed.camera)
-    weights, _ = renderer.render(*camera, changed.camera.supersampling, on.get("lens_distortion"))
+    view = *camera, changed.camera.supersampling, on.get("lens_distortion")
+    weights = render(renderer, *view).material_weights
     if "optical_blur" in on:
         kernel = gaussian_kernel(on["optical_blur"].sigma_px)
         reach, size = len(kernel) // 2, len(weights)

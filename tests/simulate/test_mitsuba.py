@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mitsuba", reason="the extra hsi-sc-nerf[mitsuba] is not installed")
+pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate import mitsuba_render
 from hsi_sc_nerf.simulate.materials import Plain
 from hsi_sc_nerf.simulate.scene import load_scene, override
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import mitsuba_agreement
+import mitsuba_rendering
 
 RAYS = 72  # a multiple of the bands
 REPEATS = 4
@@ -57,7 +57,7 @@ def test_unseen_chamber_has_its_own_spectrum_in_even_light_and_is_the_lamp_other
     scene = small("sphere")
     level = mitsuba_agreement.render_ours(scene, 0).radiance[0, 0]
     for transport, expected in (("even", level), ("chamber", np.ones(6))):
-        corner = mitsuba_render.render(scene, 0, transport, rays_per_pixel=RAYS)[:3, :3]
+        corner = mitsuba_rendering.render(scene, 0, transport, rays_per_pixel=RAYS)[:3, :3]
         np.testing.assert_allclose(corner.mean(axis=(0, 1)), expected, atol=1e-3)
 
 
@@ -66,7 +66,7 @@ def test_white_furnace():
     white = dict.fromkeys(("disc", "container_plastic", "paper", "marker_ink"), Plain(1.0))
     scene = dataclasses.replace(small("sphere"), materials=white)
     levels = [
-        mitsuba_render.render(scene, 0, transport, rays_per_pixel=RAYS).mean()
+        mitsuba_rendering.render(scene, 0, transport, rays_per_pixel=RAYS).mean()
         for transport in ("chamber", "one_bounce", "many_bounces")
     ]
     assert levels[0] < levels[1] - 0.02 < levels[2] - 0.03
@@ -76,4 +76,4 @@ def test_white_furnace():
 def test_an_effect_that_mitsuba_does_not_render_is_refused():
     scene = override(small("sphere"), effects=["photon_noise"])
     with pytest.raises(InputError, match="photon_noise cannot be rendered with Mitsuba"):
-        mitsuba_render.render(scene, 0, "even", rays_per_pixel=RAYS)
+        mitsuba_rendering.render(scene, 0, "even", rays_per_pixel=RAYS)

@@ -11,8 +11,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
+from hsi_sc_nerf.simulate.own_mesh import padded_fractions, sampled
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
-from hsi_sc_nerf.simulate.texture import padded_fractions, sampled
 
 RADIUS_M = 0.03
 TWO, THREE = ("a", "b"), ("a", "b", "c")

@@ -9,6 +9,7 @@ import pytest
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.effects import EFFECTS
+from hsi_sc_nerf.simulate.lighting import render
 from hsi_sc_nerf.simulate.scene import SHIPPED_SCENES, load_scene, override, parse_scene
 from hsi_sc_nerf.simulate.target import marker_layout
 
@@ -34,7 +35,7 @@ def test_nothing_that_turns_leaves_the_image(name):
     scene = override(load_scene(name), size_px=64)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     for pose in assemble.frame_plan(scene).camera_to_world[::6]:
-        weights, _ = renderer.render(assemble.intrinsics(scene.camera), pose, 1)
+        weights = render(renderer, assemble.intrinsics(scene.camera), pose, 1).material_weights
         chamber = weights[..., -1]
         for edge in (chamber[0], chamber[-1], chamber[:, 0], chamber[:, -1]):
             assert (edge == 1.0).all()

@@ -17,6 +17,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, project, turntable_camera_to_world
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
+from hsi_sc_nerf.simulate.lighting import render
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
@@ -157,7 +158,7 @@ def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
     intrinsics = PinholeIntrinsics(64, 64, 128.0, 128.0, 32.0, 32.0)
     mesh = unit_sphere()
     renderer = Renderer([Part(mesh, ("paper",), np.ones((len(mesh.vertices), 1)), is_object=True)])
-    _, coverage = renderer.render(intrinsics, look_at(np.array([6.0, 0.0, 0.0]), np.zeros(3)), 4)
+    coverage = render(renderer, intrinsics, look_at(np.array([6.0, 0.0, 0.0]), np.zeros(3)), 4).coverage
     # A sphere on the optical axis is a disc of radius f tan(asin(r / d)).
     radius_px = 128.0 * np.tan(np.arcsin(1.0 / 6.0))
     assert coverage.sum() == pytest.approx(np.pi * radius_px**2, rel=2e-3)
@@ -168,7 +169,7 @@ def test_white_things_in_a_white_chamber_cannot_be_seen():
     mesh = unit_sphere()
     fractions = np.random.default_rng(0).dirichlet([1.0, 1.0], len(mesh.vertices))
     renderer = Renderer([Part(mesh, ("a", "b"), fractions)], chamber="c")
-    weights, _ = renderer.render(intrinsics, look_at(np.array([5.0, 2.0, 1.0]), np.zeros(3)), 3)
+    weights = render(renderer, intrinsics, look_at(np.array([5.0, 2.0, 1.0]), np.zeros(3)), 3).material_weights
     assert (weights[..., 0] > 0).any()
     np.testing.assert_array_equal(weights @ np.full(3, 0.75, np.float32), 0.75)
 
@@ -177,11 +178,11 @@ def test_rendering_in_pieces_changes_nothing(monkeypatch):
     scene = override(load_scene("maize"), size_px=32)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     arguments = assemble.intrinsics(scene.camera), assemble.frame_plan(scene).camera_to_world[3], 2
-    whole = renderer.render(*arguments)
+    whole = render(renderer, *arguments)
     monkeypatch.setattr("hsi_sc_nerf.simulate.render.RAYS_AT_ONCE", 700)
-    pieces = renderer.render(*arguments)
-    np.testing.assert_array_equal(whole[0], pieces[0])
-    np.testing.assert_array_equal(whole[1], pieces[1])
+    pieces = render(renderer, *arguments)
+    np.testing.assert_array_equal(whole.material_weights, pieces.material_weights)
+    np.testing.assert_array_equal(whole.coverage, pieces.coverage)
 
 
 def test_exact_weights_sum_to_one_and_survive_float16():
@@ -193,7 +194,8 @@ def test_exact_weights_sum_to_one_and_survive_float16():
 
 
 def green_image(scene, renderer, pose):
-    weights, _ = renderer.render(assemble.intrinsics(scene.camera), pose, scene.camera.supersampling)
+    view = assemble.intrinsics(scene.camera), pose, scene.camera.supersampling
+    weights = render(renderer, *view).material_weights
     return (weights @ endmembers(renderer.materials, np.array([548.0])))[..., 0]
 
 

@@ -1,12 +1,18 @@
-"""The effects that a scene can name: departures from a matte object, even light and a perfect sensor."""
+"""The effects that a scene can name: departures from a matte object, even light and a perfect sensor.
+
+Effects act in the order of `EFFECTS`, whatever their order in the scene file: motion of the turntable, shape of the
+object, light, background, reflectance, lamps, optics, detector. Effects of one base class change the same thing in
+turn; `frames.Simulation` applies the others where they act. A scene without effects runs no code of any effect.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_ranges, read_dataclass
+from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection, TexturedBackground
 from hsi_sc_nerf.simulate.effects.detector import (
     BadPixels,
@@ -30,7 +36,6 @@ from hsi_sc_nerf.simulate.effects.motion import (
 )
 from hsi_sc_nerf.simulate.effects.object import Deformation, Drying, Gloss, Translucency
 from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
-from hsi_sc_nerf.simulate.effects.stages import Effect
 
 _ORDER: tuple[type[Effect], ...] = (
     PartialTurn,
@@ -63,14 +68,7 @@ _ORDER: tuple[type[Effect], ...] = (
     BadPixels,
 )
 EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
-"""All effects by name, in the order in which effects of one stage act."""
-
-Stage = TypeVar("Stage", bound=Effect)
-
-
-def of_stage(effects: Sequence[Effect], stage: type[Stage]) -> tuple[Stage, ...]:
-    """The effects of one stage, in order."""
-    return tuple(effect for effect in effects if isinstance(effect, stage))
+"""All effects by name, in the order in which they act."""
 
 
 def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:

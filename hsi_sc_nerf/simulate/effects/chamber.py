@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import ChamberEffect, SurfaceLightEffect
-from hsi_sc_nerf.simulate.light import SurfaceLight
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.light import SurfaceLight, SurfaceLightEffect
 from hsi_sc_nerf.simulate.texture import over, smooth_noise, smoothstep
 
 DIRECTIONS = 96
@@ -80,7 +80,7 @@ class InterReflection(SurfaceLightEffect):
 
 
 @dataclass(frozen=True)
-class TexturedBackground(ChamberEffect):
+class TexturedBackground(Effect):
     """The wall of the chamber is made of boards with blotches of paint, which are stationary in the image.
 
     Structure from motion finds more features on the wall than on the object and estimates a stationary camera.
@@ -94,7 +94,7 @@ class TexturedBackground(ChamberEffect):
     def cover(
         self, size_px: int, materials: tuple[str, ...], rng: np.random.Generator
     ) -> Float[np.ndarray, "lines samples materials"]:
-        """Wooden boards with black joints, covered by blotches of paint of three sizes."""
+        """Fractions of ``materials`` in each pixel of the wall: boards with black joints and blotches of paint."""
         wood, blue, black = np.eye(3)
         place = (np.arange(size_px) + 0.5) / size_px
         y, x = (axis.ravel() for axis in np.meshgrid(place, place, indexing="ij"))

@@ -7,21 +7,66 @@ of electrons per count. The digitiser adds 1/12.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import DetectorEffect, ExposureEffect, ReadoutContext, ReadoutEffect
+from hsi_sc_nerf.simulate.effect import Effect
 
+Counts: TypeAlias = Float[np.ndarray, "lines samples bands"]
 FEW_ELECTRONS = 50.0
 """Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
 
 
+class ExposureEffect(Effect):
+    """Changes the integration time."""
+
+    def factor(self, of_white: bool) -> float:
+        """Ratio of the integration time to the one at which the white tarp counts the sensor's ``white_level``.
+
+        Args:
+            of_white: whether the capture is that of the white tarp; all other frames have one integration time.
+        """
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class SpectralSmile(DetectorEffect):
+class ReadoutContext:
+    """Properties of the sensor and of the exposure that a read-out effect needs.
+
+    Attributes:
+        largest_count: largest count of the digitiser.
+        dark_level: counts without light.
+        electrons_per_count: gain of the sensor.
+        maps: result of the effect's `detector_maps`.
+        rng: random generator of this exposure.
+    """
+
+    largest_count: int
+    dark_level: int
+    electrons_per_count: float
+    maps: Mapping[str, np.ndarray]
+    rng: np.random.Generator
+
+
+class ReadoutEffect(Effect):
+    """Changes counts before they are digitised, in frames, white and dark cubes alike."""
+
+    def detector_maps(self, samples: int, bands: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Maps (samples, bands) that are the same in every exposure, by name; stored with the truth."""
+        return {}
+
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
+        """Counts under the effect, dark level included, neither rounded nor clipped; may overwrite ``counts``."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SpectralSmile(Effect):
     """The wavelength of a band varies along the detector's line (spectral smile).
 
     The shift is a parabola: 0 in the middle of the line, ``shift_nm`` at both ends. It affects all captures, and
@@ -87,9 +132,7 @@ class DarkPattern(ReadoutEffect):
         """``dark_offset``: counts to add to the dark level, float32, normal."""
         return {"dark_offset": np.float32(self.spread) * rng.standard_normal((samples, bands), dtype=np.float32)}
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Add the fixed pattern."""
         counts += context.maps["dark_offset"]
         return counts
@@ -126,9 +169,7 @@ class BadPixels(ReadoutEffect):
         of_hot[:, dead_bands] = False
         return {"dead": of_dead, "hot": of_hot}
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Overwrite the counts of bad pixels."""
         counts[:, context.maps["dead"]] = context.dark_level
         counts[:, context.maps["hot"]] = context.largest_count
@@ -141,9 +182,7 @@ class PhotonNoise(ReadoutEffect):
 
     name: ClassVar[str] = "photon_noise"
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Draw the electrons of the signal above the dark level and convert them back to counts."""
         electrons = np.maximum(counts - np.float32(context.dark_level), 0.0, dtype=np.float32)
         electrons *= np.float32(context.electrons_per_count)
@@ -163,9 +202,7 @@ class ReadNoise(ReadoutEffect):
     electrons: float = between(0.0, 1e5, default=40.0)
     """Root mean square, electrons."""
 
-    def read_out(
-        self, counts: Float[np.ndarray, "lines samples bands"], context: ReadoutContext
-    ) -> Float[np.ndarray, "lines samples bands"]:
+    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
         """Add the noise."""
         spread = np.float32(self.electrons / context.electrons_per_count)
         for line in counts:

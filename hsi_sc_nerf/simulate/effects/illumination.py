@@ -9,12 +9,22 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import IlluminationEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.light import HitLight, lamp_photons
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.light import HitLight, ViewLightEffect, lamp_photons
 from hsi_sc_nerf.simulate.render import Hits
 
 REFERENCE_NM = 700.0
 """Wavelength at which a change of colour temperature does not change the light."""
+
+
+class IlluminationEffect(Effect):
+    """Changes the light of the lamps over time or over the image, for object and white tarp alike."""
+
+    def factor(
+        self, size_px: int, wavelengths_nm: Float[np.ndarray, "bands"], lamp_temperature_k: float, elapsed: float
+    ) -> Float[np.ndarray, "#lines #samples #bands"]:
+        """Ratio of the light with and without the effect; 1 at the image centre at the start of the session."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,69 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.geometry.camera import rotation_about_z, turntable_camera_to_world
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import FramePlan, MotionEffect, PlacementEffect
+from hsi_sc_nerf.simulate.effect import Effect
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """The frames of a session, in the order in which they are taken.
+
+    Attributes:
+        room_camera: camera-to-world pose of the stationary camera, with the turntable at angle 0.
+        angles_deg: true angle of the turntable in each frame, positive counter-clockwise.
+        elapsed: time of each frame as a fraction of the session, in [0, 1].
+        nominal_step_deg: step as the operator states it in ``session.json``, positive.
+        direction: direction of rotation as the operator states it, seen from above.
+        tilts: rotation of the turntable axis in each frame; None if the axis does not move.
+    """
+
+    room_camera: Float[np.ndarray, "4 4"]
+    angles_deg: Float[np.ndarray, "n"]
+    elapsed: Float[np.ndarray, "n"]
+    nominal_step_deg: float
+    direction: Literal["ccw", "cw"]
+    tilts: Float[np.ndarray, "n 3 3"] | None = None
+
+    @property
+    def camera_to_world(self) -> Float[np.ndarray, "n 4 4"]:
+        """Camera pose of each frame in the object frame.
+
+        A point X of the object is at ``tilt Rot(z, angle) X`` in the room; the camera pose is transformed by the
+        inverse.
+        """
+        poses = []
+        for i, angle in enumerate(self.angles_deg):
+            camera = self.room_camera
+            if self.tilts is not None:
+                camera = camera.copy()
+                camera[:3] = self.tilts[i].T @ camera[:3]
+            poses.append(turntable_camera_to_world(camera, angle))
+        return np.stack(poses)
+
+    def select(self, frames: np.ndarray) -> FramePlan:
+        """The plan of the given frame indices, in that order, with their times."""
+        return replace(
+            self,
+            angles_deg=self.angles_deg[frames],
+            elapsed=self.elapsed[frames],
+            tilts=None if self.tilts is None else self.tilts[frames],
+        )
+
+
+class MotionEffect(Effect):
+    """Changes which frames are taken, and the camera poses."""
+
+    def replan(self, plan: FramePlan, rng: np.random.Generator) -> FramePlan:
+        """The plan under the effect."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -143,7 +197,7 @@ class MissingFrames(MotionEffect):
 
 
 @dataclass(frozen=True)
-class OffCentre(PlacementEffect):
+class OffCentre(Effect):
     """Disc, container and object are not centred on the turntable axis."""
 
     name: ClassVar[str] = "off_centre"

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import DeformationEffect, MaterialEffect, SurfaceLightEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.light import Colour, HitLight, SurfaceLight
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.light import Colour, HitLight, SurfaceLight, SurfaceLightEffect, ViewLightEffect
 from hsi_sc_nerf.simulate.materials import Material, PlantTissue, water_absorbance
 from hsi_sc_nerf.simulate.render import Hits
 
@@ -21,7 +21,7 @@ LEVELS = 2
 
 
 @dataclass(frozen=True)
-class Drying(MaterialEffect):
+class Drying(Effect):
     """Plant tissue loses water at a constant rate, and its water absorption bands (970 nm and others) fade.
 
     Materials with a measured spectrum do not change, because their water content is not known.
@@ -38,7 +38,7 @@ class Drying(MaterialEffect):
         wavelengths_nm: Float[np.ndarray, "*samples bands"],
         elapsed: float,
     ) -> Float[np.ndarray, "*samples materials bands"]:
-        """Remove the absorbance of the lost water; reflectance stays below the plateau of the tissue."""
+        """Reflectance of the object's materials at time ``elapsed``, in [0, 1], without the lost water."""
         water = np.array([m.water if isinstance(m, PlantTissue) else 0.0 for m in materials])
         lost = self.water_loss * elapsed * water[:, None] * water_absorbance(wavelengths_nm)[..., None, :]
         # Rounding must not lift a reflectance above 1.
@@ -46,7 +46,7 @@ class Drying(MaterialEffect):
 
 
 @dataclass(frozen=True)
-class Deformation(DeformationEffect):
+class Deformation(Effect):
     """The object shrinks at a constant rate towards the point on which it stands."""
 
     name: ClassVar[str] = "deformation"
@@ -56,7 +56,7 @@ class Deformation(DeformationEffect):
     def deform(
         self, vertices: Float[np.ndarray, "v 3"], foot_m: Float[np.ndarray, "3"], elapsed: float
     ) -> Float[np.ndarray, "v 3"]:
-        """Scale the vertices about the foot."""
+        """Vertices at time ``elapsed``, in [0, 1]; the object stands on the point ``foot_m``."""
         return foot_m + (1.0 - self.shrink_percent / 100.0 * elapsed) * (vertices - foot_m)
 
 

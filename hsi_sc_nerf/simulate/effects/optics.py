@@ -13,7 +13,7 @@ from scipy.special import ive
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects.stages import LensEffect, OpticsEffect, OrientationEffect
+from hsi_sc_nerf.simulate.effect import Effect
 
 Coefficients = tuple[float, float, float, float]
 NEWTON_STEPS = 20
@@ -22,7 +22,7 @@ UNDISTORTED_TO = 1e-10
 
 
 @dataclass(frozen=True)
-class OpticalBlur(OpticsEffect):
+class OpticalBlur(Effect):
     """The lens blurs the image with a Gaussian of the same width in all bands."""
 
     name: ClassVar[str] = "optical_blur"
@@ -38,7 +38,7 @@ class OpticalBlur(OpticsEffect):
 
 
 @dataclass(frozen=True)
-class LensDistortion(LensEffect):
+class LensDistortion(Effect):
     """Lens distortion after Brown and Conrady, with the coefficients and axes of OpenCV.
 
     Poses and pinhole intrinsics of the truth do not change; ``distortion`` of the truth holds the coefficients as
@@ -128,7 +128,7 @@ def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> 
 
 
 @dataclass(frozen=True)
-class ImageRotation(OrientationEffect):
+class ImageRotation(Effect):
     """The file holds a rotated image, as that of a SPECIM IQ, whose slit is upright and scans sideways.
 
     The image is rotated before it reaches the sensor. Fixed patterns, smile and noise belong to the sensor, whose

@@ -13,6 +13,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
+from hsi_sc_nerf.simulate.scores.visible_surface import unoccluded
 from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra.composites import composite
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
@@ -20,7 +21,8 @@ from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
-_OCCLUSION_M = 0.0001  # tolerance of the distance at which a camera's ray hits a visible point
+FACET_LIFT_M = 0.0001
+"""Offset of the origin of a line of sight, so that the facets of a concave surface do not hide each other."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +71,8 @@ class TrueSurface:
         self, points_m: Float[np.ndarray, "n 3"], eyes_m: Float[np.ndarray, "cameras 3"]
     ) -> Bool[np.ndarray, "n"]:
         """Which points of the surface are visible from at least one camera position, occluded by the object only."""
-        scene, seen = self._scene(), np.zeros(len(points_m), bool)
-        for eye in eyes_m:
-            offset_m = points_m - eye
-            distance_m = np.linalg.norm(offset_m, axis=1)
-            rays = np.concatenate([np.broadcast_to(eye, offset_m.shape), offset_m / distance_m[:, None]], axis=1)
-            hit_m = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy()
-            seen |= hit_m > distance_m - _OCCLUSION_M
-        return seen
+        scene = self._scene()
+        return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
 
     def cloud(
         self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0

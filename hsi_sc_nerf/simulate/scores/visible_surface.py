@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,6 +16,9 @@ from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.meshes.mesh import ray_scene
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
+
 COVERED = 0.5
 """Smallest fraction of an object pixel that the object covers."""
 LIFT_M = 1e-5
@@ -22,12 +26,14 @@ LIFT_M = 1e-5
 
 
 def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:
-    """The true surface of a simulated session, for `hsi_sc_nerf.evaluation.comparison.compare`.
+    """The true surface of a simulated session as the reference of `hsi_sc_nerf.evaluation.comparison.compare`.
+
+    Unless ``config.whole_reference`` is set, only points that are visible in at least one view count for recall.
 
     Args:
         session_dir: folder of the session.
         config: settings of the comparison.
-        track: shows progress.
+        track: wrapper of the captures that shows a progress bar.
 
     Raises:
         InputError: the session has no truth, no view shows its object, or the unit is not metres.
@@ -79,12 +85,21 @@ def seen_points(
         candidates = candidates[_in_object_pixels(truth, capture, poses[capture], points_m[candidates])]
         if not len(candidates):
             continue
-        sight = poses[capture][:3, 3] - points_m[candidates]
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        rays = np.concatenate([points_m[candidates], sight], axis=1, dtype=np.float32)
-        blocked = scene.test_occlusions(rays, tnear=LIFT_M).numpy()
-        seen[candidates[~blocked]] = True
+        seen[candidates] = unoccluded(scene, points_m[candidates], poses[capture][:3, 3])
     return seen
+
+
+def unoccluded(
+    scene: RaycastingScene,
+    points_m: Float[np.ndarray, "n 3"],
+    eye_m: Float[np.ndarray, "3"],
+    lift_m: float = LIFT_M,
+) -> Bool[np.ndarray, "n"]:
+    """Whether each point of a surface is visible from ``eye_m``; occluders within ``lift_m`` of it do not count."""
+    sight = eye_m - points_m
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    rays = np.concatenate([points_m, sight], axis=1, dtype=np.float32)
+    return ~scene.test_occlusions(rays, tnear=lift_m).numpy()
 
 
 def _in_object_pixels(

@@ -1,6 +1,6 @@
 """Rendering of a scene with Mitsuba 3, as an independent check of the simulator's own renderer.
 
-Needs the optional extra ``hsi-sc-nerf[mitsuba]``. Geometry, poses and material fractions are the simulator's own;
+Needs the package ``mitsuba`` of the dev group. Geometry, poses and material fractions are the simulator's own;
 visibility, light transport and the spectral film are Mitsuba's. All spectra are explicit tables, because lights that
 Mitsuba makes of plain numbers have the spectrum of daylight, which ends at 830 nm.
 """
@@ -9,21 +9,17 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
+import mitsuba as mi
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate import assemble, sensor
-from hsi_sc_nerf.simulate.effects.stages import MotionEffect
+from hsi_sc_nerf.simulate.effects.motion import MotionEffect
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import Scene
-
-try:
-    import mitsuba as mi
-except ImportError as error:
-    raise InputError("Mitsuba is not installed; install it with: pip install 'hsi-sc-nerf[mitsuba]'.") from error
 
 mi.set_variant("scalar_spectral")
 # Mitsuba warns that integrators in Python are slow; for small images they are fast enough.
