@@ -1,6 +1,6 @@
 """Time to process a frame, compared with copying its raw file and with SPy and NumPy, as a table.
 
-    uv run python benchmarks/processing_speed.py --page README.md
+    uv run python benchmarks/processing_speed.py --session SESSION --frames 60
 
 Each method runs in a process of its own. It first reads its input files, so that they are in the system's cache, and
 processes one frame untimed, so that everything is loaded. The table shows medians over rounds of the time, and of its
@@ -26,9 +26,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from results_table import RESULTS, write_results
 from spectral.io import envi
 
 from hsi_sc_nerf import paper
@@ -73,13 +71,11 @@ class ProcessingSpeed:
     """Repeats of each method."""
     folder: Path | None = None
     """Folder for the files; the system's temporary folder if not given."""
-    page: Path | None = None
-    """Markdown page whose table (between the marks of this benchmark) is replaced."""
-    figures: Path | None = None
-    """JSON file for the measurements of all rounds."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it into the page."""
+        """Measure, print the table, write it."""
         with tempfile.TemporaryDirectory(prefix="processing-speed-", dir=self.folder) as folder:
             scratch = Path(folder)
             session = self.session
@@ -98,18 +94,8 @@ class ProcessingSpeed:
                 for row in rows:
                     cost = _run(row["method"], session, scratch, row["frames"], row["workers"])
                     row["rounds"].append(cost)
-        if self.figures is not None:
-            self.figures.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        self._show(rows)
-
-    def _show(self, rows: list[dict]) -> None:
-        table = Table(*COLUMNS)
         cells = [_cells(row, rows) for row in rows]
-        for line in cells:
-            table.add_row(*line)
-        Console(width=118).print(table)
-        if self.page is not None:
-            write_table(self.page, "processing speed", COLUMNS, cells)
+        write_results("processing_speed", COLUMNS, cells, seed="0", folder=self.results)
 
 
 METHODS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}
