@@ -126,7 +126,7 @@ def _size_of_cloud_alone(cloud: SpectralCloud, ideal: SpectralMesh) -> list[list
 
 
 def _spot_errors(surface: SpectralMesh, ideal: SpectralMesh) -> tuple[str, str, str]:
-    """Relative RMS of mean spectra of spots all over the seen surface, clear of the base: median, worst, and where."""
+    """Relative RMS of mean spectra of spots all over the seen surface: median, worst, and where."""
     rng = np.random.default_rng(0)
     height_m = ideal.mesh.vertices[:, 2] - ideal.mesh.vertices[:, 2].min()
     weights = np.where(ideal.seen & (height_m > 2.0 * ROI_RADIUS_M), ideal.areas_m2, 0.0)
