@@ -25,7 +25,7 @@ import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 # The package need not be installed.
-sys.path.append(str(ROOT))
+sys.path.insert(0, str(ROOT))
 from results_table import RESULTS, current_commit, write_results  # noqa: E402
 
 STAND_INS = ROOT / "benchmarks" / "gpu_stand_ins"
