@@ -1,11 +1,11 @@
 """The paper's recipe and ours on simulated pear, apple and maize, at equal training time, beside the paper's table.
 
-    uv run python benchmarks/beyond_the_paper.py --output-dir /tmp/beyond --page docs/accuracy_and_time.md
+    uv run python benchmarks/beyond_the_paper.py --output-dir /tmp/beyond --clock cpu --threads 1
 
 Every object is simulated twice: with photon noise, read noise and the chamber's shading, and without the noise. The
 models see the noisy session alone. Their held-out views are compared with the noisy cubes, as a laboratory could do,
 and with the noise-free ones, which tell how much of the difference is the sensor's. Clouds are compared with the true
-surface: with all of it, and with what at least one camera can see. What is finished is not done again.
+surface: with all of it, and with what at least one camera can see.
 """
 
 from __future__ import annotations
@@ -18,16 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from paper_tables import METRICS, PaperTable, mean_and_deviation
+from results_table import write_results
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
-from hsi_sc_nerf.benchmark.machine import describe_machine
-from hsi_sc_nerf.benchmark.results import describe_in_words
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock, HeldOutViews
-from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
 from hsi_sc_nerf.evaluation.comparison import CompareConfig
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
@@ -36,18 +32,14 @@ from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.scores.processing import score_processing
 from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
-from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")
 SHADING = ("chamber_shading",)
 CLOUD_POINTS = 60_000
 
-METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 1)}
 # The paper's table of held-out views (mean), and its F-score, which it gives for the maize.
 PAPER = {
     "pear": {"sam": 0.0458, "rmse": 0.0324, "ssim": 0.833, "psnr": 27.47},
@@ -58,62 +50,27 @@ PAPER_FIRST_STAGE_PSNR = 22.2
 
 
 @dataclass(frozen=True)
-class BeyondThePaper:
+class BeyondThePaper(PaperTable):
     """Train the paper's recipe and ours on three objects for the same time, and judge both."""
 
-    output_dir: Path
-    """Folder for sessions, datasets and runs."""
-    page: Path | None = None
-    """Markdown page whose table is replaced."""
+    common: str = "--pipeline.datamanager.train-num-rays-per-batch 1024"
+    """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
     objects: tuple[str, ...] = ("pear", "apple", "maize")
     """Scenes of `hsi-sc-nerf simulate`."""
     configurations: tuple[str, ...] = ("paper", "ours")
     """Configurations of `hsi-sc-nerf benchmark`."""
-    common: str = "--pipeline.datamanager.train-num-rays-per-batch 1024"
-    """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
-    train_seconds: float = 600.0
-    """Time for training each."""
-    clock: Clock = "wall"
-    """What the seconds are of, as in `hsi-sc-nerf benchmark`."""
-    threads: int | None = None
-    """CPU threads; all cores where it is not given."""
-    held_out_views: int | None = None
-    """Judge this many of the held-out views instead of all."""
-    frames: int = 60
-    """Frames of a session."""
-    size: int = 128
-    """Width and height of the images, pixels."""
 
     def main(self) -> None:
-        """Do what is missing, print the table, write it into the page."""
-        rows: list[list[str]] = []
+        """Do what is missing, print the table, write it."""
         for name in self.objects:
             folder = self.output_dir / name
-            runs = self._train(name, folder)
-            rows += object_rows(name, runs, [self._judged(folder, run) for run in runs])
-        shown = Table(*TITLES)
-        for row in rows:
-            shown.add_row(*row)
-        Console(width=220).print(shown)
-        if self.page is not None:
-            write_table(self.page, "beyond the paper", TITLES, rows, self._caption())
-
-    def _train(self, name: str, folder: Path) -> list[BenchmarkRun]:
-        for session, effects in (("session", (*NOISE, *SHADING)), ("noise-free", SHADING)):
-            scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=effects)
-            if not (folder / session).exists():
-                simulate_session(scene, folder / session)
-            process_session(folder / session, folder / f"{session}-data")
-        command = BenchmarkCommand(
-            data=folder / "session-data",
-            output_dir=folder / "runs",
-            common=self.common,
-            train_seconds=self.train_seconds,
-            clock=self.clock,
-            held_out_views=self.held_out_views,
-            threads=self.threads,
-        )
-        return train_all([named_configuration(known) for known in self.configurations], command)
+            data = self.simulated(name, folder / "session", (*NOISE, *SHADING))
+            self.simulated(name, folder / "noise-free", SHADING)
+            mask_iou = score_processing(open_packed(data), load_truth(folder / "session")).mask_iou
+            print(f"{name}: smallest intersection over union of a frame's mask with the object: {mask_iou:.3f}")
+            runs = self.trained([named_configuration(known) for known in self.configurations], data, folder / "runs")
+            rows = object_rows(name, runs, [self._judged(folder, run) for run in runs])
+            write_results("beyond_the_paper", TITLES, rows, keys=2, folder=self.results)
 
     def _judged(self, folder: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
@@ -125,19 +82,6 @@ class BeyondThePaper:
             judged |= cloud_scores(config, folder, trained)
             write_json(kept, judged)
         return json.loads(kept.read_text(encoding="utf-8"))
-
-    def _caption(self) -> str:
-        masks = ", ".join(f"{name} {worst_mask(self.output_dir / name):.3f}" for name in self.objects)
-        return (
-            f"{self.frames} frames of {self.size} x {self.size} x {paper.BANDS}, {self.train_seconds:g} s of "
-            f"training ({self.clock}) each, {self.common}; masks, smallest intersection over union of a frame: "
-            f"{masks}; {describe_in_words(describe_machine())}."
-        )
-
-
-def worst_mask(folder: Path) -> float:
-    """Smallest intersection over union of a frame's mask with what the object covers."""
-    return score_processing(open_packed(folder / "session-data"), load_truth(folder / "session")).mask_iou
 
 
 def noise_free_metrics(config: Path, noise_free: Path, held_out_views: int | None) -> dict[str, float]:
@@ -186,7 +130,7 @@ TITLES = [
     *(title for title, _ in METRICS.values()),
     "stage 1, whole frame: PSNR, dB",
     "without the noise: SAM",
-    "RMSE ",
+    "RMSE",
     "F, %",
     "F of what is seen, %",
 ]
@@ -205,10 +149,7 @@ def object_rows(name: str, runs: Sequence[BenchmarkRun], judged: Sequence[Mappin
                 name,
                 run.name,
                 str(run.checkpoints[-1].iteration),
-                *(
-                    f"{last[metric]:.{digits}f} ± {last[f'{metric}_std']:.{digits}f}"
-                    for metric, (_, digits) in METRICS.items()
-                ),
+                *(mean_and_deviation(last, metric, digits) for metric, (_, digits) in METRICS.items()),
                 f"{first['full_psnr']:.1f}",
                 *(f"{more[f'clean_{metric}']:.4f}" for metric in ("sam", "rmse")),
                 f"{more['whole_f_score']:.1f}",

@@ -1,23 +1,20 @@
 """Accuracy of calibrated reflectance on simulated sessions, as a table.
 
-    uv run python benchmarks/calibration_accuracy.py --page docs/calibration.md --pictures docs/images
+    uv run python benchmarks/calibration_accuracy.py --pictures docs/images
 
 Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from page import write_table
-from rich.console import Console
+from results_table import RESULTS, write_results
 from rich.progress import track
-from rich.table import Table
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.report import draw_calibration
@@ -64,8 +61,6 @@ COLUMNS = [
 class CalibrationAccuracy:
     """Measure the accuracy of calibrated reflectance on simulated sessions."""
 
-    page: Path | None = None
-    """Markdown page whose table is replaced."""
     pictures: Path | None = None
     """Folder for the pictures of the last session's calibration."""
     scene: str = "pear"
@@ -74,20 +69,13 @@ class CalibrationAccuracy:
     """Width and height of the frames, pixels."""
     frames: int = 12
     """Frames of a session."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Run and print."""
-        scores = {name: self._score(*case) for name, case in track(SESSIONS.items(), "calibrating")}
-        rows = [[name, *_cells(score)] for name, score in scores.items()]
-        table = Table(
-            *COLUMNS, title=f"{self.scene}, {self.frames} frames of {self.size} x {self.size} x {paper.BANDS}"
-        )
-        for row in rows:
-            table.add_row(*row)
-        Console().print(table)
-        print(json.dumps({name: asdict(score) for name, score in scores.items()}))
-        if self.page is not None:
-            write_table(self.page, "calibration accuracy", COLUMNS, rows)
+        """Measure, print the table, write it."""
+        rows = [[name, *_cells(self._score(*case))] for name, case in track(SESSIONS.items(), "calibrating")]
+        write_results("calibration_accuracy", COLUMNS, rows, folder=self.results)
 
     def _score(self, effects: tuple[str, ...], config: CalibrationConfig) -> CalibrationScore:
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects)

@@ -1,6 +1,6 @@
 """Cost of each effect of the simulator, and the error of neglecting it, as a table.
 
-    uv run python benchmarks/effects_cost.py --page docs/effects.md
+    uv run python benchmarks/effects_cost.py
 
 Each effect is simulated alone, with its default settings, on each scene. Its cost is the time to prepare the scene
 and to simulate a frame, beside a frame without effects in the same run. Its error is the difference of the calibrated
@@ -9,7 +9,6 @@ reflectance with and without it over the object's pixels: root mean square and m
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +17,8 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Bool, Float
-from page import write_table
-from rich.console import Console
+from results_table import RESULTS, write_results
 from rich.progress import track
-from rich.table import Table
 
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.effects import EFFECTS
@@ -43,8 +40,6 @@ COLUMNS = [
 class EffectsCost:
     """Measure the cost and the error of every effect."""
 
-    page: Path
-    """Markdown page whose table is replaced; a JSON file beside it gets the same figures."""
     scenes: tuple[str, ...] = ("pear", "apple", "maize")
     """Scenes to measure on."""
     effects: tuple[str, ...] = tuple(EFFECTS)
@@ -53,23 +48,19 @@ class EffectsCost:
     """Frames in the turn."""
     size: int = 128
     """Width and height of the images, pixels."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it into the page."""
+        """Measure, print the table, write it."""
         rows = []
         for name in self.scenes:
             scene = override(load_scene(name), frames=self.frames, size_px=self.size, effects=())
             _make(scene)  # the first run includes imports and caches
             plain = _make(scene)
             for effect in track(self.effects, f"effects on {name}"):
-                made = _make(override(scene, effects=(effect,)))
-                rows.append({"scene": name, "effect": effect, **_compare(plain, made)})
-        self.page.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        write_table(self.page, "table", COLUMNS, _cells(rows))
-        shown = Table(*COLUMNS)
-        for cells in _cells(rows):
-            shown.add_row(*cells)
-        Console(width=110).print(shown)
+                rows.append([name, effect, *_cells(plain, _make(override(scene, effects=(effect,))))])
+        write_results("effects_cost", COLUMNS, rows, keys=2, folder=self.results)
 
 
 @dataclass(frozen=True)
@@ -104,32 +95,18 @@ def _above_dark(capture: SimulatedCapture) -> Float[np.ndarray, "lines samples b
     return capture.counts.astype(float) - capture.dark.mean(axis=0)
 
 
-def _compare(plain: _Made, made: _Made) -> dict[str, float]:
+def _cells(plain: _Made, made: _Made) -> list[str]:
+    """Times with and without the effect, and the error of leaving it out."""
     squares, angles = [], []
     for before, after, mask in zip(plain.reflectance, made.reflectance, plain.on_object, strict=False):
         squares.append(np.mean((after[mask] - before[mask]) ** 2))
         angles.append(spectral_angle(torch.from_numpy(after[mask]), torch.from_numpy(before[mask])).mean().item())
-    return {
-        "prepare_s": made.prepare_s,
-        "seconds_per_frame": made.frames_s / len(made.reflectance),
-        "plain_seconds_per_frame": plain.frames_s / len(plain.reflectance),
-        "rms_reflectance": float(np.sqrt(np.mean(squares))),
-        "sam_rad": float(np.mean(angles)),
-    }
-
-
-def _cells(rows: list[dict]) -> list[list[str]]:
     return [
-        [
-            row["scene"],
-            row["effect"],
-            f"{row['prepare_s']:.2f}",
-            f"{1000 * row['seconds_per_frame']:.0f}",
-            f"{1000 * row['plain_seconds_per_frame']:.0f}",
-            f"{row['rms_reflectance']:.4f}",
-            f"{row['sam_rad']:.4f}",
-        ]
-        for row in rows
+        f"{made.prepare_s:.2f}",
+        f"{1000 * made.frames_s / len(made.reflectance):.0f}",
+        f"{1000 * plain.frames_s / len(plain.reflectance):.0f}",
+        f"{np.sqrt(np.mean(squares)):.4f}",
+        f"{np.mean(angles):.4f}",
     ]
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
+from results_table import RESULTS, write_results
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.evaluation.spatial import sample_surface
@@ -49,9 +50,11 @@ class ExportEvenness:
     """The exported cloud."""
     patches: int = 200
     """Patches of about equal area."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure and print."""
+        """Measure, print the table, write it."""
         truth, cloud = load_truth(self.session), read_spectral_ply(self.cloud)
         mesh = truth.mesh()
         surface, normals = _surface(mesh.vertices, mesh.triangles)
@@ -82,11 +85,14 @@ class ExportEvenness:
                 (cloud.points[:, 2], np.full(len(points), seen.sum() / len(points))),
             )
         )
-        print("height, mm; fraction of the area; points per area: this cloud, rays through pixels")
-        for low, high, fraction, cloud_density, ray_density in zip(
-            edges[:-1], edges[1:], area / area.sum(), of_cloud / area, of_rays / area, strict=True
-        ):
-            print(f"  {1e3 * low:5.1f} to {1e3 * high:5.1f}  {fraction:.2f}  {cloud_density:.2f}  {ray_density:.2f}")
+        columns = ("height above the disc", "fraction of the surface", "this cloud", "rays through random pixels")
+        rows = [
+            (f"{1e3 * low:.0f} to {1e3 * high:.0f} mm", f"{100 * part:.0f} %", f"{own:.2f}", f"{ray:.2f}")
+            for low, high, part, own, ray in zip(
+                edges[:-1], edges[1:], area / area.sum(), of_cloud / area, of_rays / area, strict=True
+            )
+        ]
+        write_results("export_evenness", columns, rows, folder=self.results)
 
 
 def _surface(

@@ -1,23 +1,18 @@
 """Memory of exporting clouds of several sizes, each in a process of its own.
 
-    uv run python benchmarks/export_memory.py RUN/config.yml --points 10000 100000 1000000
-
-Writes the table into docs/export.md.
+uv run python benchmarks/export_memory.py RUN/config.yml --points 20000 1000000
 """
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from page import write_table
+from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
-
-PAGE = Path(__file__).parent.parent / "docs" / "export.md"
 
 
 @dataclass(frozen=True)
@@ -26,13 +21,13 @@ class ExportMemory:
 
     load_config: tyro.conf.Positional[Path]
     """The config.yml of a run."""
-    points: tuple[int, ...] = (10_000, 100_000, 1_000_000)
+    points: tuple[int, ...] = (20_000, 1_000_000)
     """Numbers of points."""
-    page: Path = PAGE
-    """Page that gets the table."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Export, and write the table."""
+        """Export, print the table, write it."""
         rows = []
         for points in self.points:
             with tempfile.TemporaryDirectory() as folder:
@@ -40,10 +35,9 @@ class ExportMemory:
                 words += ["--num-points", str(points)]
                 cost = run_step("export", [*nerfstudio_command("exporter"), *words], Path(folder) / "log.txt")
                 size_mib = (Path(folder) / "point_cloud.ply").stat().st_size / 2**20
-            figures = (f"{points:,}", f"{size_mib:.0f}", f"{cost.peak_memory_mib:.0f}")
-            print(json.dumps(figures))
-            rows.append(figures)
-        write_table(self.page, "export memory", ("points", "file, MiB", "peak memory, MiB"), rows)
+            rows.append((f"{points:,}", f"{size_mib:.0f}", f"{cost.peak_memory_mib:.0f}"))
+        columns = ("points", "file, MiB", "peak memory, MiB")
+        write_results("export_memory", columns, rows, folder=self.results)
 
 
 if __name__ == "__main__":

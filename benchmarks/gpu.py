@@ -1,15 +1,14 @@
-"""Everything that only a GPU can tell, in one run of some minutes: tests, the demo, and a session of full size.
+"""Measurements that need a GPU, in one run of some minutes: tests, the demo, and a session of full size.
 
-    python benchmarks/gpu.py --output-dir /tmp/gpu --csv benchmarks/results/gpu.csv
+    python benchmarks/gpu.py --output-dir /tmp/gpu
 
-Parts run one after the other, each in processes of its own, and a part that fails costs only its own rows. The
+Parts run one after the other, each in processes of its own, and a part that fails loses only its own rows. The
 session (60 noisy views of the simulated pear, 512 x 512 x 204) is made by all cores while the tests run. Rows are
-written as they come. Neither Open3D nor pycolmap is needed: `gpu_stand_ins` takes their place where they are missing.
+added to benchmarks/results/gpu.csv as they come. Where Open3D is missing, `gpu_stand_ins` takes its place.
 """
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import json
 import os
@@ -25,13 +24,29 @@ from typing import Any
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
+# The package need not be installed.
+sys.path.insert(0, str(ROOT))
+from results_table import RESULTS, current_commit, write_results  # noqa: E402
+
 STAND_INS = ROOT / "benchmarks" / "gpu_stand_ins"
-COLUMNS = (
-    *("part", "configuration", "step", "scene", "frames", "size_px", "stage", "iterations", "train_seconds"),
-    *("ms_per_iteration", "setup_seconds", "evaluation_seconds", "sam", "rmse", "ssim", "psnr", "full_psnr"),
-    *("gpu_memory_mib", "process_memory_mib", "held_out_views", "note", "seed", "device", "torch", "commit"),
-)
-METRICS = ("sam", "rmse", "ssim", "psnr")
+COLUMNS = {
+    "part": "",
+    "configuration": "",
+    "step": "",
+    "stage": "",
+    "iterations": "",
+    "train, s": ".1f",
+    "ms per iteration": ".1f",
+    "SAM, rad": ".4f",
+    "RMSE": ".4f",
+    "SSIM": ".3f",
+    "PSNR, dB": ".1f",
+    "GPU, MiB": ".0f",
+    "process, MiB": ".0f",
+    "note": "",
+}
+"""Columns of the table, and how their values are written."""
+METRICS = {"SAM, rad": "sam", "RMSE": "rmse", "SSIM": "ssim", "PSNR, dB": "psnr"}
 STEPS = {"graph": "", "eager": "--capture-steps False"}
 """How a step is launched, and the words that say so."""
 PLUGIN = {
@@ -65,10 +80,10 @@ class GpuBenchmark:
 
     output_dir: Path
     """For logs and everything that is made."""
-    csv: Path
-    """Rows are added here."""
+    results: Path = RESULTS
+    """Folder of the CSV file to which rows are added."""
     commit: str = ""
-    """Of the code; found out where it is not given."""
+    """Of the code; where it is not given, git is asked."""
     parts: tuple[str, ...] = ("tests", "demo", "session", "profile", "train")
     """Which parts."""
     scene: str = "pear"
@@ -94,7 +109,7 @@ class GpuBenchmark:
     """Trainings, CONFIGURATION:STEP:SECONDS or CONFIGURATION:STEP:ITERATIONSi. For the seconds, an earlier run of
     the same configuration and step tells how long an iteration takes."""
     checkpoints: tuple[float, ...] = (0.34, 0.67)
-    """Shares of a run of given seconds at which it is evaluated."""
+    """Fractions of a run of given seconds at which it is evaluated."""
     held_out_views: int | None = None
     """Evaluate this many of the held-out views; None for all."""
     words: str = ""
@@ -107,8 +122,8 @@ class GpuBenchmark:
     def main(self) -> None:
         """Run all parts."""
         self.output_dir.mkdir(parents=True, exist_ok=True)
-        self.output_dir, self.csv = self.output_dir.resolve(), self.csv.resolve()
-        self._say(f"device {self._facts()['device']}, torch {self._facts()['torch']}")
+        self.output_dir, self.commit = self.output_dir.resolve(), self.commit or current_commit()
+        self._say(f"{_machine()}, commit {self.commit}")
         session: subprocess.Popen | None = None
         if "session" in self.parts:
             session = self._start_session()
@@ -135,25 +150,21 @@ class GpuBenchmark:
             self._say(f"{name} FAILED: {error!r}")
             self._row(part=name, note=f"failed: {error}"[:300])
 
-    def _facts(self) -> dict[str, str]:
-        import torch
-
-        if not self.commit:
-            found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-            self.commit = found.stdout.strip() or "unknown"
-        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
-        return {"device": device, "torch": torch.__version__, "commit": self.commit, "seed": "0"}
-
     def _row(self, **values: Any) -> None:
-        self.csv.parent.mkdir(parents=True, exist_ok=True)
-        new = not self.csv.exists()
-        shown = {key: f"{value:.5g}" if isinstance(value, float) else value for key, value in values.items()}
-        with self.csv.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if new:
-                writer.writeheader()
-            writer.writerow(shown | self._facts())
-        self._say("  " + ", ".join(f"{key} {value}" for key, value in shown.items() if value not in ("", None)))
+        """Add a row; ``values`` are named as the columns, and an unnamed cell stays empty."""
+        cells = ["" if values.get(c) is None else f"{values[c]:{form}}" for c, form in COLUMNS.items()]
+        # Cells and commit name a row: an earlier measurement is replaced only by an equal one.
+        keys = len(COLUMNS) + 1
+        write_results(
+            "gpu",
+            list(COLUMNS),
+            [cells],
+            keys=keys,
+            seed="0",
+            commit=self.commit,
+            machine=_machine(),
+            folder=self.results,
+        )
 
     def _environment(self) -> dict[str, str]:
         environment = os.environ | PLUGIN | {"PYTHONUNBUFFERED": "1", "PYTHONWARNINGS": "ignore"}
@@ -185,7 +196,7 @@ class GpuBenchmark:
         """The tests that have a CUDA case; others are left out, and so are files that need what is not there."""
         files = [
             str(path)
-            for path in sorted((ROOT / "tests").glob("test_*.py"))
+            for path in sorted((ROOT / "tests").rglob("test_*.py"))
             if "cuda" in path.read_text(encoding="utf-8") and "fake_cuda" not in path.name
         ]
         words = [sys.executable, "-m", "pytest", "-q", "-k", "cuda", "--numprocesses", "4", *files]
@@ -195,7 +206,7 @@ class GpuBenchmark:
             log = (self.output_dir / "tests.log").read_text(encoding="utf-8", errors="replace")
             lines = [line for line in log.splitlines() if line.startswith(("FAILED", "ERROR")) or " in " in line]
             print("\n".join(lines[-25:]), flush=True)
-        self._row(part="tests", train_seconds=seconds, note=log.strip().splitlines()[-1].strip("= "))
+        self._row(part="tests", note=f"{seconds:.0f} s; " + log.strip().splitlines()[-1].strip("= "))
 
     def _demo(self) -> None:
         """The demo's steps; its iterations and scene are the command's own where nothing else is asked for."""
@@ -210,24 +221,14 @@ class GpuBenchmark:
             raise
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         metrics = summary["metrics"]
-        common = {"part": "demo", "configuration": "ours", "step": "graph", "scene": "pear", "frames": 36}
+        size = f"36 views of {self.demo_size} x {self.demo_size}"
+        common = {"part": "demo", "configuration": "ours", "step": "graph"}
         for cost in summary["steps"]:
-            self._row(
-                **common,
-                size_px=self.demo_size,
-                stage=cost["name"],
-                train_seconds=cost["seconds"],
-                process_memory_mib=cost["peak_memory_mib"],
-            )
-        self._row(
-            **common,
-            size_px=self.demo_size,
-            stage="all",
-            iterations=self.demo_iterations,
-            train_seconds=summary["seconds"],
-            note=f"F-score at 2 mm {metrics['f_score']:.2f} %",
-            **{name: metrics[name] for name in METRICS},
-        )
+            measured = {"train, s": cost["seconds"], "process, MiB": cost["peak_memory_mib"]}
+            self._row(**common, stage=cost["name"], note=size, **measured)
+        measured = {"train, s": summary["seconds"]} | {title: metrics[name] for title, name in METRICS.items()}
+        note = f"{size}; F-score at 2 mm {metrics['f_score']:.2f} %"
+        self._row(**common, stage="all", iterations=self.demo_iterations, note=note, **measured)
 
     def _demo_scene(self) -> Path | str:
         if self.demo_size == 128:
@@ -255,7 +256,7 @@ class GpuBenchmark:
         if status != 0:
             raise RuntimeError("the session could not be made")
         told = "; ".join(line for line in log.splitlines() if line.startswith(("simulated", "processed")))
-        self._row(part="session", scene=self.scene, frames=self.frames, size_px=self.size, note=told)
+        self._row(part="session", note=told)
 
     @property
     def _data(self) -> Path:
@@ -263,14 +264,13 @@ class GpuBenchmark:
 
     def _profile(self) -> None:
         script = str(ROOT / "benchmarks" / "gpu_profile.py")
-        for name, words in (("ours", ["hsi-sc-nerf"]),):
-            folder = str(self.output_dir / "profile")
-            self._command(f"profile-{name}", [sys.executable, script, str(self._data), folder, *words], 150.0)
-            log = (self.output_dir / f"profile-{name}.log").read_text(encoding="utf-8", errors="replace")
-            for line in log.splitlines():
-                if line.startswith("ROW "):
-                    self._row(part="profile", configuration=name, **json.loads(line[4:]))
-            print(log[-6000:] if name == "ours" else log[-2500:], flush=True)
+        folder = str(self.output_dir / "profile")
+        self._command("profile", [sys.executable, script, str(self._data), folder, "hsi-sc-nerf"], 150.0)
+        log = (self.output_dir / "profile.log").read_text(encoding="utf-8", errors="replace")
+        for line in log.splitlines():
+            if line.startswith("ROW "):
+                self._row(part="profile", configuration="ours", **json.loads(line[4:]))
+        print(log[-6000:], flush=True)
 
     def _train(self) -> None:
         for number, text in enumerate(self.runs):
@@ -289,7 +289,6 @@ class GpuBenchmark:
         """One training in a process of its own, as `hsi-sc-nerf benchmark` does it."""
         import shlex
 
-        sys.path.insert(0, str(ROOT))
         from hsi_sc_nerf.benchmark.configurations import named_configuration
 
         key = run.configuration, run.step
@@ -315,30 +314,28 @@ class GpuBenchmark:
         job_path, result_path = (self.output_dir / f"{kind}-{number}.json" for kind in ("job", "result"))
         job_path.write_text(json.dumps(job), encoding="utf-8")
         self._say(f"{run.configuration}, {run.step}, {iterations} iterations ...")
-        module = "hsi_sc_nerf.evaluation.benchmark.run"
+        module = "hsi_sc_nerf.benchmark.run"
         words = [sys.executable, "-m", module, str(job_path), str(result_path)]
         self._command(f"train-{number}-{run.configuration}-{run.step}", words, left + 60.0)
         result = json.loads(result_path.read_text(encoding="utf-8"))
         for found in result["checkpoints"]:
+            views = f"{self.held_out_views} held-out views" if self.held_out_views else ""
+            whole_frame = f"whole frame {found['metrics']['full_psnr']:.1f} dB"
+            measured = {
+                "train, s": found["train_seconds"],
+                "ms per iteration": 1000.0 * found["train_seconds"] / found["iteration"],
+                "GPU, MiB": found["gpu_memory_mib"],
+                "process, MiB": found["peak_memory_mib"],
+            }
             self._row(
                 part="train",
                 configuration=run.configuration,
                 step=run.step,
-                scene=self.scene,
-                frames=self.frames,
-                size_px=self.size,
                 stage=found["stage"] + (" (end)" if found["ends_stage"] else ""),
                 iterations=found["iteration"],
-                train_seconds=found["train_seconds"],
-                ms_per_iteration=1000.0 * found["train_seconds"] / found["iteration"],
-                setup_seconds=result["setup_seconds"],
-                evaluation_seconds=found["evaluation_seconds"],
-                gpu_memory_mib=found["gpu_memory_mib"],
-                process_memory_mib=found["peak_memory_mib"],
-                held_out_views=self.held_out_views or "all",
-                full_psnr=found["metrics"]["full_psnr"],
-                note=self.words,
-                **{name: found["metrics"][name] for name in METRICS},
+                note="; ".join(text for text in (self.words, views, whole_frame) if text),
+                **measured,
+                **{title: found["metrics"][name] for title, name in METRICS.items()},
             )
         last = result["checkpoints"][-1]
         first = result["checkpoints"][0]
@@ -346,6 +343,13 @@ class GpuBenchmark:
         self._seconds_of[key] = (last["train_seconds"] - first["train_seconds"]) / max(
             1, last["iteration"] - first["iteration"]
         )
+
+
+def _machine() -> str:
+    import torch
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+    return f"{device}, torch {torch.__version__}"
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def main(data: str, folder: str, method: str) -> None:
         _wait(device)
         step_ms = 1000.0 / STEPS * (time.perf_counter() - started)
         memory = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else 0.0
-        row = {"step": name, "ms_per_iteration": step_ms, "gpu_memory_mib": memory}
+        row = {"step": name, "ms per iteration": step_ms, "GPU, MiB": memory}
         print("ROW " + json.dumps(row | {"note": f"fetch {fetch_ms:.2f} ms of it"}), flush=True)
         if name != "eager, pixels from files":
             _profile(trainer, device)

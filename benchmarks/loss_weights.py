@@ -1,32 +1,23 @@
 """The paper's loss-weight ablation (table "Pre-trained vs. fine-tuned") on the simulated maize, beside its figures.
 
-    uv run python benchmarks/loss_weights.py --output-dir /tmp/loss-weights --page docs/accuracy_and_time.md
+    uv run python benchmarks/loss_weights.py --output-dir /tmp/loss-weights --base ours
 
-Every weighting is trained in a process of its own by `hsi-sc-nerf benchmark`; what is finished is not trained again.
 Pre-trained is the end of the first stage, fine-tuned the end of the second.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from paper_tables import METRICS, PaperTable, mean_and_deviation
+from results_table import write_results
 
 from hsi_sc_nerf.benchmark.configurations import Configuration, named_configuration
-from hsi_sc_nerf.benchmark.machine import describe_machine
-from hsi_sc_nerf.benchmark.results import describe_in_words
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
-from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
+from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.session import simulate_session
 
-METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 2)}
+DIGITS = {name: 2 if name == "psnr" else digits for name, (_, digits) in METRICS.items()}
 
 # (angular, hsi): the paper's mean and SD for each metric, pre-trained and fine-tuned (its table of the ablation).
 PAPER: dict[tuple[float, float], dict[str, tuple[tuple[float, float], tuple[float, float]]]] = {
@@ -66,68 +57,20 @@ REGIONS = ("full_", "")
 
 
 @dataclass(frozen=True)
-class LossWeights:
-    """Train with each of the paper's loss weightings and print the results beside the paper's."""
+class LossWeights(PaperTable):
+    """Train with each of the paper's loss weightings and write the results beside the paper's."""
 
-    output_dir: Path
-    """Folder for the session, the dataset and the runs."""
-    page: Path | None = None
-    """Markdown page whose table is replaced."""
     base: str = "paper"
     """Configuration of `hsi-sc-nerf benchmark` whose weights are changed."""
-    common: str = ""
-    """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
-    train_seconds: float = 600.0
-    """Time for training each weighting."""
-    clock: Clock = "wall"
-    """What the seconds are of, as in `hsi-sc-nerf benchmark`."""
-    iterations: int | None = None
-    """The same number of iterations for each weighting instead of the same time; the paper's is 40000."""
-    threads: int | None = None
-    """CPU threads; all cores where it is not given."""
-    frames: int = 60
-    """Frames of the session."""
-    size: int = 128
-    """Width and height of the images, pixels."""
-    bands: int = 204
-    """Spectral bands."""
 
     def main(self) -> None:
-        """Simulate and train what is missing, print the table, write it into the page."""
-        session, data = self.output_dir / "session", self.output_dir / "data"
-        if not session.exists():
-            scene = override(load_scene("maize"), frames=self.frames, size_px=self.size, bands=self.bands)
-            simulate_session(scene, session)
-        process_session(session, data)
-        command = BenchmarkCommand(
-            data=data,
-            output_dir=self.output_dir / "runs",
-            common=self.common,
-            train_seconds=self.train_seconds,
-            clock=self.clock,
-            iterations=self.iterations,
-            checkpoints=(1.0,),
-            threads=self.threads,
-        )
-        runs = train_all([weighted(self.base, *weights) for weights in PAPER], command)
-        titles, rows = comparison(runs)
-        shown = Table(*titles)
-        for row in rows:
-            shown.add_row(*row)
-        Console(width=200).print(shown)
-        if self.page is not None:
-            write_table(self.page, "loss weights", titles, rows, self._caption(runs))
-
-    def _caption(self, runs: list[BenchmarkRun]) -> str:
-        ends = [run.checkpoints[-1] for run in runs]
-        iterations = sorted(end.iteration for end in ends)
-        seconds = sorted(end.train_seconds for end in ends)
-        method = named_configuration(self.base).method
-        return (
-            f"{self.frames} frames of {self.size} x {self.size} x {self.bands}; {method} {self.common}, "
-            f"{iterations[0]} to {iterations[-1]} iterations in {seconds[0]:.0f} to {seconds[-1]:.0f} s of training; "
-            f"{describe_in_words(describe_machine())}."
-        )
+        """Do what is missing, print the table, write it."""
+        data = self.simulated("maize", self.output_dir / "session")
+        runs = self.trained([weighted(self.base, *weights) for weights in PAPER], data, self.output_dir / "runs")
+        for run in runs:
+            end = run.checkpoints[-1]
+            print(f"{run.name}: {end.iteration} iterations in {end.train_seconds:.0f} s of training")
+        write_results("loss_weights", *comparison(runs), folder=self.results)
 
 
 def weighted(base: str, angular: float, hsi: float) -> Configuration:
@@ -150,11 +93,11 @@ def comparison(runs: list[BenchmarkRun]) -> tuple[list[str], list[list[str]]]:
             raise InputError(f"{run.name} trained {len(ends)} stages instead of two; give it more iterations.")
         paper_cells: list[str] = []
         own_cells: list[str] = []
-        for metric, (_, digits) in METRICS.items():
+        for metric, digits in DIGITS.items():
             for stage, region in enumerate(REGIONS):
-                found = (ends[stage][region + metric], ends[stage][f"{region}{metric}_std"])
-                for cells, (mean, spread) in ((paper_cells, printed[metric][stage]), (own_cells, found)):
-                    cells.append(f"{mean:.{digits}f} ± {spread:.{digits}f}")
+                mean, deviation = printed[metric][stage]
+                paper_cells.append(f"{mean:.{digits}f} ± {deviation:.{digits}f}")
+                own_cells.append(mean_and_deviation(ends[stage], region + metric, digits))
         rows += [[name, "paper", *paper_cells], [name, "here", *own_cells]]
     return titles, rows
 

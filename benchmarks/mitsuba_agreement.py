@@ -9,25 +9,24 @@ difference.
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import mitsuba_rendering
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from results_table import RESULTS, write_results
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 from hsi_sc_nerf.simulate.sensor import band_centres_nm
+from hsi_sc_nerf.tables import screen_table
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
@@ -40,6 +39,7 @@ COMPARISONS: dict[mitsuba_rendering.Transport, tuple[str, ...]] = {
     "many_bounces": BOTH,
 }
 """Effects for each transport of Mitsuba; the simulator has at most one bounce, so the last one differs."""
+COLUMNS = ("scene", "light", "RMS", "expected", "mean of Mitsuba - ours", "on the object alone")
 LARGEST_DIFFERENCE = 0.05
 """End of the colour scale of the picture's differences."""
 
@@ -52,6 +52,7 @@ class Ours:
         radiance: relative to the white tarp's, the chamber as bright as in Mitsuba.
         weights: fraction of each material in each pixel; the last one is the chamber.
         materials: their names.
+        of_object: which of them are the object's.
         ray_grid: error of our evenly spaced rays (RMS), from two numbers of rays a pixel in even light.
         seconds: for light and frame together.
     """
@@ -59,6 +60,7 @@ class Ours:
     radiance: Float[np.ndarray, "lines samples bands"]
     weights: Float[np.ndarray, "lines samples materials"]
     materials: tuple[str, ...]
+    of_object: Bool[np.ndarray, "materials"]
     ray_grid: float
     seconds: float
 
@@ -74,6 +76,7 @@ class Agreement:
         monte_carlo: the part of it that Mitsuba's random numbers explain.
         ray_grid: the part that our evenly spaced rays explain.
         bias: mean of Mitsuba minus ours, and its standard error.
+        bias_of_object: the same for the object alone.
         bias_of_material: the same for each material, pixels weighted by its fraction.
         seconds: one rendering of ours, one of Mitsuba's.
     """
@@ -84,6 +87,7 @@ class Agreement:
     monte_carlo: float
     ray_grid: float
     bias: tuple[float, float]
+    bias_of_object: tuple[float, float]
     bias_of_material: dict[str, tuple[float, float]]
     seconds: tuple[float, float]
 
@@ -107,7 +111,8 @@ def render_ours(scene: Scene, frame: int) -> Ours:
     if scene.effects:
         radiance += weights[..., -1:] * (1.0 - rendered.endmembers[-1])
     ray_grid = _rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
-    return Ours(radiance, weights, simulation.materials, ray_grid, seconds)
+    of_object = np.isin(simulation.materials, simulation.object_part.materials)
+    return Ours(radiance, weights, simulation.materials, of_object, ray_grid, seconds)
 
 
 def compare(
@@ -131,6 +136,7 @@ def compare(
         monte_carlo=_rms(renders.std(axis=0, ddof=1)[seen]) / np.sqrt(repeats),
         ray_grid=ours.ray_grid,
         bias=_weighted_mean(difference, seen.astype(float)),
+        bias_of_object=_weighted_mean(difference, ours.weights[..., ours.of_object].sum(axis=-1)),
         bias_of_material={
             name: _weighted_mean(difference, ours.weights[..., i])
             for i, name in enumerate(ours.materials)
@@ -159,7 +165,7 @@ class MitsubaAgreement:
     """Render one frame of a scene with our renderer and with Mitsuba 3 and compare them."""
 
     output_dir: Path
-    """Folder for the picture and the JSON file."""
+    """Folder for the picture."""
     scene: str = "pear"
     """A shipped scene's name, or a scene file; its effects are left out."""
     frame: int = 0
@@ -174,9 +180,11 @@ class MitsubaAgreement:
     """How many pictures Mitsuba makes of each; their scatter is the Monte-Carlo error."""
     supersampling: int = 16
     """Our rays along each side of a pixel."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Render, print the tables, write picture and JSON."""
+        """Render, print the tables, draw the picture, write the results."""
         scene = override(load_scene(self.scene), size_px=self.size_px, bands=self.bands, effects=())
         scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, supersampling=self.supersampling))
         ours = {
@@ -188,37 +196,36 @@ class MitsubaAgreement:
             for transport, effects in COMPARISONS.items()
         }
         self.output_dir.mkdir(parents=True, exist_ok=True)
-        stem = self.output_dir / f"mitsuba-{scene.name}"
-        stem.with_suffix(".json").write_text(json.dumps(self._report(found), indent=1) + "\n", encoding="utf-8")
-        _picture(found, scene, stem.with_suffix(".png"))
-        _print(found)
-
-    def _report(self, found: dict[mitsuba_rendering.Transport, Agreement]) -> dict[str, Any]:
-        numbers = ("rms", "monte_carlo", "ray_grid", "expected", "bias", "bias_of_material", "seconds")
-        settings = {key: value for key, value in dataclasses.asdict(self).items() if key != "output_dir"}
-        return {
-            **settings,
-            "mitsuba": mitsuba_rendering.mi.__version__,
-            "transports": {name: {key: getattr(each, key) for key in numbers} for name, each in found.items()},
-        }
-
-
-def _print(found: dict[mitsuba_rendering.Transport, Agreement]) -> None:
-    table = Table("1e-3", "RMS", "expected", "Monte Carlo", "ray grid", "bias", "our s", "its s")
-    of_material = Table("bias, 1e-3", *found)
-    for transport, each in found.items():
-        numbers = (each.rms, each.expected, each.monte_carlo, each.ray_grid)
-        table.add_row(
-            transport,
-            *(f"{1e3 * value:.1f}" for value in numbers),
-            f"{1e3 * each.bias[0]:+.2f}",
-            *(f"{value:.1f}" for value in each.seconds),
+        _picture(found, scene, self.output_dir / f"mitsuba-{scene.name}.png")
+        materials = [
+            [
+                material,
+                *(
+                    "{:+.2f} ± {:.2f}".format(*1e3 * np.array(each.bias_of_material[material]))
+                    for each in found.values()
+                ),
+            ]
+            for material in found["even"].bias_of_material
+        ]
+        Console().print(screen_table(["bias, 1e-3", *found], materials))
+        print(
+            {
+                transport: f"ours {each.seconds[0]:.1f} s, Mitsuba {each.seconds[1]:.1f} s"
+                for transport, each in found.items()
+            }
         )
-    for material in found["even"].bias_of_material:
-        row = [each.bias_of_material[material] for each in found.values()]
-        of_material.add_row(material, *(f"{1e3 * bias:+.2f} ± {1e3 * error:.2f}" for bias, error in row))
-    Console().print(table)
-    Console().print(of_material)
+        rows = [[scene.name, transport.replace("_", " "), *_cells(each)] for transport, each in found.items()]
+        write_results("mitsuba_agreement", COLUMNS, rows, keys=2, folder=self.results)
+
+
+def _cells(agreement: Agreement) -> list[str]:
+    bias, error = agreement.bias_of_object
+    return [
+        f"{1e3 * agreement.rms:.1f}",
+        f"{1e3 * agreement.expected:.1f}",
+        f"{1e3 * agreement.bias[0]:+.2f}",
+        f"{1e3 * bias:+.2f} ± {1e3 * error:.2f}",
+    ]
 
 
 def _picture(found: dict[mitsuba_rendering.Transport, Agreement], scene: Scene, path: Path) -> None:

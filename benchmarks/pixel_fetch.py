@@ -21,10 +21,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
-from page import write_table
-from rich.console import Console
+from results_table import RESULTS, write_results
 from rich.progress import track
-from rich.table import Table
 from spectral.io import envi
 
 from hsi_sc_nerf import paper
@@ -56,11 +54,11 @@ class PixelFetch:
     """Batches whose median is taken."""
     folder: Path | None = None
     """Folder for the files; the system's temporary folder if not given. A full session takes 13 GB."""
-    page: Path | None = None
-    """Markdown page whose table (between the marks of this benchmark) is replaced."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it into the page."""
+        """Measure, print the table, write it."""
         with tempfile.TemporaryDirectory(prefix="pixel-fetch-", dir=self.folder) as folder:
             raw, packed = self._make_files(Path(folder))
             readers: dict[str, tuple[Sequence[Path], Callable[[], Fetch]]] = {
@@ -78,7 +76,8 @@ class PixelFetch:
             name = "float32 in RAM" + ("" if in_ram == self.frames else f" ({in_ram} frames: no memory for more)")
             ram_ms, taken = self._timed(_ram(packed[:in_ram]), in_ram)
             rows[name] = (None, ram_ms, taken)
-        self._show([_cells(name, cold, warm, taken, ram_ms) for name, (cold, warm, taken) in rows.items()])
+        cells = [_cells(name, cold, warm, taken, ram_ms) for name, (cold, warm, taken) in rows.items()]
+        write_results("pixel_fetch", COLUMNS, cells, seed="0, 1, 2", folder=self.results)
 
     def _make_files(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Headers of a raw and a packed session, made of copies of one frame."""
@@ -132,16 +131,6 @@ class PixelFetch:
             fetch(indices)
             seconds.append(time.perf_counter() - started)
         return 1000 * float(np.median(seconds)), _resident_mib() - before
-
-    def _show(self, rows: list[list[str]]) -> None:
-        title = f"{self.pixels} random pixels of {self.frames} frames, {self.size} x {self.size} x {self.bands}"
-        table = Table(*COLUMNS, title=title)
-        for cells in rows:
-            table.add_row(*cells)
-        Console(width=118).print(table)
-        if self.page is not None:
-            caption = f"{title}; median of {self.repeats} batches."
-            write_table(self.page, "pixel fetch", COLUMNS, rows, caption)
 
 
 def _spy_pixels(headers: Sequence[Path]) -> Fetch:

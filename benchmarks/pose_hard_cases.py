@@ -1,9 +1,11 @@
-"""How good poses from markers are in hard cases, on simulated sessions with known truth, as a table.
+"""Largest errors of poses in hard cases: from markers, and from features on sessions without markers.
 
-    uv run python benchmarks/pose_hard_cases.py --page docs/poses.md
+    uv run python benchmarks/pose_hard_cases.py
+    uv run python benchmarks/pose_hard_cases.py --method colmap
 
-Each case is a session with one thing that makes it hard. Printed are the largest errors over the used frames of the
-camera's rotation and place, the error of the focal length, the reprojection error, and what the report warns of.
+Each case is a simulated session with one thing that makes it hard; errors are those against its true poses, over the
+used frames. Poses from features have no scale and no axes of their own: they are compared after the best similarity.
+COLMAP is not told the nominal angles, so that it cannot fall back to them.
 """
 
 from __future__ import annotations
@@ -13,18 +15,18 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 import tyro
 from jaxtyping import Float, UInt8
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from pose_errors import align_poses, pose_errors, transformed_poses
+from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -32,17 +34,17 @@ from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
-TABLE = "markers table"
 COLUMNS = (
     "case",
     "frames",
     "rotation, deg",
-    "place, mm",
+    "position, mm",
     "focal, %",
     "reprojection, px",
     "time, s",
     "model; warnings",
 )
+FEATURE_COLUMNS = ("session", "rotation, deg", "position, mm")
 WORKERS = 2
 Images = list[UInt8[np.ndarray, "h w"]]
 
@@ -56,7 +58,7 @@ class Case:
     scene: str = "pear"
     frames: int = 24
     size: float = 1.0
-    """Of the images, as a share of the usual size."""
+    """Of the images, as a fraction of the usual size."""
     changes: dict[str, dict[str, float]] = field(default_factory=dict)
     """To parts of the scene."""
     alter: Callable[[Images], Images] | None = None
@@ -121,28 +123,34 @@ CASES = {
     "wobble of 1 degree": Case(("{wobble: {amplitude_deg: 1}}",), frames=36, any_axis=True),
 }
 
+WALL = ("textured_background",)
+NO_MARKERS: dict[str, dict[str, float]] = {"markers": {"on_container": 0, "on_disc": 0}}
+FEATURE_CASES = {
+    "pear, textured wall": Case(WALL, frames=60, changes=NO_MARKERS),
+    "apple, textured wall, photon noise": Case((*WALL, "photon_noise"), "apple", 60, changes=NO_MARKERS),
+    "pear, 20 frames": Case(WALL, frames=20, changes=NO_MARKERS),
+    "pear, 200 degrees": Case((*WALL, "{partial_turn: {span_deg: 200}}"), frames=60, changes=NO_MARKERS),
+    "maize ear": Case(WALL, "maize", 60, changes=NO_MARKERS),
+}
+
 
 @dataclass(frozen=True)
 class Posed:
-    """Poses of a simulated session beside the truth."""
+    """Poses of a simulated session beside the truth.
+
+    Attributes:
+        simulation: the session.
+        poses: of its frames.
+        rotation_deg: errors of the used frames' rotations.
+        position_mm: errors of the used frames' positions.
+        seconds: wall time.
+    """
 
     simulation: Simulation
     poses: TurntablePoses
-    truth: Float[np.ndarray, "n 4 4"]
-    """True poses of the used frames, in the estimate's object frame."""
+    rotation_deg: Float[np.ndarray, "n"]
+    position_mm: Float[np.ndarray, "n"]
     seconds: float
-
-    @property
-    def rotation_deg(self) -> Float[np.ndarray, "n"]:
-        """Errors of the used frames' rotations."""
-        found = self.poses.camera_to_world[self.poses.used]
-        return np.array([rotation_angle_deg(a, b) for a, b in zip(found, self.truth, strict=True)])
-
-    @property
-    def place_mm(self) -> Float[np.ndarray, "n"]:
-        """Errors of the used frames' places."""
-        found = self.poses.camera_to_world[self.poses.used]
-        return 1e3 * np.linalg.norm(found[:, :3, 3] - self.truth[:, :3, 3], axis=-1)
 
     @property
     def focal_percent(self) -> float:
@@ -176,7 +184,9 @@ def grey_images(simulation: Simulation) -> Images:
         return list(pool.map(lambda i: to_8_bit((signal(simulation.frame(i)) / white).mean(axis=-1)), frames))
 
 
-def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
+def pose(
+    case: Case, size_px: int, frames: int | None = None, method: Literal["markers", "colmap"] = "markers"
+) -> Posed:
     """Simulate a case and pose it.
 
     Raises:
@@ -187,7 +197,27 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
     images = grey_images(simulation)
     if case.alter is not None:
         images = case.alter(images)
-    info = SessionInfo(
+    info = marker_info(simulation) if method == "markers" else SessionInfo()
+    started = time.perf_counter()
+    poses = find_poses(images, simulation.captures, info, method, progress=False)
+    seconds = time.perf_counter() - started
+    found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
+    if method == "colmap":
+        found = transformed_poses(align_poses(found, truth), found)
+    else:
+        azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
+        truth = rotation_about_z(-azimuth) @ truth  # x points to the first used frame's camera
+        if case.any_axis:
+            truth = transformed_poses(align_poses(truth, found, rigid=True), truth)
+        if case.any_height:
+            truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
+    return Posed(simulation, poses, *pose_errors(found, truth), seconds)
+
+
+def marker_info(simulation: Simulation) -> SessionInfo:
+    """What a laboratory would note of a session with markers."""
+    scene = simulation.scene
+    return SessionInfo(
         marker_dictionary=scene.markers.dictionary,
         marker_side_m=scene.markers.side_m,
         nominal_step_deg=simulation.plan.nominal_step_deg,
@@ -195,67 +225,53 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
         container_diameter_m=scene.container.diameter_m,
         container_height_m=scene.container.height_m,
     )
-    started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, info, "markers", progress=False)
-    seconds = time.perf_counter() - started
-    found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
-    azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
-    truth = rotation_about_z(-azimuth) @ truth  # x points to the first used frame's camera
-    if case.any_axis:
-        truth = _aligned(truth, found)
-    if case.any_height:
-        truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
-    return Posed(simulation, poses, truth, seconds)
-
-
-def _aligned(truth, found):
-    """The truth moved rigidly on to the found poses."""
-    u, _, vt = np.linalg.svd((found[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2)).sum(axis=0))
-    move = np.eye(4)
-    move[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    move[:3, 3] = (found[:, :3, 3] - truth[:, :3, 3] @ move[:3, :3].T).mean(axis=0)
-    return move @ truth
 
 
 @dataclass(frozen=True)
 class PoseHardCases:
-    """Measure poses from markers in hard cases."""
+    """Measure poses in hard cases."""
 
+    method: Literal["markers", "colmap"] = "markers"
+    """From markers, or from features."""
     size: int = 512
-    """Width and height of the images, pixels; some cases take a share of it."""
-    cases: tuple[str, ...] = tuple(CASES)
-    """Which cases."""
-    page: Path | None = None
-    """Markdown page whose table is replaced."""
+    """Width and height of the images, pixels; some cases take a fraction of it."""
+    cases: tuple[str, ...] = ()
+    """Which cases of the method; all if not given."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it into the page."""
-        rows, console = [], Console(width=170)
-        for name in self.cases:
-            rows.append((name, *self._measure(CASES[name])))
-            console.print(" | ".join(rows[-1]), highlight=False)
-        shown = Table(*COLUMNS)
-        for cells in rows:
-            shown.add_row(*cells)
-        console.print(shown)
-        if self.page is not None:
-            write_table(self.page, TABLE, COLUMNS, rows)
+        """Measure, print the table, write it."""
+        markers = self.method == "markers"
+        known, cells = (CASES, _cells) if markers else (FEATURE_CASES, _feature_cells)
+        rows = []
+        for name in self.cases or known:
+            try:
+                measured = cells(pose(known[name], self.size, method=self.method))
+            except InputError as error:
+                refused = f"refused: {error}"
+                measured = ("0", "", "", "", "", "", refused) if markers else (refused, "")
+            rows.append((name, *measured))
+            print(" | ".join(rows[-1]), flush=True)
+        table, columns = ("pose_hard_cases", COLUMNS) if markers else ("poses_by_object", FEATURE_COLUMNS)
+        write_results(table, columns, rows, keys=1, folder=self.results)
 
-    def _measure(self, case: Case) -> tuple[str, ...]:
-        try:
-            posed = pose(case, self.size)
-        except InputError as error:
-            return ("0", "", "", "", "", "", f"refused: {error}")
-        poses = posed.poses
-        return (
-            f"{poses.used.sum()} of {len(poses.names)}",
-            f"{posed.rotation_deg.max():.3f}",
-            f"{posed.place_mm.max():.2f}",
-            f"{posed.focal_percent:+.3f}",
-            f"{poses.overall_error_px:.3f}",
-            f"{posed.seconds:.0f}",
-            "; ".join([poses.model, *pose_report(poses)["warnings"]]),
-        )
+
+def _cells(posed: Posed) -> tuple[str, ...]:
+    poses = posed.poses
+    return (
+        f"{poses.used.sum()} of {len(poses.names)}",
+        f"{posed.rotation_deg.max():.3f}",
+        f"{posed.position_mm.max():.2f}",
+        f"{posed.focal_percent:+.3f}",
+        f"{poses.overall_error_px:.3f}",
+        f"{posed.seconds:.0f}",
+        "; ".join([poses.model, *pose_report(poses)["warnings"]]),
+    )
+
+
+def _feature_cells(posed: Posed) -> tuple[str, ...]:
+    return f"{posed.rotation_deg.max():.3f}", f"{posed.position_mm.max():.2f}"
 
 
 if __name__ == "__main__":

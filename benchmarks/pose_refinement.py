@@ -1,6 +1,6 @@
 """What refining poses during training is worth, by mode, on a simulated session with known truth, as a table.
 
-    uv run python benchmarks/pose_refinement.py --output-dir /tmp/refinement --page docs/poses.md
+    uv run python benchmarks/pose_refinement.py --output-dir /tmp/refinement
 
 The same frames are trained on with the true poses, with the true poses disturbed by known errors, and with those that
 the markers gave. Held-out views keep the errors of their poses, as in a real session. What is left of the errors is
@@ -24,16 +24,15 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from pose_errors import align_poses, pose_errors, transformed_poses
+from results_table import RESULTS, write_results
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.cli.demo import DEMO_TRAINING
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.dataparser import scene_scaling
 from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
-from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.models.staged_trainer import StagedTrainer, StagedTrainerConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, write_transforms
 from hsi_sc_nerf.processing.process import process_session
@@ -43,21 +42,21 @@ from hsi_sc_nerf.simulate.truth import Truth, load_truth
 from hsi_sc_nerf.surface.depth_renders import render_depth_maps
 from hsi_sc_nerf.surface.surface_points import sample_surface_points
 
-COLUMNS = {
-    "poses": "{poses}",
-    "refinement": "{mode}",
-    "SAM, rad": "{sam:.4f}",
-    "RMSE": "{rmse:.4f}",
-    "SSIM": "{ssim:.3f}",
-    "PSNR, dB": "{psnr:.1f}",
-    "F-score at 2 mm, %": "{f_score:.1f}",
-    "training views, °": "{train_deg:.3f}",
-    "mm": "{train_mm:.2f}",
-    "held-out views, °": "{held_out_deg:.3f}",
-    "mm ": "{held_out_mm:.2f}",
-    "scale, %": "{scale_percent:+.2f}",
-    "train, CPU s": "{seconds:.0f}",
-}
+COLUMNS = (
+    ("poses", "{poses}"),
+    ("refinement", "{mode}"),
+    ("SAM, rad", "{sam:.4f}"),
+    ("RMSE", "{rmse:.4f}"),
+    ("SSIM", "{ssim:.3f}"),
+    ("PSNR, dB", "{psnr:.1f}"),
+    ("F-score at 2 mm, %", "{f_score:.1f}"),
+    ("training views, °", "{train_deg:.3f}"),
+    ("mm", "{train_mm:.2f}"),
+    ("held-out views, °", "{held_out_deg:.3f}"),
+    ("mm", "{held_out_mm:.2f}"),
+    ("scale, %", "{scale_percent:+.2f}"),
+    ("train, CPU s", "{seconds:.0f}"),
+)
 Poses = Literal["true", "disturbed", "markers"]
 ROWS: tuple[tuple[Poses, str], ...] = (
     ("true", "off"),
@@ -108,8 +107,6 @@ class PoseRefinementBenchmark:
 
     output_dir: Path
     """Folder for the session, the datasets and the runs."""
-    page: Path | None = None
-    """Markdown page whose table is replaced."""
     errors: PoseErrors = PoseErrors()
     """Errors of the disturbed poses."""
     iterations: int = 500
@@ -122,22 +119,21 @@ class PoseRefinementBenchmark:
     """Width and height of the images, pixels."""
     bands: int = 48
     """Spectral bands."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Train what is missing, print the table, write it into the page."""
+        """Train what is missing, print the table, write it."""
         datasets, truth = self._datasets()
-        shown, cells = Table(*COLUMNS), []
+        cells = []
         for poses, mode in ROWS:
             path = self.output_dir / f"{poses}-{mode}.json"
             if not path.exists():
                 row = {"poses": poses, "mode": mode, **self._row(datasets[poses], truth, mode)}
                 path.write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
             row = json.loads(path.read_text(encoding="utf-8"))
-            cells.append([template.format(**row) for template in COLUMNS.values()])
-            shown.add_row(*cells[-1])
-        Console(width=160).print(shown)
-        if self.page is not None:
-            write_table(self.page, "pose refinement", list(COLUMNS), cells)
+            cells.append([template.format(**row) for _, template in COLUMNS])
+        write_results("pose_refinement", [title for title, _ in COLUMNS], cells, folder=self.results)
 
     def _datasets(self) -> tuple[dict[Poses, Path], Truth]:
         """The session's dataset with each kind of poses, and the truth; the pixels are linked, not copied."""
@@ -186,9 +182,7 @@ class PoseRefinementBenchmark:
         train = trainer.pipeline.datamanager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
         held_out = np.setdiff1d(frames, train)
         fit = align_poses(refined[train], true_poses[train])
-        aligned = transformed_poses(fit, refined)
-        degrees = np.array([rotation_angle_deg(a, b) for a, b in zip(aligned, true_poses, strict=True)])
-        mm = 1000 * np.linalg.norm(aligned[:, :3, 3] - true_poses[:, :3, 3], axis=1)
+        degrees, mm = pose_errors(transformed_poses(fit, refined), true_poses)
         mesh = truth.mesh()
         reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
         return {
@@ -219,24 +213,6 @@ class PoseRefinementBenchmark:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer
-
-
-def align_poses(poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
-    """The similarity that brings poses closest to a reference: first their orientations, then their positions."""
-    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], poses[:, :3, :3]))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    turned, target = poses[:, :3, 3] @ rotation.T, reference[:, :3, 3]
-    centred = turned - turned.mean(axis=0)
-    scale = float(np.sum(centred * target) / np.sum(centred**2))
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0))
-
-
-def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    """Camera-to-world poses in the frame that the similarity leads to."""
-    moved = poses.copy()
-    moved[:, :3, :3] = similarity.rotation @ poses[:, :3, :3]
-    moved[:, :3, 3] = similarity(poses[:, :3, 3])
-    return moved
 
 
 @torch.no_grad()

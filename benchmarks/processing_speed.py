@@ -1,11 +1,11 @@
 """Time to process a frame, compared with copying its raw file and with SPy and NumPy, as a table.
 
-    uv run python benchmarks/processing_speed.py --page README.md
+    uv run python benchmarks/processing_speed.py SESSION --frames 60
 
 Each method runs in a process of its own. It first reads its input files, so that they are in the system's cache, and
 processes one frame untimed, so that everything is loaded. The table shows medians over rounds of the time, and of its
 ratio to copying as many files in the same round. "Processor" is the processor time of all workers, which other work
-on the machine changes less. A session with plausible counts is made and deleted at the end, or give one of your own.
+on the machine changes less.
 """
 
 from __future__ import annotations
@@ -26,15 +26,12 @@ from typing import Any
 
 import numpy as np
 import tyro
-from page import write_table
-from rich.console import Console
-from rich.table import Table
+from results_table import RESULTS, write_results
 from spectral.io import envi
 
-from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
-from hsi_sc_nerf.capture.envi import Cube, write_cube
+from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame
@@ -49,7 +46,6 @@ COLUMNS = [
     "of copying",
     "peak memory, MiB",
 ]
-DARK_COUNTS, WHITE_COUNTS = 100, 3000
 CALIBRATION_NAME = "calibration.pickle"
 
 Work = Callable[[int], None]
@@ -59,12 +55,8 @@ Work = Callable[[int], None]
 class ProcessingSpeed:
     """Measure the time to process frames, compared with copying their raw files and with SPy and NumPy."""
 
-    session: Path | None = None
-    """Session to process; one is made if not given."""
-    size: int = 512
-    """Width and height of the made frames, pixels."""
-    bands: int = paper.BANDS
-    """Bands of the made frames."""
+    session: tyro.conf.Positional[Path]
+    """Session to process; a simulated one will do."""
     frames: int = 12
     """Frames that are processed in parallel."""
     workers: int = 2
@@ -73,20 +65,14 @@ class ProcessingSpeed:
     """Repeats of each method."""
     folder: Path | None = None
     """Folder for the files; the system's temporary folder if not given."""
-    page: Path | None = None
-    """Markdown page whose table (between the marks of this benchmark) is replaced."""
-    figures: Path | None = None
-    """JSON file for the measurements of all rounds."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it into the page."""
+        """Measure, print the table, write it."""
         with tempfile.TemporaryDirectory(prefix="processing-speed-", dir=self.folder) as folder:
             scratch = Path(folder)
-            session = self.session
-            if session is None:
-                session = scratch / "session"
-                _run("make", session, scratch, self.frames, 1, size=self.size, bands=self.bands)
-            _run("calibrate", session, scratch, 0, 1)
+            _run("calibrate", self.session, scratch, 0, 1)
             many = min(self.frames, len(_load(scratch)[0]))
             jobs = [("nothing", 0, 1), ("copy", 1, 1), ("process", 1, 1), ("spy", 1, 1)]
             jobs += [("copy", many, 1), ("copy", many, self.workers), ("process", many, self.workers)]
@@ -96,20 +82,10 @@ class ProcessingSpeed:
             ]
             for _ in range(self.rounds):
                 for row in rows:
-                    cost = _run(row["method"], session, scratch, row["frames"], row["workers"])
+                    cost = _run(row["method"], self.session, scratch, row["frames"], row["workers"])
                     row["rounds"].append(cost)
-        if self.figures is not None:
-            self.figures.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        self._show(rows)
-
-    def _show(self, rows: list[dict]) -> None:
-        table = Table(*COLUMNS)
         cells = [_cells(row, rows) for row in rows]
-        for line in cells:
-            table.add_row(*line)
-        Console(width=118).print(table)
-        if self.page is not None:
-            write_table(self.page, "processing speed", COLUMNS, cells)
+        write_results("processing_speed", COLUMNS, cells, seed="0", folder=self.results)
 
 
 METHODS = {"nothing": "Python, imports", "copy": "shutil.copyfile", "process": "this package", "spy": "SPy, numpy"}
@@ -128,10 +104,10 @@ def _cells(row: dict, rows: list[dict]) -> list[str]:
     return [*cells, peak]
 
 
-def _run(method: str, session: Path, scratch: Path, frames: int, workers: int, **made: int) -> dict[str, float]:
+def _run(method: str, session: Path, scratch: Path, frames: int, workers: int) -> dict[str, float]:
     """Times a frame and peak memory of one method, in a process of its own."""
     log = scratch / "log"
-    options = {"method": method, "session": session, "scratch": scratch, "frames": frames, "workers": workers, **made}
+    options = {"method": method, "session": session, "scratch": scratch, "frames": frames, "workers": workers}
     arguments = [argument for name, value in options.items() for argument in (f"--{name}", str(value))]
     cost = run_step(method, [sys.executable, __file__, *arguments], log)
     return {**json.loads(log.read_text(encoding="utf-8")), "peak_mib": cost.peak_memory_mib}
@@ -142,7 +118,7 @@ class OneMethod:
     """Run one method and print its times a frame."""
 
     method: str
-    """A key of ``METHODS``, or "make" or "calibrate"."""
+    """A key of ``METHODS``, or "calibrate"."""
     session: Path
     """Session to process."""
     scratch: Path
@@ -151,17 +127,11 @@ class OneMethod:
     """Frames to process."""
     workers: int
     """Workers that process them."""
-    size: int = 512
-    """Width and height of the made frames, pixels."""
-    bands: int = paper.BANDS
-    """Bands of the made frames."""
 
     def main(self) -> None:
         """Warm up, process the frames, print the times."""
         times = {}
-        if self.method == "make":
-            _make_session(self.session, self.size, self.bands, self.frames)
-        elif self.method == "calibrate":
+        if self.method == "calibrate":
             calibration = calibrate_session(open_session(self.session), CalibrationConfig())
             with (self.scratch / CALIBRATION_NAME).open("wb") as file:
                 pickle.dump((calibration.cubes, calibration.frames), file)
@@ -250,35 +220,6 @@ def _central_spectrum(capture: Capture) -> np.ndarray:
     lines, samples, _ = capture.cube.shape
     middle = capture.cube.memmap()[lines // 3 : -(lines // 3), samples // 3 : -(samples // 3)]
     return middle.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
-
-
-def _make_session(path: Path, size: int, bands: int, frames: int) -> None:
-    """A leaf before a gray wall under a lamp with little light at both ends, in 12-bit counts with photon noise."""
-    rng = np.random.default_rng(0)
-    wavelengths_nm = np.linspace(*paper.WAVELENGTH_RANGE_NM, bands)
-    lamp = WHITE_COUNTS * np.exp(-(((wavelengths_nm - 680.0) / 230.0) ** 2))
-    leaf = 0.05 + 0.45 / (1.0 + np.exp((705.0 - wavelengths_nm) / 12.0))
-    y, x = np.mgrid[:size, :size] / size - 0.5
-
-    def write(name: str, reflectance: np.ndarray) -> None:
-        light = (reflectance * lamp).astype(np.float32)
-        light += np.sqrt(light) * rng.standard_normal(light.shape, np.float32)
-        counts = np.clip(np.rint(light + DARK_COUNTS), 0, 4095).astype(np.uint16)
-        dark = rng.normal(DARK_COUNTS, 2.0, (8, size, bands)).round().astype(np.uint16)
-        for stem, cube in ((name, counts), (f"DARKREF_{name}", dark)):
-            write_cube(path / name / "capture" / f"{stem}.hdr", cube, wavelengths_nm=wavelengths_nm)
-
-    write("white_reference", np.ones((size, size, 1)))
-    on_leaf = np.hypot(x, 1.5 * y) < 0.25
-    write("frame_000", np.where(on_leaf[..., None], leaf, 0.8))
-    # The time does not depend on a frame's content.
-    for i in range(1, max(2, frames)):
-        for stem in ("", "DARKREF_"):
-            for suffix in (".hdr", ".raw"):
-                source = path / "frame_000" / "capture" / f"{stem}frame_000{suffix}"
-                target = path / f"frame_{i:03d}" / "capture" / f"{stem}frame_{i:03d}{suffix}"
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Benchmark results as CSV files, from which the documentation makes its tables.
 
-A file has the table's own columns, then where the figures come from: commit, seed and machine.
+A file has the table's own columns, then where the figures of a row come from: commit, seed and machine.
 """
 
 from __future__ import annotations
@@ -13,34 +13,65 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from rich.console import Console
+
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.tables import screen_table
 
 RESULTS = Path(__file__).parent / "results"
 SOURCE_COLUMNS = ("commit", "seed", "machine")
 
 
 def write_results(
-    name: str, columns: Sequence[str], rows: Sequence[Sequence[str]], seed: str = "scene", folder: Path = RESULTS
+    name: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    keys: int = 0,
+    seed: str = "scene",
+    commit: str | None = None,
+    machine: str | None = None,
+    folder: Path = RESULTS,
 ) -> Path:
-    """Write ``folder/NAME.csv`` and return its path.
+    """Print a table, write it to ``folder/NAME.csv``, and return that path.
 
     Args:
         name: of the table, as a page of the documentation names it.
         columns: titles of the table.
         rows: one cell a column.
+        keys: the first ``keys`` cells tell which measurement a row is. Rows of the file that are measured again are
+            replaced in their place; the file's other rows are kept with their own sources. With 0, ``rows`` are the
+            whole table.
         seed: seed or seeds of the runs; ``scene`` is the seed of each shipped scene.
+        commit: of the code; by default the one that is checked out.
+        machine: that measured; by default this one.
         folder: where the results are kept.
 
+    Raises:
+        ValueError: rows are to be kept, but the file has other columns.
+
     Example:
-        >>> write_results("pose_hard_cases", ["case", "rotation, deg"], [["even turn", "0.005"]])
+        >>> write_results("pose_hard_cases", ["case", "rotation, deg"], [["even turn", "0.005"]], keys=1)
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    Console(width=220).print(screen_table(columns, rows, title=name))
     path = folder / f"{name}.csv"
-    source = (current_commit(), seed, machine_name())
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*columns, *SOURCE_COLUMNS])
-        writer.writerows([*row, *source] for row in rows)
+    source = (commit or current_commit(), seed, machine or machine_name())
+    titles = [*columns, *SOURCE_COLUMNS]
+    table = [[*row, *source] for row in rows]
+    if keys and path.is_file():
+        kept_titles, *kept = read_results(path)
+        if kept_titles != titles:
+            raise ValueError(f"{path} has other columns than this table: {kept_titles}. Move it away to start anew.")
+        table = list({tuple(row[:keys]): row for row in (*kept, *table)}.values())
+    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([titles, *table])
     return path
+
+
+def read_results(path: Path) -> list[list[str]]:
+    """Titles and rows of a results file, sources included."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.reader(file))
 
 
 def current_commit() -> str:

@@ -17,15 +17,14 @@ import torch
 import tyro
 from jaxtyping import Float
 from open3d.core import Tensor as Open3DTensor
-from rich.console import Console
-from rich.table import Table
+from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.meshes.mesh import ray_scene
 from hsi_sc_nerf.models.trained_run import TrainedRun, open_run
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.surface.surface_depth import camera_rays, opacity_crossing_depth
 
-LEVELS = (0.05, 0.07, 0.1, 0.15, 0.25, 0.5, 0.75, 0.9)
+LEVELS = (0.05, 0.07, 0.1, 0.25, 0.5, 0.9)
 BEFORE_M, BEHIND_M, STEP_M = 0.006, 0.008, 0.0001
 MIN_COSINE = 0.5
 
@@ -42,10 +41,13 @@ class SurfaceDepth:
     """Number of rays."""
     seed: int = 0
     """Seed of the random rays."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure and print."""
-        run, mesh = open_run(self.load_config), load_truth(self.session).mesh()
+        """Measure, print the table, write the object's row."""
+        run, truth = open_run(self.load_config), load_truth(self.session)
+        mesh = truth.mesh()
         origins_m, directions = self._rays(run)
         scene = ray_scene(mesh.vertices, mesh.triangles)
         met = scene.cast_rays(Open3DTensor(np.concatenate([origins_m, directions], axis=1).astype(np.float32)))
@@ -55,12 +57,10 @@ class SurfaceDepth:
         below_m = depths_below_surface(
             run, origins_m[frontal], directions[frontal], depths_m[frontal], cosines[frontal]
         )
-        table = Table("opacity", "below the true surface, mm: mean", "standard deviation", "fraction of rays, %")
-        for level, below in zip(LEVELS, below_m, strict=True):
-            reached = np.isfinite(below)
-            figures = (1e3 * below[reached].mean(), 1e3 * below[reached].std(), 100.0 * reached.mean())
-            table.add_row(f"{level:g}", *(f"{figure:.2f}" for figure in figures))
-        Console().print(table)
+        cells = [f"{1e3 * np.nanmean(below):.2f} ± {1e3 * np.nanstd(below):.2f}" for below in below_m]
+        columns = ["object", *(f"opacity {level:g}" for level in LEVELS)]
+        seed = f"scene, rays {self.seed}"
+        write_results("surface_depth", columns, [[truth.object, *cells]], keys=1, seed=seed, folder=self.results)
 
     def _rays(self, run: TrainedRun) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Refined rays through the centres of pixels of the object: origins in metres, and directions."""

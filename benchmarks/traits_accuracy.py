@@ -1,6 +1,6 @@
 """How good traits are, on a simulated object whose sizes, spectra and materials are known, as a table.
 
-    uv run python benchmarks/traits_accuracy.py SESSION --cloud EXPORT/point_cloud.ply
+    uv run python benchmarks/traits_accuracy.py SESSION "pear, shaded" --cloud EXPORT/point_cloud.ply
 
 Without a cloud, one that an ideal reconstruction would give is sampled from the true mesh: even, of what the cameras
 see, with true spectra and 0.3 mm of noise. The object stands where the container ends.
@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from results_table import RESULTS, write_results
+from rich.console import Console
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
@@ -24,17 +26,33 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
-from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
-from hsi_sc_nerf.tables import markdown_table
+from hsi_sc_nerf.tables import screen_table
 
 EVERY_KTH_CAMERA = 5
+SIZES = {
+    "area_m2": "area",
+    "volume_l": "volume",
+    "height_m": "height",
+    "largest_diameter_m": "largest diameter",
+    "smallest_diameter_m": "smallest diameter",
+}
+ALONE = "volume, base height unknown"
+CLASSIFIED = ("by angle, truth classified alike", "by angle", "by mixture")
+COLUMNS = (
+    "cloud",
+    *SIZES.values(),
+    ALONE,
+    "spectra of spots, median RMS",
+    "spectra of spots, worst RMS",
+    *(f"bruise {how}" for how in CLASSIFIED),
+)
 ROI_RADIUS_M = 0.005
 ROIS = 12
 INCIDENCES_DEG = ((0, 50), (50, 70), (70, 90))
-BLUSH_SHARES = (0.25, 0.5, 0.75)
+BLUSH_FRACTIONS = (0.25, 0.5, 0.75)
 LEFT_OUT = ("stem",)
 """Its spectrum lies between those of bruise and skin: the rim of a bruise would be stem."""
 
@@ -45,6 +63,8 @@ class TraitsAccuracy:
 
     session: tyro.conf.Positional[Path]
     """Simulated session."""
+    name: tyro.conf.Positional[str]
+    """Of the cloud, in the table."""
     cloud: Path | None = None
     """Spectral cloud reconstructed from it; without it, an ideal cloud."""
     points: int = 100_000
@@ -53,11 +73,11 @@ class TraitsAccuracy:
     """Of the ideal cloud, in each direction."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """How the mesh is made."""
-    output: Path | None = None
-    """Markdown file for the table; it is printed in any case."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print and write."""
+        """Measure, print all figures, write the table's row."""
         truth = load_truth(self.session)
         true = TrueSurface.of(truth)
         eyes_m = truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3]
@@ -74,52 +94,51 @@ class TraitsAccuracy:
         ideal = SpectralMesh(
             true.mesh, true.reflectance(everything), true.wavelengths_nm, true.seen(vertices, eyes_m)
         )
-        rows = [*_size_rows(surface, ideal, cloud), *_roi_rows(surface, ideal), *_class_rows(surface, true, ideal)]
-        rows += _incidence_rows(cloud, true)
-        page = markdown_table(["trait", "measured", "true", "error"], rows)
-        page += f"\n\nopen edges: {open_edges(mesh)}; {len(cloud.points)} points; {seconds:.0f} s"
-        print(page)
-        if self.output:
-            with atomic_write(self.output) as (temporary,):
-                temporary.write_text(page + "\n", encoding="utf-8")
+        sizes = [*_size_rows(surface, ideal), *_size_of_cloud_alone(cloud, ideal)]
+        median, worst, where = _spot_errors(surface, ideal)
+        classes = _class_rows(surface, true, ideal)
+        details = [*sizes, ["spots", "", "", f"median {median}, worst {worst} {where}"], *classes]
+        details += _incidence_rows(cloud, true)
+        title = f"open edges: {open_edges(mesh)}; {len(cloud.points)} points; {seconds:.0f} s"
+        Console(width=160).print(screen_table(["trait", "measured", "true", "error"], details, title))
+        errors = {name: error for name, _, _, error in (*sizes, *classes)}
+        cells = [*(errors[name] for name in SIZES.values()), errors[ALONE], median, worst]
+        cells += [errors.get(f"bruise {how}", "") for how in CLASSIFIED]
+        write_results("traits_accuracy", COLUMNS, [[self.name, *cells]], keys=1, folder=self.results)
 
 
-def _size_rows(surface: SpectralMesh, ideal: SpectralMesh, cloud: SpectralCloud) -> list[list[str]]:
+def _size_row(name: str, measured: float, true: float) -> list[str]:
+    return [name, f"{measured:.5g}", f"{true:.5g}", f"{100.0 * (measured / true - 1.0):+.1f} %"]
+
+
+def _size_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
     measured, true = size_of(surface.mesh), size_of(ideal.mesh)
-    rows = [
-        [name, f"{a:.5g}", f"{b:.5g}", f"{100.0 * (a / b - 1.0):+.2f} %"]
-        for name in vars(true)
-        for a, b in [(getattr(measured, name), getattr(true, name))]
-    ]
-    # Without knowing where the object stands: closed where the cloud ends.
-    unknown = size_of(closed_mesh(cloud.points, cloud.normals, MeshConfig()))
-    rows += [
-        [f"{name}, base height unknown", f"{a:.5g}", f"{b:.5g}", f"{100.0 * (a / b - 1.0):+.2f} %"]
-        for name in ("area_m2", "volume_l")
-        for a, b in [(getattr(unknown, name), getattr(true, name))]
-    ]
     seen = [float(one.areas_m2[one.seen].sum()) for one in (surface, ideal)]
-    return [
-        *rows,
-        ["seen area_m2", f"{seen[0]:.5g}", f"{seen[1]:.5g}", f"{100.0 * (seen[0] / seen[1] - 1.0):+.2f} %"],
-    ]
+    rows = [_size_row(title, getattr(measured, name), getattr(true, name)) for name, title in SIZES.items()]
+    return [*rows, _size_row("seen area", *seen)]
 
 
-def _roi_rows(surface: SpectralMesh, ideal: SpectralMesh) -> list[list[str]]:
-    """Mean spectra of spots all over the seen surface, clear of the base."""
+def _size_of_cloud_alone(cloud: SpectralCloud, ideal: SpectralMesh) -> list[list[str]]:
+    """Sizes if it is not known where the object stands: closed where the cloud ends."""
+    measured, true = size_of(closed_mesh(cloud.points, cloud.normals, MeshConfig())), size_of(ideal.mesh)
+    area = _size_row("area, base height unknown", measured.area_m2, true.area_m2)
+    return [area, _size_row(ALONE, measured.volume_l, true.volume_l)]
+
+
+def _spot_errors(surface: SpectralMesh, ideal: SpectralMesh) -> tuple[str, str, str]:
+    """Relative RMS of mean spectra of spots all over the seen surface: median, worst, and where."""
     rng = np.random.default_rng(0)
     height_m = ideal.mesh.vertices[:, 2] - ideal.mesh.vertices[:, 2].min()
-    chances = np.where(ideal.seen & (height_m > 2.0 * ROI_RADIUS_M), ideal.areas_m2, 0.0)
-    centres = ideal.mesh.vertices[rng.choice(len(chances), ROIS, p=chances / chances.sum())]
+    weights = np.where(ideal.seen & (height_m > 2.0 * ROI_RADIUS_M), ideal.areas_m2, 0.0)
+    centres = ideal.mesh.vertices[rng.choice(len(weights), ROIS, p=weights / weights.sum())]
     errors = []
     for centre in centres:
         spot = RegionOfInterest("spot", tuple(centre.tolist()), ROI_RADIUS_M)
         measured, true = (region_spectrum("spot", one, spot.of(one)).mean for one in (surface, ideal))
         errors.append(relative_rms(measured, true))
     x, y, z = 1000.0 * centres[int(np.argmax(errors))]
-    worst = f"worst {100.0 * max(errors):.2f} % at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
-    spots = f"spectra of {ROIS} spots of {2000.0 * ROI_RADIUS_M:g} mm, relative RMS"
-    return [[spots, "", "", f"median {100.0 * np.median(errors):.2f} %, {worst}"]]
+    median, worst = 100.0 * np.median(errors), 100.0 * max(errors)
+    return f"{median:.2g} %", f"{worst:.2g} %", f"at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
 
 
 def _incidence_rows(cloud: SpectralCloud, true: TrueSurface) -> list[list[str]]:
@@ -151,7 +170,7 @@ def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -
     references = [(names[index], true.endmembers[index]) for index in wanted]
     ends = [true.endmembers[index] for index in wanted if names[index].endswith("_skin")]
     if len(ends) == 2:
-        references += [(names[0], (1.0 - share) * ends[0] + share * ends[1]) for share in BLUSH_SHARES]
+        references += [(names[0], (1.0 - part) * ends[0] + part * ends[1]) for part in BLUSH_FRACTIONS]
     library = SpectralLibrary(
         tuple(name for name, _ in references), true.wavelengths_nm, np.stack([spectrum for _, spectrum in references])
     )
@@ -162,16 +181,13 @@ def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -
     unmixed = classified(surface, pure, paper.CLASSIFICATION_ANGLE_RAD, 0.0)
     mixture_m2 = dict(zip(unmixed.names, unmixed.mixture_areas_m2, strict=True))
     for name, area_m2, alike_m2 in zip(found.names, found.areas_m2, alike.areas_m2, strict=True):
-        share = true.weights[:, [other == name for other in names]].sum(axis=1)
-        most_m2 = float(ideal.areas_m2[ideal.seen & (share > 0.5)].sum())
-        for what, measured_m2, true_m2 in (
-            ("by angle; true spectra classified alike", area_m2, alike_m2),
-            ("by angle; true share over a half", area_m2, most_m2),
-            ("by mixture; true share over a half", mixture_m2[name], most_m2),
-        ):
+        fraction = true.weights[:, [other == name for other in names]].sum(axis=1)
+        most_m2 = float(ideal.areas_m2[ideal.seen & (fraction > 0.5)].sum())
+        areas = ((area_m2, alike_m2), (area_m2, most_m2), (mixture_m2[name], most_m2))
+        for how, (measured_m2, true_m2) in zip(CLASSIFIED, areas, strict=True):
             if true_m2 > 0.0:
                 error = f"{100 * (measured_m2 / true_m2 - 1):+.1f} %"
-                rows.append([f"{name}, cm², {what}", f"{1e4 * measured_m2:.2f}", f"{1e4 * true_m2:.2f}", error])
+                rows.append([f"{name} {how}", f"{1e4 * measured_m2:.2f}", f"{1e4 * true_m2:.2f}", error])
     return rows
 
 

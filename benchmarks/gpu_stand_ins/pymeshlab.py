@@ -1,1 +1,1 @@
-"""Nothing: nerfstudio's exporter imports this package for meshes, and no mesh is exported here."""
+"""An empty PyMeshLab: imported by nerfstudio's exporter for meshes, which this project does not export."""

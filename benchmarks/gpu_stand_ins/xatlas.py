@@ -1,1 +1,1 @@
-"""Nothing: nerfstudio's exporter imports this package for textures, and no texture is exported here."""
+"""An empty xatlas: imported by nerfstudio's exporter for textures, which this project does not export."""

@@ -358,7 +358,7 @@ def test_hard_session_is_posed(name, size_px, frames, largest_deg, largest_mm):
     assert posed.poses.model == "turntable"
     assert posed.poses.distortion == (0.0, 0.0, 0.0, 0.0)
     assert posed.rotation_deg.max() < largest_deg
-    assert posed.place_mm.max() < largest_mm
+    assert posed.position_mm.max() < largest_mm
     assert abs(posed.focal_percent) < 0.7
 
 
@@ -367,7 +367,7 @@ def test_a_wobbling_and_distorted_session_is_posed_and_reported(tmp_path):
     posed = pose(Case(effects, any_axis=True), 224, 10)
     assert posed.poses.model == "free poses"
     assert posed.rotation_deg.max() < 0.1
-    assert posed.place_mm.max() < 0.7
+    assert posed.position_mm.max() < 0.7
     assert posed.poses.distortion[0] == pytest.approx(-0.3, abs=0.05)
     assert posed.poses.distortion[2:] == (0.0, 0.0)
     report = json.loads(json.dumps(pose_report(posed.poses)))

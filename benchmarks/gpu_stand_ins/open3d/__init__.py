@@ -1,8 +1,4 @@
-"""What this project uses of Open3D, over embreex and scipy, for machines that cannot hold Open3D itself.
-
-Only `benchmarks/gpu.py` puts this folder on the path, and after everything else: where Open3D is installed, it is
-Open3D. Rays are cast by the same library (Embree) in single precision; tests/test_gpu_stand_ins.py compares frames.
-"""
+"""The parts of Open3D that this project uses, by embreex and SciPy; only benchmarks/gpu.py puts them on the path."""
 
 from __future__ import annotations
 

@@ -1,0 +1,76 @@
+"""What the benchmarks beside the paper's tables share: simulated objects, trained by several configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from results_table import RESULTS
+
+from hsi_sc_nerf.benchmark.configurations import Configuration
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
+from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
+from hsi_sc_nerf.processing.process import process_session
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+
+METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 1)}
+"""Title and digits after the point of each metric."""
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """Options of a benchmark that trains on simulated objects. What is finished is not done again."""
+
+    output_dir: Path
+    """Folder for sessions, datasets and runs."""
+    common: str = ""
+    """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
+    train_seconds: float = 600.0
+    """Time for training each."""
+    clock: Clock = "wall"
+    """What the seconds are of, as in `hsi-sc-nerf benchmark`."""
+    iterations: int | None = None
+    """The same number of iterations for each run instead of the same time; the paper's is 40000."""
+    threads: int | None = None
+    """CPU threads; all cores where it is not given."""
+    held_out_views: int | None = None
+    """Evaluate this many of the held-out views instead of all."""
+    frames: int = 60
+    """Frames of a session."""
+    size: int = 128
+    """Width and height of the images, pixels."""
+    bands: int = 204
+    """Spectral bands."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
+
+    def simulated(self, name: str, session: Path, effects: Sequence[str] = ()) -> Path:
+        """Dataset, ``SESSION-data``, of a scene that is simulated if it is missing."""
+        if not session.exists():
+            scene = override(
+                load_scene(name), frames=self.frames, size_px=self.size, bands=self.bands, effects=effects
+            )
+            simulate_session(scene, session)
+        return process_session(session, session.with_name(f"{session.name}-data"))
+
+    def trained(self, configurations: Sequence[Configuration], data: Path, runs: Path) -> list[BenchmarkRun]:
+        """One run for each configuration, in processes of their own."""
+        command = BenchmarkCommand(
+            data=data,
+            output_dir=runs,
+            common=self.common,
+            train_seconds=self.train_seconds,
+            clock=self.clock,
+            iterations=self.iterations,
+            checkpoints=(1.0,),
+            held_out_views=self.held_out_views,
+            threads=self.threads,
+        )
+        return train_all(configurations, command)
+
+
+def mean_and_deviation(metrics: Mapping[str, float], name: str, digits: int) -> str:
+    """A metric's mean over the held-out views, and its standard deviation."""
+    return f"{metrics[name]:.{digits}f} ± {metrics[f'{name}_std']:.{digits}f}"
