@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from hsi_sc_nerf.geometry.similarity import Similarity
 from jaxtyping import Float
 
-from hsi_sc_nerf.geometry.camera import rotation_angle_deg
+from hsi_sc_nerf.geometry.camera import Similarity, rotation_angle_deg
 
 
 def pose_errors(

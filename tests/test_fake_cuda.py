@@ -112,6 +112,7 @@ def on_gpu(request, flagged_dataset):
         yield SimpleNamespace(model=pipeline.model, pixels=pixels, rays=rays, indices=indices)
 
 
+@pytest.mark.slow
 def test_a_training_step_stays_on_the_device(on_gpu):
     model: SpectralModel = on_gpu.model.train()
     with NoTransfers():
@@ -120,6 +121,7 @@ def test_a_training_step_stays_on_the_device(on_gpu):
     assert {value.device.type for value in (*terms.values(), *metrics.values())} == {"cuda"}
 
 
+@pytest.mark.slow
 def test_rays_of_a_view_and_of_an_export_stay_on_the_device(on_gpu):
     model = on_gpu.model.eval()
     with NoTransfers(), torch.no_grad(), torch.device("cuda"):

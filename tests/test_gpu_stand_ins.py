@@ -28,6 +28,7 @@ np.savez(sys.argv[1], where=open3d.__file__, counts=frame.counts, coverage=frame
 """
 
 
+@pytest.mark.slow
 def test_frames_and_clean_clouds_equal_open3d(tmp_path):
     pytest.importorskip("embreex")
     pytest.importorskip("open3d")

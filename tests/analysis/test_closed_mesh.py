@@ -79,6 +79,7 @@ def test_base_without_a_height_is_where_the_cloud_ends():
     assert mesh.vertices[:, 2].min() == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_rim_that_hangs_down_does_not_widen_the_base():
     points, normals = sphere_points(40000, above=-0.8)
     edge_m = STAND_M + 0.2 * RADIUS_M
@@ -158,6 +159,7 @@ def test_feret_diameters_of_a_turned_rectangle():
     assert smallest == pytest.approx(0.03)
 
 
+@pytest.mark.slow
 def test_spread_from_halves_is_that_of_independent_clouds():
     config = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
     clouds = [sphere_points(3000, seed, 0.0005, above=-0.93) for seed in range(11)]

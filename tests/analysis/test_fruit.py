@@ -57,6 +57,7 @@ def ideal_apple(true_apple):
     return SpectralMesh(true_apple.mesh, true_apple.reflectance(everything), NM, seen)
 
 
+@pytest.mark.slow
 def test_area_is_within_three_and_volume_within_two_percent(true_apple, measured_apple):
     measured, true = size_of(measured_apple.mesh), size_of(true_apple.mesh)
     assert open_edges(measured_apple.mesh) == 0
@@ -81,6 +82,7 @@ def test_spectra_of_spots_are_within_two_percent(ideal_apple, measured_apple):
         assert relative_rms(measured.mean, true.mean) < 0.02
 
 
+@pytest.mark.slow
 def test_bruise_area_is_within_ten_percent_of_the_true_surface_classified_alike(
     ideal_apple, measured_apple, true_apple
 ):
@@ -92,6 +94,7 @@ def test_bruise_area_is_within_ten_percent_of_the_true_surface_classified_alike(
     assert [region.label for region in measured.regions].count(1) >= 1
 
 
+@pytest.mark.slow
 def test_bruise_area_by_mixture_is_within_three_percent_of_where_it_has_most(ideal_apple, measured_apple, true_apple):
     spectra = SpectralLibrary(true_apple.materials, NM, true_apple.endmembers)
     measured = classified(measured_apple, spectra, 0.1, 1e-5)

@@ -205,6 +205,7 @@ def command(tiny_dataset, folder, device="cpu", **changes):
     return replace(made, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_path, in_this_process, device):
     command(tiny_dataset, tmp_path, device).main()

@@ -86,6 +86,7 @@ def middle_of_illumination(truth: Truth, capture: str):
     return product
 
 
+@pytest.mark.slow
 def test_drift_is_recovered(odd, noisy):
     for session in (odd, noisy):
         drift = session.calibration.drift
@@ -156,6 +157,7 @@ def leave_gaps(cube: Cube, gap: float, dtype: str) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "dtype", "saturation"),
     [

@@ -76,6 +76,7 @@ HARD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", HARD.values(), ids=HARD)
 def test_all_bad_elements_are_found_and_no_others(effects):
     """With photon and read noise; together there are 65 000 elements, of which about 600 are bad."""
@@ -88,6 +89,7 @@ def test_all_bad_elements_are_found_and_no_others(effects):
     assert (defects.saturation_counts == 4095.0) == ("saturation" in effects)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [{}, NOISE], ids=["quiet", "noisy"])
 @pytest.mark.parametrize(
     ("effects", "bands", "bit_depth"),
@@ -111,6 +113,7 @@ def test_nothing_is_found_where_nothing_is(effects, bands, bit_depth, noise):
     assert not defects.bad_bands.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [{}, NOISE], ids=["quiet", "noisy"])
 @pytest.mark.parametrize("bit_depth", [8, 10, 14, 16])
 def test_saturation_is_where_the_digitiser_stops(bit_depth, noise):

@@ -57,6 +57,7 @@ def simulated(*effects, name="pear", bands=40, frames=8, **camera):
     return drift, true / true[0], np.stack([capture.coverage for capture in captures])[:, lines]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "name"),
     [

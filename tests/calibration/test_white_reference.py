@@ -309,6 +309,7 @@ def test_real_maize_kernel():
     np.testing.assert_allclose(centre[bands], [0.54, 0.83, 0.85, 0.85, 0.85], atol=0.025)
 
 
+@pytest.mark.slow
 def test_white_reference_picture(tmp_path):
     tarp = capture(tmp_path, "white", tarp_scene())
     path = tmp_path / "report" / "white_reference.png"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -32,6 +33,7 @@ def random_cube(shape: tuple[int, int, int], dtype: str, seed: int) -> np.ndarra
 shapes = st.tuples(st.integers(1, 4), st.integers(1, 4), st.integers(1, 5))
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     shape=shapes,

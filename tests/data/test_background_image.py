@@ -275,6 +275,7 @@ def test_inpainting_without_anything_measured():
     np.testing.assert_allclose(filled, np.broadcast_to([0.1, 0.9], (4, 5, 2)))
 
 
+@pytest.mark.slow
 def test_held_out_frames_see_the_same_chamber(tiny_dataset):
     dataset = open_packed(tiny_dataset[0])
     held_out = dataset.frames[4]

@@ -151,6 +151,7 @@ def test_spectra_of_a_packed_dataset_are_sampled(tmp_path):
     np.testing.assert_array_equal(sample_training_spectra(frames, 400, 0.25, 1)[0], spectra)
 
 
+@pytest.mark.slow
 def test_noise_of_a_real_kernel_is_the_detectors_where_it_is_dark():
     kernel, dark, white = (
         open_cube(MAIZE / f"{name}.hdr").memmap().astype(float)

@@ -102,6 +102,7 @@ def test_a_reference_with_a_missing_half_does_not_pull() -> None:
     assert left_over_m(found.transform, moved, CLOUD) < 2e-4
 
 
+@pytest.mark.slow
 def test_features_align_from_anywhere_and_find_the_scale() -> None:
     scale = 0.37
     moved = moved_by(scale, *FAR)
@@ -111,6 +112,7 @@ def test_features_align_from_anywhere_and_find_the_scale() -> None:
     assert found.transform.scale == pytest.approx(1 / scale, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_features_do_not_say_how_a_ball_lies() -> None:
     ball = surface(False, 5000, 1)
     moved = moved_by(1.0, *FAR)

@@ -52,6 +52,7 @@ def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
         require_format(tmp_path / "cloud", "las", 337, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("file_format", "name"), [("netcdf", "cloud.nc"), ("zarr", "cloud.zarr")])
 def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, file_format, name: str) -> None:
     xarray = pytest.importorskip("xarray")

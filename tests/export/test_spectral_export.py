@@ -221,6 +221,7 @@ def test_keep_turntable_keeps_the_turntable(run, tmp_path):
         assert lowest - 1e-3 < points[:, 2].min() < lowest + 0.3
 
 
+@pytest.mark.slow
 def test_nerfstudios_options_work(run, tmp_path):
     def exported(**options):
         return read_spectral_ply(export_cloud(run, tmp_path, CloudOptions(num_points=300, **options)))

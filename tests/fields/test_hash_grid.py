@@ -73,6 +73,7 @@ def test_compiled_loops_equal_tensor_operations(count):
         torch.testing.assert_close(compiled, reference, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_gradients():
     torch.manual_seed(0)
     points, upstream = torch.rand(6000, 3), torch.randn(6000, 4)

@@ -49,6 +49,7 @@ def field(kind: type[SpectralField] = SpectralField, **options) -> SpectralField
     return made
 
 
+@pytest.mark.slow
 def test_the_direct_head_has_a_reflectance_a_band():
     spectra = field()(rays())[FieldHeadNames.RGB]
     assert spectra.shape == (5, 6, BANDS)

@@ -69,6 +69,7 @@ def test_training_does_not_see_flagged_values(pipeline):
     assert outputs["spectral"].grad[batch["valid"]].any()
 
 
+@pytest.mark.slow
 def test_held_out_views_are_judged_by_their_measurements(pipeline):
     _, batch = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     height, width, _ = batch["spectral"].shape
@@ -89,6 +90,7 @@ def test_held_out_views_are_judged_by_their_measurements(pipeline):
     assert pipeline.model.get_image_metrics_and_images(outputs, batch)[0]["rmse"] > 1.5 * found[0]["rmse"]
 
 
+@pytest.mark.slow
 def test_a_view_without_its_object_is_not_judged(flagged_dataset, tmp_path):
     """It would score as perfect."""
     data = shutil.copytree(flagged_dataset, tmp_path / "data")
@@ -101,6 +103,7 @@ def test_a_view_without_its_object_is_not_judged(flagged_dataset, tmp_path):
     assert [batch["image_idx"] for _, batch in loader] == [0, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "told"),
     [("field.aabb", "is not the dataset"), ("mlp_head", "is not the dataset"), (None, "other settings of the model")],

@@ -69,6 +69,7 @@ def whole(tiny_dataset, tmp_path_factory):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed_at", [5, SWITCH, 15])
 def test_killed_and_resumed(tiny_dataset, tmp_path, whole, killed_at):
     made = longer(tiny_dataset, tmp_path)
@@ -95,6 +96,7 @@ def test_both_stages_leave_their_held_out_metrics(whole):
     assert again["psnr"] == pytest.approx(found["results"]["psnr"], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["full-frame", "masked"])
 def test_killed_while_a_stage_is_evaluated(tiny_dataset, tmp_path, monkeypatch, stage):
     values = {f"{prefix}{name}": 0.5 for prefix in ("", "full_") for name in ("sam", "rmse", "ssim", "psnr")}
@@ -115,6 +117,7 @@ def test_killed_while_a_stage_is_evaluated(tiny_dataset, tmp_path, monkeypatch, 
         assert {path.suffix for path in (resumed.base_dir / f"stage-{name}").iterdir()} == {".ckpt", ".json"}
 
 
+@pytest.mark.slow
 def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp_path, whole):
     made = longer(tiny_dataset, tmp_path, switch=15, load_dir=whole.base_dir / "stage-full-frame")
     seen = []
@@ -132,6 +135,7 @@ def test_a_first_stage_of_any_length_is_followed_by_the_second(tiny_dataset, tmp
     assert checkpoint(made.checkpoint_dir)["training"]["completed_stage"] == "masked"
 
 
+@pytest.mark.slow
 def test_a_second_stage_after_another_runs_first_is_resumed_where_it_was(tiny_dataset, tmp_path, whole):
     """The settings alone would put its steps back into the first stage."""
     made = longer(tiny_dataset, tmp_path / "killed", switch=15, load_dir=whole.base_dir / "stage-full-frame")
@@ -151,6 +155,7 @@ def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, t
     assert not list(made.base_dir.glob("stage-*"))
 
 
+@pytest.mark.slow
 def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, whole):
     with pytest.raises(SystemExit, match="holds no checkpoint; --load-dir takes"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
@@ -168,6 +173,7 @@ def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, 
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
 
 
+@pytest.mark.slow
 def test_checkpoints_of_older_versions_load_or_are_refused(tiny_dataset, tmp_path, whole):
     older = checkpoint(whole.checkpoint_dir)
     older["training"]["weights"] = {}  # older versions kept averaged weights here, if there were any

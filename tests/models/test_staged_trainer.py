@@ -12,6 +12,7 @@ from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
     made = trainer(tiny_dataset, tmp_path, device)
@@ -45,6 +46,7 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
     torch.testing.assert_close(twists[2], twists[5], rtol=0, atol=0)  # kept, and frozen
 
 
+@pytest.mark.slow
 def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path):
     """Frozen groups, loss weights, learning rates and the paper's rays, by stage."""
     first, second = full_frame_stage(), masked_stage()
@@ -79,12 +81,14 @@ def test_impossible_settings_end_in_a_sentence(tiny_dataset, tmp_path):
         trainer(tiny_dataset, tmp_path, full_frame=StageConfig("a", 1.0, frozen_groups=("x",)))
 
 
+@pytest.mark.slow
 def test_several_devices_are_refused(tiny_dataset, tmp_path):
     config = trainer(tiny_dataset, tmp_path).config
     with pytest.raises(SystemExit, match="trains on one device"):
         config.setup(local_rank=0, world_size=2).setup()
 
 
+@pytest.mark.slow
 def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()
@@ -98,6 +102,7 @@ def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
     assert second._stage.config.name == "masked"
 
 
+@pytest.mark.slow
 def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path)
     made.train()
@@ -119,6 +124,7 @@ def poison(made, bad_steps):
     made.pipeline.datamanager.next_train = next_train
 
 
+@pytest.mark.slow
 def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
     made = trainer(tiny_dataset, tmp_path)
     poison(made, {2})
@@ -127,6 +133,7 @@ def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
     assert all(torch.isfinite(parameter).all() for parameter in made.pipeline.model.parameters())
 
 
+@pytest.mark.slow
 def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path, max_nonfinite_steps=2)
     poison(made, {1, 2, 3, 4, 5})

@@ -22,6 +22,7 @@ def events(tiny_dataset, tmp_path, monkeypatch):
     return accumulator
 
 
+@pytest.mark.slow
 def test_events_of_a_run(events):
     tags = events.Tags()
     losses = ["hsi_loss", "angular_loss", "interlevel_loss", "distortion_loss"]
@@ -43,6 +44,7 @@ def test_events_of_a_run(events):
     assert ends == [STEPS // 2 - 1, STEPS - 1]
 
 
+@pytest.mark.slow
 def test_picture_of_spectra():
     wavelengths_nm = np.linspace(400, 1000, 20)
     measured, rendered = torch.zeros(2, 20), torch.full((2, 20), 0.5)

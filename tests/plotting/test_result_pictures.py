@@ -77,6 +77,7 @@ def test_the_nearer_side_hides_the_farther(tmp_path: Path) -> None:
     assert len(where(picture, BLUE)) < 0.02 * len(where(picture, RED))
 
 
+@pytest.mark.slow
 def test_from_above_the_camera_is_at_the_bottom_and_from_the_left_on_the_right(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     points = random.uniform((-0.03, -0.03, 0.0), (0.03, 0.03, 0.06), (4000, 3))
@@ -108,6 +109,7 @@ def test_a_picture_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: 
     assert [file.name for file in tmp_path.iterdir()] == ["views.png"]
 
 
+@pytest.mark.slow
 def test_matplotlibs_global_state_stays_as_it_was(tmp_path: Path) -> None:
     before = mpl.rcParams["font.size"], mpl.rcParams["axes.grid"]
     draw_views(tmp_path / "views.png", [plain(RED)], [plain(GREEN)], ["a"])

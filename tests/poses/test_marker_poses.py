@@ -57,6 +57,7 @@ def estimated(**options):
     return scene, poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -157,6 +158,7 @@ def test_frames_without_a_shared_marker_are_not_linked():
     np.testing.assert_array_equal(linked_rows(frame, marker), [True] * 5 + [False] * 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "largest_deg", "largest_mm"),
     [
@@ -238,6 +240,7 @@ def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
     assert position < 3.0
 
 
+@pytest.mark.slow
 def test_frames_without_markers_are_refused_with_names_and_advice():
     noise = list(np.random.default_rng(0).integers(0, 255, (4, 64, 64)).astype(np.uint8))
     with pytest.raises(InputError, match=r"first \.\.\. last.*dictionary"):
@@ -257,6 +260,7 @@ def test_a_single_frame_is_refused():
         poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO, progress=False)
 
 
+@pytest.mark.slow
 def test_a_camera_before_a_still_table_is_refused():
     scene = MarkerScene(frames=18, noise=0.01)
     still = [scene.render()[0]] * 4

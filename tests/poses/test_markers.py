@@ -58,6 +58,7 @@ def test_fitted_corners_are_good_to_hundredths_of_a_pixel(small):
     assert abs(bias) < 0.002  # 1 mm in half a metre
 
 
+@pytest.mark.slow
 def test_covariance_tells_the_size_of_the_error():
     squared = [
         (fitted.corners_px - truth).ravel()
@@ -98,6 +99,7 @@ def test_fit_refuses_another_marker_and_the_images_edge(small):
     assert fit_marker(np.full_like(image, 7.0), DICTIONARY, marker, start) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur_px", [0.0, 0.7])
 def test_blur_is_found(blur_px):
     _, images = truth_and_images(size_px=160, blur_px=blur_px, noise=0.005)
@@ -119,6 +121,7 @@ def test_dictionary_is_found(name):
     assert find_dictionary([page, page, page]) == name
 
 
+@pytest.mark.slow
 def test_no_dictionary_where_there_is_no_marker():
     noise = np.random.default_rng(0).integers(0, 255, (3, 96, 96)).astype(np.uint8)
     assert find_dictionary(list(noise)) is None

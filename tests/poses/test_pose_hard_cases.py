@@ -225,6 +225,7 @@ def test_one_displaced_marker_is_no_displaced_frame():
     assert 0.2 < found.rms_error_px[3] < 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
 def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(frames, which):
     scene = MarkerScene(size_px=128, frames=frames, displaced=which)
@@ -241,6 +242,7 @@ def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(fram
     assert warning.startswith(f"{len(which)} of {frames} frames are left out: {', '.join(names[i] for i in which)} (")
 
 
+@pytest.mark.slow
 def test_a_session_on_a_wobbling_table_keeps_its_frames():
     scene = MarkerScene(size_px=128, frames=10, wobble_deg=0.5)
     poses = poses_from_markers(scene.render(), scene.names(), SessionInfo(marker_side_m=SIDE_M), progress=False)
@@ -338,6 +340,7 @@ def test_the_container_is_measured_by_its_markers(shift_m):
     np.testing.assert_allclose(machine.reproject(seen), machine.resized(2.0).reproject(seen), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "size_px", "frames", "largest_deg", "largest_mm"),
     [
@@ -362,6 +365,7 @@ def test_hard_session_is_posed(name, size_px, frames, largest_deg, largest_mm):
     assert abs(posed.focal_percent) < 0.7
 
 
+@pytest.mark.slow
 def test_a_wobbling_and_distorted_session_is_posed_and_reported(tmp_path):
     effects = ("{wobble: {amplitude_deg: 1}}", "{lens_distortion: {k1: -0.3}}", "{axis_tilt: {tilt_deg: 5}}")
     posed = pose(Case(effects, any_axis=True), 224, 10)
@@ -383,6 +387,7 @@ def test_a_wobbling_and_distorted_session_is_posed_and_reported(tmp_path):
     assert (tmp_path / "poses.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_container_alone_gives_the_scale_and_a_wrong_one_is_noticed():
     scene = scene_of(Case(), 128, 8)
     simulation = Simulation(scene)

@@ -44,6 +44,7 @@ def largest_errors(poses, truth):
     return rotation, place
 
 
+@pytest.mark.slow
 def test_auto_takes_markers(pear):
     images, names, truth, _ = pear
     poses = find_poses(images, names, pear_info(), "auto", progress=False)
@@ -53,6 +54,7 @@ def test_auto_takes_markers(pear):
     assert place_m < 0.5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["colmap", "angles"])
 def test_features_find_the_poses_and_markers_their_scale(pear, method):
     images, names, truth, intrinsics = pear
@@ -73,6 +75,7 @@ def test_features_find_the_poses_and_markers_their_scale(pear, method):
     assert np.abs(disc[:, 2]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_without_markers_and_a_known_distance_there_is_no_scale(pear):
     images, names, truth, _ = pear
     # The session's markers are of another dictionary.
@@ -105,6 +108,7 @@ def test_auto_says_why_not(pear):
     assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
 
 
+@pytest.mark.slow
 def test_where_colmap_fails_known_angles_are_a_start(pear):
     images, names, truth, _ = pear
     given = np.arange(FRAMES) * 360.0 / FRAMES + np.where(np.arange(FRAMES) % 5 == 2, 1.5, 0.0)

@@ -206,6 +206,7 @@ def test_the_broad_mean_is_best_where_nothing_is_wrong(pear, tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "best", "worse"),
     [
@@ -248,6 +249,7 @@ def two_pictures(best, other):
     )
 
 
+@pytest.mark.slow
 def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machine):
     _, images = machine
     blank = [np.full_like(image, 100) for image in images]
@@ -281,6 +283,7 @@ def test_ink_that_the_best_picture_does_not_show_is_found_in_the_broad_mean(mach
     assert find_dictionary(two_pictures(blank, images)) == DICTIONARY
 
 
+@pytest.mark.slow
 def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     # In frames that show many markers only the adjusted turntable asks for the rest.
     scene, images = machine
@@ -329,6 +332,7 @@ def packed(tmp_path_factory):
     return open_session(session), process_session(session, folder / "data", progress=False, estimate_poses=true_poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("features", "name"),
     [

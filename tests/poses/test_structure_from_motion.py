@@ -79,6 +79,7 @@ def errors(found, truth):
     return rotation, np.linalg.norm(off - off.mean(axis=0), axis=-1).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "drift"), [(0.0, 0.0), (0.02, -0.05)])
 def test_what_moves_is_told_from_a_patterned_wall(noise, drift):
     images, _, covered = session(noise=noise, drift=drift)
@@ -88,6 +89,7 @@ def test_what_moves_is_told_from_a_patterned_wall(noise, drift):
     assert moving[far].mean() < 0.003
 
 
+@pytest.mark.slow
 def test_a_ball_before_a_patterned_wall_is_posed(tmp_path, monkeypatch):
     images, truth, _ = session()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -105,6 +107,7 @@ def test_a_ball_before_a_patterned_wall_is_posed(tmp_path, monkeypatch):
     np.testing.assert_allclose(np.rad2deg(found.turntable.angles_rad), STEPS_DEG, atol=0.3)
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_poses():
     images, _, _ = session()
     some = images[:6], names()[:6]
@@ -112,6 +115,7 @@ def test_the_same_images_give_the_same_poses():
     np.testing.assert_array_equal(one.world_to_camera, two.world_to_camera)
 
 
+@pytest.mark.slow
 def test_matched_tracks_and_known_angles_give_the_camera():
     images, truth, _ = session()
     tracks = matched_tracks(images, names())
@@ -125,6 +129,7 @@ def test_matched_tracks_and_known_angles_give_the_camera():
     assert place_m < 0.0015
 
 
+@pytest.mark.slow
 def test_unmasked_the_wall_wins():
     """What the mask is for: with the wall in sight the camera is found to stand still, or most frames are lost."""
     images, _, _ = session()

@@ -131,6 +131,7 @@ def test_held_angles_stay():
     assert pose_error_deg(found.turntable, true) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sign", "elevation_deg"), [(1.0, 2.0), (-1.0, 55.0)])
 def test_known_angles_give_the_camera_from_scratch(sign, elevation_deg):
     true = machine(sign * np.arange(0, 360, 18.0), elevation_deg=elevation_deg)
@@ -152,6 +153,7 @@ def test_tracks_of_something_else_are_refused():
         adjust_tracks(true, few.select(few.point < 5))
 
 
+@pytest.mark.slow
 def test_halves_of_the_points_tell_the_error():
     true = machine(np.arange(0, 360, 18.0), points=400)
     errors, told = [], []

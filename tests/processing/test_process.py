@@ -61,6 +61,7 @@ def no_markers(images, names, **_):
     raise InputError("no marker was found")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("specim", [True, False])
 def test_session_to_dataset(tmp_path, specim):
     session = write_session(tmp_path / "session", ANGLES_DEG, specim=specim)
@@ -110,6 +111,7 @@ def test_a_session_of_finished_reflectance(tmp_path):
     assert sorted(path.name for path in (output / "report").iterdir()) == ["masks.png", "poses.png"]
 
 
+@pytest.mark.slow
 def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
     info = {**INFO, "nominal_step_deg": 90, "direction": "ccw", "marker_dictionary": "DICT_4X4_50"}
     session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
@@ -131,6 +133,7 @@ def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
         np.testing.assert_allclose(image, 255 * frame_reflectance(angle)[..., visible].mean(-1), atol=1.0)
 
 
+@pytest.mark.slow
 def test_the_same_input_is_processed_once(session, tmp_path):
     output = run(session, tmp_path / "data")
     before, stamp = written(output), (output / "transforms.json").stat().st_mtime_ns
@@ -139,6 +142,7 @@ def test_the_same_input_is_processed_once(session, tmp_path):
     assert (output / "transforms.json").stat().st_mtime_ns == stamp
 
 
+@pytest.mark.slow
 def test_other_settings_redo_what_depends_on_them(session, tmp_path):
     output = run(session, tmp_path / "data")
     before = written(output)
@@ -148,6 +152,7 @@ def test_other_settings_redo_what_depends_on_them(session, tmp_path):
     assert rewritten(output, before) == ["ball_1", "ball_2", "ball_3", "ball_4"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["panel", "camera"])
 def test_a_changed_file_that_a_setting_names_is_noticed(session, tmp_path, kind):
     if kind == "panel":
@@ -168,6 +173,7 @@ def test_a_changed_file_that_a_setting_names_is_noticed(session, tmp_path, kind)
     )
 
 
+@pytest.mark.slow
 def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
     dataset = open_packed(run(session, tmp_path / "data"))
 
@@ -181,6 +187,7 @@ def test_an_earlier_session_tells_how_the_table_turns(session, tmp_path):
     assert told(0.0) is None
 
 
+@pytest.mark.slow
 def test_a_changed_capture_is_done_again_alone(session, tmp_path):
     # All of that frame gets darker, which would be taken for the lamps.
     config = ProcessConfig(calibration=CalibrationConfig(lamp_drift="never"))
@@ -193,6 +200,7 @@ def test_a_changed_capture_is_done_again_alone(session, tmp_path):
     np.testing.assert_allclose(cube / REFLECTANCE_SCALE, 0.9 * frame_reflectance(180.0), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_damaged_output_is_made_again(session, tmp_path):
     output = run(session, tmp_path / "data")
     before = written(output)
@@ -205,6 +213,7 @@ def test_damaged_output_is_made_again(session, tmp_path):
     assert open_packed(output).frames[0].mask().any()
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on(session, tmp_path):
     one_by_one = ProcessConfig(workers=1)
     in_the_way = tmp_path / "data" / "cubes" / "ball_3.bip"
@@ -220,6 +229,7 @@ def test_a_stopped_run_goes_on(session, tmp_path):
     assert len(open_packed(output).frames) == 4
 
 
+@pytest.mark.slow
 def test_full_disk(session, tmp_path, monkeypatch):
     from spectral.io import envi as spy
 
@@ -246,6 +256,7 @@ def test_no_markers_leaves_no_dataset(session, tmp_path):
     assert not (tmp_path / "data" / "poses.json").exists()
 
 
+@pytest.mark.slow
 def test_an_outdated_dataset_does_not_survive_a_failure(session, tmp_path):
     run(session, tmp_path / "data")
     write_capture(session, "ball_1", expose(frame_reflectance(0.0) * 0.9))
@@ -254,6 +265,7 @@ def test_an_outdated_dataset_does_not_survive_a_failure(session, tmp_path):
     assert not (tmp_path / "data" / "transforms.json").exists()
 
 
+@pytest.mark.slow
 def test_frames_without_a_pose_are_left_out_with_a_warning(session, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         output = run(session, tmp_path / "data", poses=partial(true_poses, unused=("ball_2",)))
@@ -261,6 +273,7 @@ def test_frames_without_a_pose_are_left_out_with_a_warning(session, tmp_path, ca
     assert [frame.capture for frame in open_packed(output).frames] == ["ball_1", "ball_3", "ball_4"]
 
 
+@pytest.mark.slow
 def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
     angles_deg = tuple(np.arange(20) * 18.0)
     session = write_session(tmp_path / "session", angles_deg)
@@ -271,6 +284,7 @@ def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
     assert [frame.capture for frame in open_packed(output).frames if not frame.mask().any()] == ["ball_7"]
 
 
+@pytest.mark.slow
 def test_names_are_printed_as_they_are(tmp_path, capsys):
     info = {**INFO, "white_reference": "[white]"}
     session = write_session(tmp_path / "[session]", ANGLES_DEG, info=info)
@@ -295,6 +309,7 @@ def test_marker_size_is_needed(tmp_path):
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.slow
 def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
     seen = []
 
@@ -325,6 +340,7 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
     assert other.read_text() == '{"frames": []}'
 
 
+@pytest.mark.slow
 def test_object_without_contrast(tmp_path):
     session = tmp_path / "session"
     for name in ("a", "b", "c", "d"):

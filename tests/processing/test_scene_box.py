@@ -24,6 +24,7 @@ def turn(count: int) -> np.ndarray:
     return np.stack([true_pose(angle) for angle in np.arange(count) * 360.0 / count])
 
 
+@pytest.mark.slow
 def test_object_box_of_a_sphere():
     poses = turn(24)
     intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)

@@ -139,6 +139,7 @@ def silhouette(pose, lens=factory.INTRINSICS):
     return np.sqrt(towards @ towards - (directions @ towards) ** 2) - factory.SPHERE_RADIUS_M
 
 
+@pytest.mark.slow
 def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
     monkeypatch.setattr(trained_run, "open_run", lambda _: run)
     RenderCommand(tmp_path, tmp_path / "out", video=("pseudo-RGB",)).main()

@@ -112,6 +112,7 @@ def check_page(text):
     return page
 
 
+@pytest.mark.slow
 def test_a_run_without_comparison_traits_and_logs(run):
     write_report(run, run / "report.html", ReportSources())
     text = (run / "report.html").read_text(encoding="utf-8")
@@ -121,6 +122,7 @@ def test_a_run_without_comparison_traits_and_logs(run):
     assert sorted(path.name for path in run.iterdir()) == ["point_cloud.ply", "report.html"]
 
 
+@pytest.mark.slow
 def test_names_from_outside_stay_text(run):
     (run / "comparison.json").write_text(json.dumps(COMPARISON))
     (run / "traits.json").write_text(json.dumps(TRAITS))

@@ -89,6 +89,7 @@ def test_names_cannot_become_markup():
         assert root.attrib["aria-label"] == HOSTILE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("y", [np.full(3, np.nan), np.zeros(3), np.ones(3)])
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_constant_and_missing_curves_are_drawn_all_the_same(y, logarithmic):

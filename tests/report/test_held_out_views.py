@@ -153,6 +153,7 @@ def run(flagged_dataset):
     return TrainedRun(pipeline.model, pipeline.datamanager)
 
 
+@pytest.mark.slow
 def test_views_are_scored_as_the_model_scores_them(run, flagged_dataset):
     (view,) = render_held_out(run, 1)
     assert len(run.manager.eval_dataset) == 1

@@ -205,6 +205,7 @@ def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
     np.testing.assert_allclose(spectra[both], [0.45, 0.02])
 
 
+@pytest.mark.slow
 def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     radius_m, height_m = 0.045, 0.07
     drum = part(cylinder(2 * radius_m, height_m, 128, spacing_m=0.0025), "drum")

@@ -202,6 +202,7 @@ def detect(image, enlarge=2):
     return {int(n): (c[0] + 0.5) / enlarge for n, c in zip(numbers.ravel(), corners, strict=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
@@ -456,6 +457,7 @@ def test_a_session_without_effects_is_one_of_a_build_without_them(tmp_path, monk
     np.testing.assert_array_equal(frame.counts, np.rint(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", OURS, ids=lambda cls: cls.name)
 def test_no_effect_runs_that_is_not_named(named, monkeypatch):
     raise_in(monkeypatch, [cls for cls in OURS if cls is not named])
@@ -466,6 +468,7 @@ def test_no_effect_runs_that_is_not_named(named, monkeypatch):
     assert last != 2 or (simulation.frame(last).counts != even.frame(last).counts).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "neutral",
     [

@@ -31,6 +31,7 @@ def agreement(scene, transport, effects=(), frame=2):
     return mitsuba_agreement.compare(scene, frame, transport, ours, RAYS, REPEATS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "pear"])
 def test_matte_scene_in_even_light_agrees_within_monte_carlo_error(name):
     found = agreement(small(name), "even")
@@ -41,6 +42,7 @@ def test_matte_scene_in_even_light_agrees_within_monte_carlo_error(name):
         assert abs(bias) < 4.0 * error + 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("transport", "effects"),
     [("chamber", ["chamber_shading"]), ("one_bounce", ["chamber_shading", "inter_reflection"])],
@@ -53,6 +55,7 @@ def test_shading_and_one_bounce_agree(transport, effects):
         assert abs(bias) < 4.0 * error + 2e-3
 
 
+@pytest.mark.slow
 def test_unseen_chamber_has_its_own_spectrum_in_even_light_and_is_the_lamp_otherwise():
     scene = small("sphere")
     level = mitsuba_agreement.render_ours(scene, 0).radiance[0, 0]
@@ -61,6 +64,7 @@ def test_unseen_chamber_has_its_own_spectrum_in_even_light_and_is_the_lamp_other
         np.testing.assert_allclose(corner.mean(axis=(0, 1)), expected, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_white_furnace():
     """What absorbs nothing cannot be seen in an even white chamber, once all bounces are followed."""
     white = dict.fromkeys(("disc", "container_plastic", "paper", "marker_ink"), Plain(1.0))

@@ -295,6 +295,7 @@ def test_a_run_without_space_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_goes_on_with_what_is_missing(tmp_path, monkeypatch):
     scene = override(load_scene("pear"), frames=4, size_px=16, bands=3)
     whole = simulate_session(scene, tmp_path / "whole", False)

@@ -169,6 +169,7 @@ def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
     assert not panel.state_dict()
 
 
+@pytest.mark.slow
 def test_an_attached_panel_is_found_by_the_viewer_and_keeps_checkpoints(pipeline):
     before = pipeline.state_dict().keys()
     panel = attach_spectral_panel(pipeline)
