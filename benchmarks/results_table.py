@@ -12,7 +12,6 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from rich.console import Console
 
 from hsi_sc_nerf.files import atomic_write
@@ -84,5 +83,8 @@ def current_commit() -> str:
 
 def machine_name() -> str:
     """Cores and GPU of this machine."""
+    # PyTorch takes 500 MiB, which benchmarks of memory must not count.
+    import torch
+
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     return f"{os.cpu_count()} cores ({platform.machine()}), {gpu}"
