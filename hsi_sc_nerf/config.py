@@ -74,7 +74,9 @@ hsi_sc_nerf = MethodSpecification(
     config=_method(
         "hsi-sc-nerf",
         SpectralPipelineConfig(
-            _target=pipeline_with_panel, datamanager=SpectralDataManagerConfig(), model=SpectralModelConfig()
+            _target=pipeline_with_panel,  # type: ignore[arg-type]
+            datamanager=SpectralDataManagerConfig(),
+            model=SpectralModelConfig(),
         ),
         {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4},
         full_frame=full_frame_stage(),
@@ -90,7 +92,7 @@ hsi_sc_nerf_paper = MethodSpecification(
     config=_method(
         "hsi-sc-nerf-paper",
         SpectralPipelineConfig(
-            _target=pipeline_with_panel,
+            _target=pipeline_with_panel,  # type: ignore[arg-type]
             datamanager=SpectralDataManagerConfig(
                 dataparser=SpectralDataParserConfig(scene="cameras"),
                 train_num_rays_per_batch=paper.RAYS_PER_BATCH,

@@ -35,9 +35,15 @@ class SpectralCloud:
 
     def select(self, rows: np.ndarray | slice) -> SpectralCloud:
         """The points that a slice, an index or a boolean array selects."""
-        arrays = (array[rows] for array in (self.points, self.normals, self.colours, self.spectra))
         extra = {name: column[rows] for name, column in self.extra.items()}
-        return SpectralCloud(*arrays, self.wavelengths_nm, extra)
+        return SpectralCloud(
+            self.points[rows],
+            self.normals[rows],
+            self.colours[rows],
+            self.spectra[rows],
+            self.wavelengths_nm,
+            extra,
+        )
 
     def check(self) -> None:
         """Raise ValueError if the arrays' shapes do not fit together."""

@@ -161,8 +161,8 @@ class _RenderedChunks:
         parts = []
         for start in range(0, len(surface), self.batch):
             part = surface.select(slice(start, start + self.batch))
-            spectra, *columns = render_points(model, manager.train_dataset.cameras, part, self.options)
-            parts.append([column.cpu().numpy() for column in (spectra[:, bands], *columns)])
+            rendered, *columns = render_points(model, manager.train_dataset.cameras, part, self.options)
+            parts.append([column.cpu().numpy() for column in (rendered[:, bands], *columns)])
         spectra, opacity, colours, model_normals = (np.concatenate(column) for column in zip(*parts, strict=True))
         points, outward = (
             torch.from_numpy(array).float().to(model.device) for array in (surface.points, surface.mesh_normals)

@@ -23,7 +23,7 @@ MIN_MASK_FRACTION = 0.8
 MASK_MARGIN_PX = 2
 """Masks are widened by this for the visual hull: boundaries are uncertain by a pixel or two."""
 
-Vector = Sequence[float]
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def cylinder_region(box: Float[np.ndarray, "2 3"]) -> Region:
 
 def oriented_box_region(centre: Vector, roll_pitch_yaw: Vector, sides: Vector) -> Region:
     """nerfstudio's oriented box; angles in radians."""
-    box = OrientedBox.from_params(tuple(centre), tuple(roll_pitch_yaw), tuple(sides))
+    box = OrientedBox.from_params(centre, roll_pitch_yaw, sides)
     reach = np.abs(box.R.numpy()) @ np.divide(sides, 2.0)
     return Region(
         lambda points, _: box.within(torch.from_numpy(points).float()).numpy(),
