@@ -80,6 +80,7 @@ def assert_finite(value: torch.Tensor, *leaves: torch.Tensor) -> None:
         assert leaf.grad.dtype == leaf.dtype
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(

@@ -72,6 +72,7 @@ def test_base_of_a_cone_goes_straight_on_to_where_it_stands():
     assert (outward[~on_floor, 2] < 0.0).all()
 
 
+@pytest.mark.slow
 def test_base_without_a_height_is_where_the_cloud_ends():
     points, normals = sphere_points(20000, above=-0.6)
     assert lowest_edge_m(points) == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=5e-4)
@@ -98,6 +99,7 @@ def test_a_rim_that_hangs_down_does_not_widen_the_base():
     assert foot_m.max() < 0.55 * RADIUS_M
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.0, 0.0003])
 def test_closed_sphere_has_its_area_and_volume(noise_m):
     points, normals = sphere_points(20000, noise_m=noise_m, above=-0.93)

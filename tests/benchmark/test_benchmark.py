@@ -106,6 +106,7 @@ def test_bad_configurations_are_refused_in_one_sentence(text):
         own_configuration(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_every_known_configuration_is_one_that_its_method_takes(name):
     known = named_configuration(name)
@@ -237,6 +238,7 @@ def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_pat
     assert ends[0] == pytest.approx(ends[1], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["wall", "cpu"])
 def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, clock):
     writer.EVENT_WRITERS.clear()

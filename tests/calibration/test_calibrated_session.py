@@ -71,6 +71,7 @@ def noisy(tmp_path_factory) -> Calibrated:
     return calibrated(tmp_path_factory.mktemp("noisy"), [*ODDITIES, *NOISE], CalibrationConfig(flat_field=True))
 
 
+@pytest.mark.slow
 def test_reflectance_is_within_one_percent(odd):
     errors = []
     for number in range(len(odd.session.frames)):
@@ -231,6 +232,7 @@ def test_other_sources_of_white(tmp_path):
     assert not by_target.drift_corrected
 
 
+@pytest.mark.slow
 def test_finished_reflectance_as_input(tmp_path):
     scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["image_rotation"])
     folder = simulate_session(scene, tmp_path / "session", progress=False)
@@ -254,6 +256,7 @@ def test_finished_reflectance_as_input(tmp_path):
     np.testing.assert_allclose(reflectance, np.clip(truth.reflectance(name), 0.0, 1.0), atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "option"), [("capture", "white-source"), ("product", "white-source"), ("target", "roi")]
 )

@@ -49,6 +49,7 @@ def tarp_capture(folder, counts: np.ndarray) -> Capture:
     return Capture("tarp", open_cube(folder / "tarp.hdr"), open_cube(folder / "dark.hdr"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", [0.0, 0.15])
 @pytest.mark.parametrize("dirty", [False, True], ids=["clean", "folded"])
 def test_reflectance_is_right_to_1_percent_over_the_whole_image(tmp_path, gradient, dirty):

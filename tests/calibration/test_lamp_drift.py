@@ -82,6 +82,7 @@ def test_drift_of_a_noisy_session_within_a_third_of_a_percent(effects, name):
     np.testing.assert_array_equal(correction(drift, "auto"), drift.factor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [(), NOISE, (*NOISE, "textured_background", "wobble", "drying")])
 def test_session_without_drift_stays_as_it_is(effects):
     drift, _, _ = simulated(*effects)
@@ -91,6 +92,7 @@ def test_session_without_drift_stays_as_it_is(effects):
     assert correction(drift, "auto") is None
 
 
+@pytest.mark.slow
 def test_inter_reflection_makes_no_drift():
     drift, _, _ = simulated(
         {"inter_reflection": {"directions": 24}}, {"chamber_shading": {"directions": 24}}, bands=20, frames=4
@@ -105,6 +107,7 @@ def test_noise_free_drift_before_an_even_background():
     assert np.sqrt(np.mean((drift.factor / true - 1.0) ** 2)) < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effects", "name"), [((), "pear"), ((*NOISE, DRIFT), "maize"), ((*NOISE, "lamp"), "apple")])
 def test_not_measurable_where_the_object_fills_the_frame(effects, name):
     drift, _, _ = simulated(*effects, name=name, bands=20, frames=5, field_of_view_deg=4.0, aim_height_m=0.11)

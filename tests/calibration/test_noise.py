@@ -39,6 +39,7 @@ def exposures(light=1.0, **noise):
     return white, digitised(np.zeros((64, SAMPLES, BANDS)), rng, **noise)
 
 
+@pytest.mark.slow
 def test_simulated_session_within_three_percent():
     scene = override(load_scene("sphere"), size_px=128, bands=204, frames=1)
     effects = read_effects(["illumination_falloff", "photon_noise", "dark_pattern", "read_noise"], "test")

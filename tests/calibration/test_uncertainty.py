@@ -31,6 +31,7 @@ def moving_average(spectrum, width):
 
 
 # The white averaged over many pixels, and over so few that its share shows; many dark lines, and few.
+@pytest.mark.slow
 @pytest.mark.parametrize(("white_lines", "columns", "dark_lines"), [(20, 20, 16), (1, 3, 2)])
 def test_agrees_with_repeated_exposures(white_lines, columns, dark_lines):
     rng = np.random.default_rng(8)

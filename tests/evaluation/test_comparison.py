@@ -141,6 +141,7 @@ def test_icp_brings_a_shifted_cloud_back(mesh: Path, tmp_path: Path) -> None:
     assert found.to_reference_m.max() < 2e-4
 
 
+@pytest.mark.slow
 def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Registration(Similarity(), 0.001, Rival(90.0, 0.0001, 0.0001))
     monkeypatch.setattr(comparison, "align_by_features", lambda *_: found)

@@ -123,6 +123,7 @@ def test_features_do_not_say_how_a_ball_lies() -> None:
     np.testing.assert_allclose(found.transform(moved(np.zeros((1, 3)))), 0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_box_fits_in_four_attitudes() -> None:
     box = trimesh.creation.box((0.03, 0.05, 0.08))
     near, far = (sample_surface(box.vertices, box.faces, count, seed) for count, seed in ((10_000, 0), (5000, 1)))

@@ -116,6 +116,7 @@ def test_distance_to_the_surface_not_to_its_vertices(origin_m: tuple[float, ...]
     np.testing.assert_allclose(distances, [0.003, 0.003, 0.0, 0.05], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_scores_need_no_open3d() -> None:
     program = "import sys, hsi_sc_nerf.evaluation.spatial as s; sys.exit('open3d' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

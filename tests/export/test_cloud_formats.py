@@ -83,6 +83,7 @@ def test_a_missing_package_is_one_sentence(tmp_path: Path, monkeypatch, file_for
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file_format", ["ply", "las", "netcdf", "zarr"])
 def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> None:
     before = write_cloud(tmp_path / "cloud", stream(cloud()), file_format)

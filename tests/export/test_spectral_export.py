@@ -59,6 +59,7 @@ def test_poses_are_the_refined_ones(run):
     np.testing.assert_allclose(refined.numpy(), POSES, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_points_lie_on_the_surface_and_at_their_image_coordinates(run):
     found = surface_points(run, POINTS)
     assert len(found) == POINTS
@@ -150,6 +151,7 @@ def tried(monkeypatch):
     return counts
 
 
+@pytest.mark.slow
 def test_a_small_region_is_searched_only_near_it(run, tmp_path, tried):
     box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)  # 9 mm2 of the ball's 31,000
     cloud = read_spectral_ply(export_cloud(run, tmp_path, CloudOptions(num_points=300, roi_box=box)))
@@ -196,6 +198,7 @@ def test_a_path_is_shown_as_it_is(run, tmp_path, capsys):
     assert str(path) in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path):
     painted = np.zeros((LENS.h, LENS.w), np.uint8)
     painted[:, : LENS.w // 2] = 255
@@ -211,6 +214,7 @@ def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path):
         export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
 
 
+@pytest.mark.slow
 def test_keep_turntable_keeps_the_turntable(run, tmp_path):
     """The object's box and mask cut the ball to its upper half; without them all of it is there."""
     cut = known_run(tmp_path / "cut")

@@ -93,6 +93,7 @@ def test_density_gradient_is_that_of_the_log_density(distortion, kind):
     torch.testing.assert_close(made.density_gradient(points), difference, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [None, contraction()])
 def test_normals_are_those_of_the_scene(distortion):
     made = field(use_pred_normals=True, spatial_distortion=distortion)

@@ -46,6 +46,7 @@ def pipeline(flagged_dataset) -> SpectralPipeline:
     return pipeline_config(flagged_dataset).setup(device="cpu")
 
 
+@pytest.mark.slow
 def test_training_does_not_see_flagged_values(pipeline):
     rays, batch = pipeline.datamanager.next_train(0)
     frame, line, sample = batch["indices"].T
@@ -127,6 +128,7 @@ def test_density_groups_that_there_cannot_be(flagged_dataset, groups, told):
         replace(config, model=replace(config.model, density_groups=groups)).setup(device="cpu")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 2])
 def test_nerfstudios_rgba_pictures_are_opaque(flagged_dataset, groups):
     config = pipeline_config(flagged_dataset)

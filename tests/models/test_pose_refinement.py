@@ -301,6 +301,7 @@ def pose_errors(true_poses, poses):
     return max(turns), shifts.max() / np.linalg.norm(true_poses[0, :3, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wobbles", [False, True])
 def test_errors_of_the_axis_and_the_angles_are_recovered(wobbles):
     """An axis that stands elsewhere and leans elsewhere is a camera moved before it; each frame's angle is its own.

@@ -83,6 +83,7 @@ def test_killed_and_resumed(tiny_dataset, tmp_path, whole, killed_at):
     assert differences(first, second) == []
 
 
+@pytest.mark.slow
 def test_both_stages_leave_their_held_out_metrics(whole):
     made = whole
     for name, step in (("full-frame", SWITCH - 1), ("masked", STEPS - 1)):

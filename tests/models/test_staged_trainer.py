@@ -145,6 +145,7 @@ def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset,
     assert all(torch.isfinite(value).all() for value in state["pipeline"].values() if value.is_floating_point())
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monkeypatch):
     made = trainer(tiny_dataset, tmp_path)
     made.save_checkpoint(0)

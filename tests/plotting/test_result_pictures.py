@@ -90,6 +90,7 @@ def test_from_above_the_camera_is_at_the_bottom_and_from_the_left_on_the_right(t
     assert np.median(where(above, RED)[:, 0]) > np.median(where(above, BLUE)[:, 0]) + third // 4
 
 
+@pytest.mark.slow
 def test_a_stray_point_does_not_shrink_the_object(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(-0.03, 0.03, (5000, 3))
     colours = np.full((5001, 3), RED, np.uint8)
@@ -97,6 +98,7 @@ def test_a_stray_point_does_not_shrink_the_object(tmp_path: Path) -> None:
     assert len(where(drawn(tmp_path / "cloud.png"), RED)) > 100_000
 
 
+@pytest.mark.slow
 def test_an_empty_cloud_is_an_empty_picture(tmp_path: Path) -> None:
     draw_cloud(tmp_path / "cloud.png", np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert drawn(tmp_path / "cloud.png").size

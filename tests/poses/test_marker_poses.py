@@ -97,6 +97,7 @@ def test_noisy_corners_give_close_poses():
     assert position < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "free",
     [
@@ -228,6 +229,7 @@ def test_disc_is_the_lowest_group_that_faces_up():
     np.testing.assert_array_equal(lie_on_disc(turntable.corners()), turntable.markers >= 6)
 
 
+@pytest.mark.slow
 def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
     scene, poses = estimated(size_px=160, frames=15, disc_markers=0)
     lowest = min(corners[:, 2].min() for corners in poses.marker_corners_m.values())

@@ -47,6 +47,7 @@ def test_detected_corners_count_from_the_images_corner(width):
     np.testing.assert_allclose(found[4], [[40, 50], [110, 50], [110, 120], [40, 120]], atol=0.1)
 
 
+@pytest.mark.slow
 def test_fitted_corners_are_good_to_hundredths_of_a_pixel(small):
     found = [(truth, start, fitted) for truth, start, fitted in fits(*small) if fitted is not None]
     assert len(found) >= 12

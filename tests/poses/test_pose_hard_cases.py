@@ -103,6 +103,7 @@ def relative_errors(found, truth):
     return rotation, 1e3 * np.abs(steps[0][:, :3, 3] - steps[1][:, :3, 3]).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude_deg", "seed"), [(0.3, None), (1.0, None), (0.5, 3)])
 def test_a_wobbling_table_gets_free_poses(amplitude_deg, seed):
     machine = wobbling(amplitude_deg, seed=seed)
@@ -179,6 +180,7 @@ def displaced(machine, frames, tilt_deg, shift_m, seed=0):
     return replace(machine, tilts_rad=tilts, shifts=shifts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frames", "which", "tilt_deg", "shift_m"),
     [(14, [6], 0.2, 0.0002), (14, [0], 8.0, 0.015), (30, [4, 5, 19], 0.3, 0.0003), (30, [0, 11, 29], 2.0, 0.003)],

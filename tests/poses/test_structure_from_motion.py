@@ -138,6 +138,7 @@ def test_unmasked_the_wall_wins():
         turntable_from_poses(structure_from_motion(images[:8], names()[:8], moving=everything).world_to_camera)
 
 
+@pytest.mark.slow
 def test_a_ball_without_patterns_is_refused():
     images, _, _ = session(texture=False, noise=0.01)
     with pytest.raises(InputError, match=r"nothing moves|too little texture"):

@@ -97,6 +97,7 @@ def test_session_to_dataset(tmp_path, specim):
     assert not [path for path in output.rglob("*") if "partial" in path.name]
 
 
+@pytest.mark.slow
 def test_a_session_of_finished_reflectance(tmp_path):
     session = tmp_path / "session"
     for number, angle in enumerate(ANGLES_DEG, start=1):
@@ -249,6 +250,7 @@ def test_full_disk(session, tmp_path, monkeypatch):
     assert len(open_packed(run(session, tmp_path / "data")).frames) == 4
 
 
+@pytest.mark.slow
 def test_no_markers_leaves_no_dataset(session, tmp_path):
     with pytest.raises(InputError, match="no marker was found"):
         run(session, tmp_path / "data", poses=no_markers)

@@ -52,6 +52,7 @@ def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
     assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
 
 
+@pytest.mark.slow
 def test_one_wrong_mask_does_not_cut_the_object():
     poses = turn(24)
     masks = np.stack([sphere_mask(pose) for pose in poses])

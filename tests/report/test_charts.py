@@ -70,6 +70,7 @@ def test_bars_are_as_high_as_their_numbers():
     assert heights[1] == pytest.approx(2.0 * heights[0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_colours_follow_the_page():
     x = np.arange(3.0)
     svg = line_chart([Curve(f"{i}", x, x + i, np.ones(3)) for i in range(8)], marks={"end": 1.0}, **LABELS)
@@ -78,6 +79,7 @@ def test_colours_follow_the_page():
     assert " id=" not in svg
 
 
+@pytest.mark.slow
 def test_names_cannot_become_markup():
     marks = {HOSTILE: 1.0}
     labels = {"x_label": HOSTILE, "y_label": HOSTILE, "alt": HOSTILE}

@@ -33,6 +33,7 @@ def test_tarp_of_its_own_integration_time():
     np.testing.assert_array_equal(white.dark, usual.white().dark)
 
 
+@pytest.mark.slow
 def test_both_exposures_multiply():
     both = simulation(saturation={"exposure_factor": 2.0}, tarp_exposure={"exposure_factor": 0.5})
     np.testing.assert_array_equal(both.white().counts, simulation().white().counts)

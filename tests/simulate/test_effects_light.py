@@ -88,6 +88,7 @@ def test_every_effect_of_light_can_be_named():
     assert all(isinstance(effect, LightEffect) for effect in scene.effects)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["lamp", "{chamber_shading: {directions: 8}}"])
 def test_true_fractions_of_materials_do_not_change(effect):
     small = {"size_px": 32, "bands": 4, "frames": 2}
@@ -134,6 +135,7 @@ def test_energy_is_never_created(still_life, effects):
     assert if_white(light, colours).max() <= 1.0 + excess
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.1, 0.25, 1.0])
 def test_a_white_point_under_the_lamp_sends_no_more_than_it_gets(roughness):
     gloss = Gloss(roughness=roughness)

@@ -151,6 +151,7 @@ MOVED = (
 )
 
 
+@pytest.mark.slow
 def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
     """The room is rendered as it is: everything moved by 4 x 4 matrices, before a camera that stands still."""
     moved = scene(*MOVED, name="pear")
@@ -242,6 +243,7 @@ def test_the_object_frame_keeps_its_x_axis_towards_the_first_camera():
 # --- ageing ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_deformation_shrinks_about_the_foot_and_keeps_poses_and_the_mesh_of_the_start(tmp_path):
     shrinking = scene("{deformation: {shrink_percent: 20}}", "{off_centre: {shift_m: 0.01, azimuth_deg: 0}}")
     simulation = Simulation(shrinking)
@@ -407,6 +409,7 @@ def test_the_background_stands_still_and_nothing_else_changes():
     assert np.abs(pooled - frames[0].material_weights)[wall].mean() < 0.02
 
 
+@pytest.mark.slow
 def test_structure_from_motion_would_lock_on_to_the_background():
     """Of the features that match between two frames, most have not moved."""
     still = {}
@@ -445,6 +448,7 @@ def files(session):
     return {path.relative_to(session): path.read_bytes() for path in sorted(session.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_session_without_effects_is_one_of_a_build_without_them(tmp_path, monkeypatch):
     raise_in(monkeypatch, OURS)
     with_effects = files(simulate_session(scene(), tmp_path / "a", False))

@@ -271,6 +271,7 @@ def test_distortion_is_opencvs_and_comes_undone():
     np.testing.assert_allclose(undistort(distort(points, coefficients), coefficients), points, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_markers_are_seen_where_opencv_projects_them(one_renderer):
     strong = {"k1": -0.9, "k2": 0.5, "p1": 0.01, "p2": -0.015}
     changed = scene("pear", size_px=256, bands=3, frames=9, lens_distortion=strong)
@@ -309,6 +310,7 @@ def test_a_lens_that_folds_the_image_is_refused():
         Simulation(scene(lens_distortion={"k1": -2.0, "k2": -2.0})).frame(0)
 
 
+@pytest.mark.slow
 def test_truth_carries_the_distortion_and_zeros_without(tmp_path):
     with_lens = load_truth(simulate_session(scene(lens_distortion=LENS, frames=1), tmp_path / "lens", False))
     without = load_truth(simulate_session(scene(frames=1), tmp_path / "none", False))

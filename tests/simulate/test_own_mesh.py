@@ -65,6 +65,7 @@ def ramp(path, axis):
     Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".gltf"])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_texture_lies_where_the_uvs_say(tmp_path, suffix, axis):

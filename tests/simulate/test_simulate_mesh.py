@@ -57,6 +57,7 @@ def test_revolve_refuses_a_profile_that_cannot_close(profile):
         revolve(np.array(profile, float), 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "height_m", "volume_ml", "radius_m"),
     [

@@ -53,6 +53,7 @@ def test_white_reflects_all_and_grey_half_in_every_band():
     np.testing.assert_array_equal(grey, 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "materials"),
     [
@@ -122,6 +123,7 @@ def test_each_shape_has_its_own_keys(tmp_path):
         parse(SCENE.replace("material: matte_white", "blush: 1"), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pear", "apple", "maize"])
 def test_another_seed_grows_another_fruit_and_the_same_seed_the_same(name):
     scene = load_scene(name)

@@ -30,6 +30,7 @@ def test_shipped_scenes_have_the_papers_target(name):
     assert (scene.markers.on_container, scene.markers.on_disc) == (6, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED_SCENES)
 def test_nothing_that_turns_leaves_the_image(name):
     scene = override(load_scene(name), size_px=64)

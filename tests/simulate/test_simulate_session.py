@@ -38,6 +38,7 @@ def counts(session_dir, capture, prefix=""):
     return open_cube(session_dir / capture / "capture" / f"{prefix}{capture}.hdr").read().astype(float)
 
 
+@pytest.mark.slow
 def test_folder_is_as_the_instrument_leaves_it(small_session):
     assert sorted(path.name for path in small_session.iterdir()) == [
         "apple_000", "apple_001", "apple_002", "session.json", "truth", "white_reference",
@@ -62,6 +63,7 @@ def test_folder_is_as_the_instrument_leaves_it(small_session):
     }
 
 
+@pytest.mark.slow
 def test_metadata_state_each_captures_exposure_and_how_images_lie(tmp_path):
     effects = ["{image_rotation: {quarter_turns: 3}}", "{tarp_exposure: {exposure_factor: 0.3}}"]
     scene = override(load_scene("apple"), frames=2, size_px=32, bands=4, effects=effects)
@@ -129,6 +131,7 @@ def test_mesh_on_disk_is_the_object_on_the_lid(small_session):
     assert ply.get_surface_area() == pytest.approx(truth.area_m2, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_mesh_on_disk_carries_its_materials_and_serves_as_a_mesh_of_ones_own(small_session):
     part = assemble.object_part(load_scene("apple"))
     again = OwnMesh("mesh", load_truth(small_session).mesh_path, part.materials)
@@ -154,6 +157,7 @@ def unit_sphere() -> Mesh:
     return revolve(profile, 800)
 
 
+@pytest.mark.slow
 def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
     intrinsics = PinholeIntrinsics(64, 64, 128.0, 128.0, 32.0, 32.0)
     mesh = unit_sphere()
@@ -211,6 +215,7 @@ def detect(image, enlarge):
     return {int(n): (c[0] + 0.5) / enlarge for n, c in zip(numbers.ravel(), corners, strict=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pear", "maize"])
 def test_enough_markers_are_found_in_small_images(name):
     scene = load_scene(name)
@@ -238,6 +243,7 @@ def test_marker_corners_are_seen_where_truth_projects_them():
     assert np.abs(np.median(errors, axis=(0, 1))).max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_fruit(tmp_path, small_session):
     scene = override(load_scene("apple"), **SMALL)
     again = simulate_session(scene, tmp_path / "again", False)
@@ -260,6 +266,7 @@ def test_clockwise_turns_the_other_way(small_session):
     )
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, capsys):
     words = ["pear", str(tmp_path / "s"), "--frames", "2", "--size", "24", "--bands", "5", "--seed", "3"]
     tyro.cli(SimulateCommand, args=words).main()
@@ -276,6 +283,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.slow
 def test_an_earlier_simulated_session_is_replaced(tmp_path):
     scene = override(load_scene("pear"), frames=2, size_px=16, bands=3)
     simulate_session(scene, tmp_path / "s", False)

@@ -61,6 +61,7 @@ def test_nothing_kept_is_nothing_found(monkeypatch) -> None:
     assert even_points(VERTICES, TRIANGLES[:0], 100, at) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.2, 2e-3])
 def test_a_narrow_region_is_searched_in_pieces(monkeypatch, width: float) -> None:
     """A 250th of the area is kept, or so little of it that the first sample misses it."""

@@ -66,6 +66,7 @@ def test_angle_to_measured_is_that_of_two_spectra_where_seen_and_valid(device):
     np.testing.assert_allclose(result.cpu(), [[0.0, np.nan, 0.4], [np.nan, 0.8, np.nan]], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_drawings_are_pictures_in_markdown():
     wavelengths_nm = np.linspace(400.0, 1000.0, 7)
     plot = spectra_plot(wavelengths_nm, {"rendered": np.full(7, 0.5), "measured": np.full(7, np.nan)}, "a point")
@@ -157,6 +158,7 @@ def rendered_as(spectral):
     return render
 
 
+@pytest.mark.slow
 def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
     panel, server, _ = attached
     frame = pipeline.datamanager.train_dataset.cameras[2:3]
