@@ -9,8 +9,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 
 def pytest_collection_modifyitems(items):
-    """Fast tests first."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+    """The demo first, because all others fit beside it; then fast tests before slow ones."""
+    items.sort(key=lambda item: (item.path.name != "test_end_to_end.py", item.get_closest_marker("slow") is not None))
 
 
 @pytest.fixture(scope="session", autouse=True)
