@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from trimesh.graph import connected_component_labels
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
@@ -105,6 +104,8 @@ def solid_pieces(mesh: Mesh) -> Mesh:
 
     A stem apart from its fruit is kept; specks and bubbles inside the object (negative volume) are removed.
     """
+    from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
+
     edges = mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     piece = connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.triangles[:, 0]]
     fraction = np.bincount(piece) / len(piece)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
-Spectra = TypeVar("Spectra", np.ndarray, Tensor)
+if TYPE_CHECKING:
+    from torch import Tensor  # takes seconds, and the commands' help does without it
+
+Spectra = TypeVar("Spectra", np.ndarray, "Tensor")
 """Reflectance, bands last: an array or a tensor on any device."""
 
 NEAR_NM = 10.0
