@@ -24,11 +24,10 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from results_table import RESULTS, SOURCE_COLUMNS
 
 from hsi_sc_nerf.cli.main import Commands
 
-RESULTS = Path(__file__).parent / "results"
-SOURCE_COLUMNS = ("commit", "seed", "machine")
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
 
 
