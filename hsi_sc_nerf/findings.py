@@ -1,0 +1,49 @@
+"""What a check of a session found: a level, one sentence, and the figures behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hsi_sc_nerf.errors import InputError
+
+Level = Literal["green", "amber", "red"]
+"""green: as it should be; amber: usable, and worth a look; red: results would be wrong."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        name: of the check, in lower case with hyphens; ``--accept`` takes it.
+        level: how serious it is.
+        sentence: what is so, and for amber and red what to do; one sentence.
+        values: the measured figures behind it, ready for JSON.
+    """
+
+    name: str
+    level: Level
+    sentence: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> None:
+    """Stop at findings that would spoil the results.
+
+    Args:
+        findings: results of checks.
+        accepted: names of checks whose red findings the user accepts.
+
+    Raises:
+        InputError: a red finding is not accepted; the message names all of them.
+
+    Example:
+        >>> refuse_red([Finding("white", "red", "The white reference is one of the frames.")], accepted=["white"])
+    """
+    refused = [finding for finding in findings if finding.level == "red" and finding.name not in accepted]
+    if refused:
+        sentences = " ".join(finding.sentence for finding in refused)
+        accept = " ".join(f"--accept {name}" for name in dict.fromkeys(finding.name for finding in refused))
+        raise InputError(f"{sentences} (To go on in spite of this: {accept}.)")
