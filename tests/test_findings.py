@@ -13,5 +13,5 @@ def test_all_red_findings_are_named_at_once() -> None:
 
 def test_accepted_findings_stop_nothing() -> None:
     refuse_red(FINDINGS, accepted=["white", "dates"])
-    with pytest.raises(InputError, match="^No white"):
+    with pytest.raises(InputError, match=r"^No white"):
         refuse_red(FINDINGS, accepted=["dates"])
