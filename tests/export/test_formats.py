@@ -21,7 +21,7 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     path = write_cloud(tmp_path / "cloud", replace(stream(written, 7), run="pear/hsi-sc-nerf/now"), "las")
     read = laspy.read(path)
     assert path.name == "cloud.las"
-    (text,) = (vlr.string.splitlines() for vlr in read.header.vlrs if vlr.record_id == 3)
+    (text,) = (vlr.record_data.decode().splitlines() for vlr in read.header.vlrs if vlr.record_id == 3)
     assert "run: pear/hsi-sc-nerf/now" in text
     assert any(line.startswith("views [1]: ") for line in text)
     assert read.header.generating_software.startswith("hsi-sc-nerf")
