@@ -17,7 +17,7 @@ from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
 from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.geometry.camera import Similarity
-from hsi_sc_nerf.simulate.scores.visible_surface import seen_points, true_reference
+from hsi_sc_nerf.simulate.scores.surface import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 RADIUS_M, CAMERA_M = 0.04, 0.2
