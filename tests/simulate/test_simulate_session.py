@@ -160,16 +160,6 @@ def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
     assert coverage.sum() == pytest.approx(np.pi * radius_px**2, rel=2e-3)
 
 
-def test_white_things_in_a_white_chamber_cannot_be_seen():
-    intrinsics = PinholeIntrinsics(32, 32, 64.0, 64.0, 16.0, 16.0)
-    mesh = unit_sphere()
-    fractions = np.random.default_rng(0).dirichlet([1.0, 1.0], len(mesh.vertices))
-    renderer = Renderer([Part(mesh, ("a", "b"), fractions)], chamber="c")
-    weights = render(renderer, intrinsics, look_at(np.array([5.0, 2.0, 1.0]), np.zeros(3)), 3).material_weights
-    assert (weights[..., 0] > 0).any()
-    np.testing.assert_array_equal(weights @ np.full(3, 0.75, np.float32), 0.75)
-
-
 def test_rendering_in_pieces_changes_nothing(monkeypatch):
     scene = override(load_scene("maize"), size_px=32)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
