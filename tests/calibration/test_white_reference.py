@@ -12,12 +12,11 @@ from hsi_sc_nerf.calibration.detector import Defects, dark_columns
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, pack_counts
 from hsi_sc_nerf.calibration.report import draw_column_white, draw_white_reference
 from hsi_sc_nerf.calibration.white_reference import (
-    column_sums,
+    ElementSums,
     column_white,
     deviation_map,
     find_coarse_roi,
     mean_over_columns,
-    mean_spectrum,
     smooth_spectrum,
     white_mask,
     white_reference,
@@ -231,16 +230,16 @@ def test_mean_spectrum_weighs_every_reading_alike():
     rng = np.random.default_rng(0)
     counts, mask = rng.integers(0, 9, (6, 5, 3)), rng.random((6, 5)) < 0.6
     dark, dead = rng.uniform(0.0, 2.0, (5, 3)), rng.random((5, 3)) < 0.3
-    columns = column_sums(counts, mask, ignore_value=4, saturation_counts=7).without(dead)
+    readings = ElementSums.of(counts, mask, dead, 4, defects(5, 3, saturation_counts=7))
     slow = [[], [], []]
     saturated = np.zeros(3)
     for y, x, b in np.ndindex(6, 5, 3):
         if mask[y, x] and not dead[x, b] and counts[y, x, b] != 4:
             slow[b].append(counts[y, x, b] - dark[x, b])
             saturated[b] += counts[y, x, b] >= 7
-    np.testing.assert_allclose(mean_spectrum(columns, dark), [np.mean(values) for values in slow])
-    np.testing.assert_array_equal(columns.saturated.sum(axis=0), saturated)
-    assert np.isnan(mean_spectrum(columns.without(np.ones((5, 3), bool)), dark)).all()
+    np.testing.assert_allclose(readings.mean_spectrum(dark), [np.mean(values) for values in slow])
+    np.testing.assert_array_equal(readings.saturated.sum(axis=0), saturated)
+    assert np.isnan(ElementSums.of(counts, mask, np.ones_like(dead), None, None).mean_spectrum(dark)).all()
 
 
 def test_target_in_every_frame_is_read_at_its_place_alone(tmp_path):
