@@ -138,9 +138,7 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
     rows = [["image", "image", "image", "deviation", "deviation", "deviation"]]
     rows += [["lower"] * 2 + ["used"] * 2 + ["higher"] * 2, ["spectrum"] * 6]
     axes = figure.subplot_mosaic(rows, height_ratios=[4.0, 4.0, 3.0])
-    kept = np.zeros(image.shape[:2], dtype=bool)
-    kept[y0:y1, x0:x1] = white.mask
-    axes["image"].imshow(draw_outline(image, kept))
+    axes["image"].imshow(draw_outline(image, white.region(image.shape[:2])))
     region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2)
     axes["image"].add_patch(region)
     axes["image"].set_title(f"White: coarse region, and the {white.pixels} pixels that are kept")
@@ -177,11 +175,7 @@ def draw_lamp_drift(
     path: Path, drift: LampDriftEstimate, wavelengths_nm: Float[np.ndarray, "bands"], *, corrected: bool
 ) -> None:
     """Draw the lamps' light by frame at some wavelengths, and by wavelength in the last frame."""
-    change, two_sd, measured = (
-        100.0 * (drift.factor - 1.0),
-        200.0 * drift.standard_error,
-        100.0 * (drift.measured - 1),
-    )
+    change, two_sd = 100.0 * (drift.factor - 1.0), 200.0 * drift.standard_error
     figure = new_figure(12.0, 4.5)
     by_frame, by_band = figure.subplots(1, 2)
     bands = list(dict.fromkeys(nearest_bands(wavelengths_nm, DRIFT_NM)))

@@ -74,6 +74,13 @@ class WhiteReference(White):
     mask: Bool[np.ndarray, "y x"]
     kernel_px: int
 
+    def region(self, shape: tuple[int, ...]) -> Bool[np.ndarray, "lines samples"]:
+        """The refined region in an image of that shape."""
+        x0, y0, x1, y1 = self.roi
+        image = np.zeros(shape, bool)
+        image[y0:y1, x0:x1] = self.mask
+        return image
+
 
 def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects | None = None) -> WhiteReference:
     """Steps 1 to 5 on an image that shows the white; the spectrum has one column.
