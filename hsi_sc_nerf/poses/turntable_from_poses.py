@@ -24,7 +24,7 @@ from hsi_sc_nerf.geometry.camera import (
     rotation_about_z,
     rotation_angle_deg,
 )
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
 _CONTRADICTS_DEG = 3.0
@@ -55,10 +55,10 @@ class TurntableFit:
 
     def turntable(
         self, points_3d: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
-    ) -> PointTurntable:
+    ) -> Turntable:
         """The start for ``adjust_tracks``: the fitted frames, and points of the poses' world, numbered by row."""
         frames = np.flatnonzero(np.isfinite(self.angles_rad))
-        return PointTurntable(
+        return Turntable(
             focal_px=focal_px,
             centre_px=centre_px,
             camera_rotation=self.camera_rotation,
