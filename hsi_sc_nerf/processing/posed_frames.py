@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
 from hsi_sc_nerf.processing.frames import FramePaths
+
+_log = logging.getLogger(__name__)
 
 PoseFunction = Callable[..., TurntablePoses]
 """Called like ``poses.pose_methods.find_poses``."""
@@ -110,6 +113,8 @@ def pose_frames(
             console.print(f"Markers stand out best in {seen_in}.", highlight=False)
     for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
         console.print(f"Warning: {warning}", highlight=False)
+    for name in np.array(names)[~poses.used]:
+        _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
     refuse_red(findings, accepted)
     return poses
 
