@@ -52,13 +52,12 @@ def poses_from_features(
     """
     grays = SessionPictures.of(images).named(GRAY)
     free = structure_from_motion(grays, names)
-    fit = turntable_from_poses(free.world_to_camera)
-    if fit.contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
+    start, contradicts = turntable_from_poses(free.world_to_camera, free.points_3d, free.focal_px, free.centre_px)
+    if contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
         raise InputError(
-            f"{int(fit.contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
+            f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
-    start = fit.turntable(free.points_3d, free.focal_px, free.centre_px)
     if angles_deg is not None:
         known = np.deg2rad(angles_deg[start.frames])
         sign = np.copysign(1.0, np.dot(np.diff(known), np.diff(start.angles_rad)))

@@ -70,4 +70,4 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
     np.testing.assert_allclose(found, whole, atol=2e-5 * np.abs(whole).max())
     m = layout.motion_size
     schur = normal[:m, :m] - normal[:m, m:] @ np.linalg.pinv(normal[m:, m:], hermitian=True) @ normal[m:, :m]
-    np.testing.assert_allclose(equations.information(), schur, atol=1e-5 * np.abs(schur).max())
+    np.testing.assert_allclose(equations.information(), schur, atol=1e-4 * np.abs(schur).max())
