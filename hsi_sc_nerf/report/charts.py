@@ -131,37 +131,6 @@ def line_chart(
         return _inline_svg(figure, alt)
 
 
-def bar_chart(
-    edges: Float[np.ndarray, "n_and_1"],
-    heights: Float[np.ndarray, "n"],
-    *,
-    x_label: str,
-    y_label: str,
-    alt: str,
-) -> Markup:
-    """Bars from 0 upwards between neighbouring edges, such as a histogram, as an ``svg`` element.
-
-    Args:
-        edges: ascending.
-        heights: not negative; a bar of NaN is left out.
-        x_label: with its unit.
-        y_label: with its unit.
-        alt: description for readers who do not see the chart.
-    """
-    with rc_context(_STYLE):
-        figure = new_figure(_WIDTH_IN, _HEIGHT_IN)
-        axes = figure.subplots()
-        shown = np.isfinite(heights)
-        widths = 0.9 * np.diff(edges)[shown]
-        centres = (edges[:-1] + edges[1:])[shown] / 2.0
-        for bar in axes.bar(centres, heights[shown], widths, color=_SERIES[0]):
-            bar.set_gid("bar")
-        ends = {"xlim": (edges[0], edges[-1]), "ylim": _value_range(heights, True, False)}
-        axes.set(xlabel=x_label, ylabel=y_label, **ends)
-        axes.grid(axis="x", visible=False)
-        return _inline_svg(figure, alt)
-
-
 def _value_range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: bool) -> tuple[float, float]:
     """Ends of an axis that holds the finite values, with a margin."""
     finite = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
@@ -198,7 +167,7 @@ def _inline_svg(figure: Figure, alt: str) -> Markup:
             if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}defs"):
                 parent.remove(child)
         identifier = parent.attrib.pop("id", None)
-        if identifier in ("line", "band", "bar"):
+        if identifier in ("line", "band"):
             parent.set("class", identifier)
         # Nothing is drawn beyond the axes, and identifiers would have to be unique on the page.
         parent.attrib.pop("clip-path", None)

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
+from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
@@ -141,13 +142,7 @@ def masks_section(dataset: PackedDataset) -> Section:
         ("smallest", f"{areas_px.min()} ({dataset.frames[int(areas_px.argmin())].capture})"),
         ("largest", f"{areas_px.max()} ({dataset.frames[int(areas_px.argmax())].capture})"),
     ]
-    chart = bar_chart(
-        np.arange(len(areas_px) + 1.0) - 0.5,
-        areas_px.astype(float),
-        x_label="frame",
-        y_label="pixels",
-        alt="Size of the object's mask by frame",
-    )
+    chart = _by_frame(areas_px, "pixels", "Size of the object's mask by frame")
     blocks: list[Block] = [
         Table("The object's masks.", ("", "found"), rows),
         Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
@@ -165,27 +160,22 @@ def poses_section(dataset: PackedDataset) -> Section:
     blocks: list[Block] = [Table("The turntable and the camera.", ("", "found"), _pose_rows(found))]
     errors = np.array([np.nan if (e := f.reprojection_error_px) is None else e for f in dataset.frames])
     if np.isfinite(errors).any():
-        chart = bar_chart(
-            np.arange(len(errors) + 1.0) - 0.5,
-            errors,
-            x_label="frame",
-            y_label="reprojection error (px)",
-            alt="Root mean square reprojection error by frame",
-        )
+        chart = _by_frame(errors, "reprojection error (px)", "Root mean square reprojection error by frame")
         blocks.append(Figure([chart], "Root mean square reprojection error of the markers or features, pixels."))
     steps_deg = np.diff([frame.angle_deg for frame in dataset.frames])
     if len(steps_deg):
-        chart = line_chart(
-            [Curve("", np.arange(1.0, len(steps_deg) + 1.0), steps_deg)],
-            x_label="frame",
-            y_label="step (degrees)",
-            alt="Turn of the table from each frame to the next",
-        )
+        chart = _by_frame(np.append(np.nan, steps_deg), "step (degrees)", "Turn of the table since the frame before")
         caption = "Turn of the table since the frame before, degrees, positive counter-clockwise."
         blocks.append(Figure([chart], caption))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
     warnings = [Finding("poses", "amber", sentence) for sentence in found.get("warnings", ())]
     return Section("poses", "Poses", blocks, warnings)
+
+
+def _by_frame(values: Float[np.ndarray, "frames"], y_label: str, alt: str) -> Markup:
+    """A chart of a number of each frame, which are counted from 0; NaN is a gap."""
+    curve = Curve("", np.arange(len(values), dtype=float), values.astype(float))
+    return line_chart([curve], x_label="frame", y_label=y_label, alt=alt, from_zero=np.nanmin(values) >= 0.0)
 
 
 def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:

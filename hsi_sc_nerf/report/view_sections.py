@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
-from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
+from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
     ViewScores,
@@ -144,12 +144,12 @@ def bands_section(
     if len(angles):
         middle, high, top = np.percentile(angles, (50.0, 95.0, _PERCENTILE_DRAWN))
         counts, edges = np.histogram(angles, _HISTOGRAM_BINS, (0.0, max(float(top), 1e-6)))
-        charts["Spectral angle"] = bar_chart(
-            edges,
-            100.0 * counts / len(angles),
+        charts["Spectral angle"] = line_chart(
+            [Curve("", (edges[:-1] + edges[1:]) / 2.0, 100.0 * counts / len(angles))],
             x_label="spectral angle (rad)",
             y_label="fraction of pixels (%)",
             alt="Histogram of the spectral angle over the object's pixels",
+            from_zero=True,
         )
         caption += (
             f" Spectral angle between measurement and rendering, {len(angles)} pixels of the object: mean "
