@@ -9,6 +9,9 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
+MAX_SKIPPED_IN_A_ROW = 20
+"""Skipped steps that end a run: single ones come from damaged values, so many from weights that are lost."""
+
 
 class TrainingDivergedError(RuntimeError):
     """Too many steps in a row were not finite."""
@@ -57,15 +60,9 @@ class GuardedOptimizers(Optimizers):
 
 
 class NonFiniteGuard:
-    """Counter of consecutive skipped steps.
+    """Counter of consecutive skipped steps."""
 
-    Args:
-        limit: number of consecutive skipped steps that ends the run.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.in_a_row = 0
+    in_a_row = 0
 
     def record(self, step: int, losses: Iterable[str], groups: Iterable[str]) -> str | None:
         """Record a step; returns a sentence to print if it was skipped, else None.
@@ -76,7 +73,7 @@ class NonFiniteGuard:
             groups: names of the parameter groups whose gradient was not finite.
 
         Raises:
-            TrainingDivergedError: this was the last of ``limit`` skipped steps in a row.
+            TrainingDivergedError: this was the last of `MAX_SKIPPED_IN_A_ROW`.
         """
         causes = [f"loss {name}" for name in losses] or [f"gradient of {name}" for name in groups]
         if not causes:
@@ -84,7 +81,7 @@ class NonFiniteGuard:
             return None
         self.in_a_row += 1
         sentence = f"step {step} skipped: {', '.join(causes)} not finite"
-        if self.in_a_row >= self.limit:
+        if self.in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingDivergedError(
                 f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate, or look for "
                 "damaged frames"

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -28,7 +28,7 @@ from hsi_sc_nerf.models.checkpoints import (
 )
 from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
@@ -56,8 +56,6 @@ class StagedTrainerConfig(TrainerConfig):
     """Second stage: the masked object, and some background rays."""
     evaluate_stages: bool = True
     """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
-    max_nonfinite_steps: int = 20
-    """Number of consecutive skipped steps that stops the run."""
     capture_steps: bool = True
     """On a GPU, launch a step's forward and backward pass as one CUDA graph."""
 
@@ -91,7 +89,7 @@ class StagedTrainer(Trainer):
         self._saved_step: int | None = None
         self._loaded: Path | None = None
         self._completed: str | None = None
-        self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
+        self._guard = NonFiniteGuard()
         self._captured: CapturedSteps | None = None
         try:
             super().setup(test_mode)
@@ -192,11 +190,9 @@ class StagedTrainer(Trainer):
         return found
 
     def _enter(self, stage: Stage) -> None:
-        """Set the rays and loss weights of ``stage``."""
+        """Set the rays of ``stage``."""
         self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_ray_fraction
         self.pipeline.datamanager.boundary_ray_fraction = stage.config.boundary_ray_fraction
-        weights: dict[str, Any] = stage.config.loss_weights()
-        self._model.config = dataclasses.replace(cast(SpectralModelConfig, self.config.pipeline.model), **weights)
         self._stage = stage
 
     def _freeze(self, frozen: set[str]) -> None:

@@ -31,10 +31,6 @@ class StageConfig:
     boundary_ray_fraction: float = 0.0
     """Fraction of the other rays that pass within 3 pixels of the masks, where the object ends. It has no effect
     without a foreground ray fraction."""
-    angular_loss_mult: float | None = None
-    """Weight of the spectral angle's loss in this stage. None: the model's."""
-    hsi_loss_mult: float | None = None
-    """Weight of the squared error in this stage. None: the model's."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
@@ -47,11 +43,6 @@ class StageConfig:
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
     group_lr: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Both factors for single parameter groups, in place of those above."""
-
-    def loss_weights(self) -> dict[str, float]:
-        """Loss weights that this stage sets, by their names in the model's configuration."""
-        weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
-        return {name: weight for name, weight in weights.items() if weight is not None}
 
     def check(self, groups: Collection[str]) -> None:
         """Check the settings.
