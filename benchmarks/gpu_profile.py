@@ -16,7 +16,6 @@ import torch
 
 from hsi_sc_nerf.benchmark.configurations import training_config
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
-from hsi_sc_nerf.models.training_log import TrainingProgress
 
 ON_GPU = torch.cuda.is_available()
 WARM_UP, STEPS, FETCHES = (30, 150, 100) if ON_GPU else (2, 3, 5)
@@ -37,7 +36,7 @@ def main(data: str, folder: str, method: str) -> None:
                 continue
             _compile_functions()
         trainer = build_trainer(training_config(method, words), job, 4000, Path(folder))
-        trainer._progress = TrainingProgress(4000, 0)
+        trainer._show_progress = lambda *_: None
         trainer.pipeline.train()
         _steps(trainer, 0, WARM_UP)
         _wait(device)

@@ -62,7 +62,6 @@ ROWS: tuple[tuple[Poses, str], ...] = (
     ("true", "off"),
     ("disturbed", "off"),
     ("disturbed", "free-discarded"),
-    ("disturbed", "free"),
     ("disturbed", "turntable"),
     ("markers", "off"),
     ("markers", "turntable"),

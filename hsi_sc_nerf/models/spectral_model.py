@@ -35,7 +35,6 @@ from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalFie
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
-from hsi_sc_nerf.models.renderers import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
@@ -147,7 +146,7 @@ class SpectralModel(NerfactoModel):
             self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
         self.background = make_background(config.background, dataset, metadata["frames"])
 
-        self.renderer_rgb = SpectralRenderer("last-sample" if self.background is None else "none")
+        self.renderer_rgb = SpectralRenderer(last_sample_behind=self.background is None)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.renderer_expected_depth = DepthRenderer(method="expected")
@@ -300,3 +299,51 @@ class SpectralModel(NerfactoModel):
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }
         return metrics, images
+
+
+class SpectralRenderer(nn.Module):
+    """Composite spectra, or coefficients of a spectral basis; nerfstudio's renderer takes three channels and clamps.
+
+    Args:
+        last_sample_behind: the light that the samples let through has the spectrum of the last one, as in nerfacto;
+            otherwise the ray ends in black.
+
+    Attributes:
+        background_color: read by nerfstudio's exporters of textures; their pictures of whole rays are opaque.
+    """
+
+    background_color = "black"
+
+    def __init__(self, last_sample_behind: bool = False) -> None:
+        super().__init__()
+        self.last_sample_behind = last_sample_behind
+
+    def forward(
+        self, rgb: Float[Tensor, "*rays samples channels"], weights: Float[Tensor, "*rays samples 1"]
+    ) -> Float[Tensor, "*rays channels"]:
+        """Sum of the samples' channels (``rgb`` is nerfstudio's name for them), each with its weight."""
+        composited = torch.sum(weights * rgb, dim=-2)
+        if not self.last_sample_behind:
+            return composited
+        return composited + (1.0 - torch.sum(weights, dim=-2)) * rgb[..., -1, :]
+
+
+class BasisDecoder(nn.Module):
+    """Spectra from coefficients in a basis.
+
+    Compositing and the basis are both linear: decoding composited coefficients once a ray equals compositing decoded
+    spectra, with far fewer numbers a sample.
+
+    Args:
+        basis: one spectrum a column, linearly independent (`SpectralSubspace.scaled_basis`).
+    """
+
+    basis: Tensor
+
+    def __init__(self, basis: Float[Tensor, "bands rank"]) -> None:
+        super().__init__()
+        self.register_buffer("basis", basis.clone())
+
+    def forward(self, coefficients: Float[Tensor, "*rays rank"]) -> Float[Tensor, "*rays bands"]:
+        """Spectra of (composited) coefficients."""
+        return coefficients @ self.basis.T

@@ -7,7 +7,7 @@ import torch
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
-from hsi_sc_nerf.models.backgrounds import BackgroundImage, BackgroundSpectrum, interpolate_image
+from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 
 LENS = PinholeIntrinsics(60, 40, 80.0, 85.0, 31.0, 18.5)
 STRAIGHT = (0.0, 0.0, 0.0, 0.0)
@@ -30,7 +30,7 @@ def rays_of_frame(angle_deg, pixels):
 
 
 def background(image, cell_px=1, distortion=STRAIGHT):
-    return BackgroundImage(image, cell_px, LENS, distortion, SPECTRUM)
+    return Background(SPECTRUM, image, cell_px, LENS, distortion)
 
 
 def random_image(lines=LENS.h, samples=LENS.w):
@@ -116,7 +116,6 @@ def test_nothing_is_learned_and_the_picture_is_saved():
 
 
 def test_one_spectrum_behind_every_ray():
-    spectrum = torch.tensor([0.7, 0.8])
-    behind = BackgroundSpectrum(spectrum)(torch.rand(4, 6, 3), None)
-    assert behind.shape == (4, 6, 2)
-    torch.testing.assert_close(behind[3, 5], spectrum)
+    directions, rotations = rays_of_frame(30.0, pixel_centres())
+    torch.testing.assert_close(background(None)(directions, rotations), SPECTRUM.expand(40, 60, 3))
+    assert set(background(None).state_dict()) == {"spectrum"}

@@ -12,7 +12,7 @@ from hsi_sc_nerf.geometry.camera import look_at, rotation_about_z, rotation_angl
 from hsi_sc_nerf.models.pose_refinement import (
     CAMERA_ROTATION,
     FRAME_INDEX,
-    NoRefinement,
+    PoseRefinement,
     PoseRefinementConfig,
     TurntableRefinement,
     held_out_interpolation,
@@ -22,7 +22,7 @@ from hsi_sc_nerf.models.pose_refinement import (
 AXIS_ORIGIN = np.array([0.0, 0.0, -0.4])
 FIRST = look_at(np.array([2.0, 0.3, 0.9]), np.array([0.0, 0.0, 0.1]))
 TRAIN = [0, 1, 3, 5]
-LEARNING_MODES = ["turntable", "free", "free-discarded"]
+LEARNING_MODES = ["turntable", "free-discarded"]
 MODES = ["off", *LEARNING_MODES]
 
 
@@ -88,7 +88,7 @@ def learn_something(learned, size=0.05):
 
 @pytest.mark.parametrize(
     ("pose_method", "kind"),
-    [("markers", NoRefinement), ("colmap", TurntableRefinement), (None, TurntableRefinement)],
+    [("markers", PoseRefinement), ("colmap", TurntableRefinement), (None, TurntableRefinement)],
 )
 def test_by_default_all_poses_but_those_from_markers_are_refined(pose_method, kind):
     assert type(refinement(session(), TRAIN, PoseRefinementConfig().mode, pose_method)) is kind
@@ -158,21 +158,6 @@ def test_mixed_precision_does_not_move_rays(mode):
     torch.testing.assert_close(mixed.origins, full.origins, rtol=0, atol=1e-6)
 
 
-def test_free_corrections_are_nerfstudios():
-    """A turn and a shift in the scene's axes for each view; a held-out view takes its neighbours' mean."""
-    poses = session()
-    learned = learn_something(refinement(poses, TRAIN, "free"))
-    numbers = learned.pose_adjustment.detach().numpy()
-    for frame, (shift, turn) in {
-        3: np.split(numbers[2], 2),
-        4: np.split(numbers[2:4].mean(axis=0), 2),
-    }.items():
-        corrected = poses.copy()
-        corrected[frame, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ poses[frame, :3, :3]
-        corrected[frame, :3, 3] += shift
-        assert_moves_like(learned, poses, corrected, frame)
-
-
 def assert_moves_like(learned, poses, corrected, frame):
     rays = rays_of(poses, frame)
     learned.apply_to_raybundle(rays)
@@ -190,10 +175,9 @@ def moved_by(learned, poses, frame):
     return rays, (rays.origins - before).abs().max().item()
 
 
-@pytest.mark.parametrize("mode", ["turntable", "free"])
-def test_frozen_corrections_are_kept_but_get_no_gradient(mode):
+def test_frozen_corrections_are_kept_but_get_no_gradient():
     poses = session()
-    learned = learn_something(refinement(poses, TRAIN, mode))
+    learned = learn_something(refinement(poses, TRAIN))
     assert moved_by(learned, poses, 3)[0].origins.requires_grad
     learned.freeze(True)
     for frame in (3, 4):
@@ -207,11 +191,15 @@ def test_frozen_corrections_are_kept_but_get_no_gradient(mode):
     assert moved_by(learned, poses, 3)[0].origins.requires_grad
 
 
-def test_discarded_corrections_leave_held_out_views_alone_and_end_with_the_stage():
+def test_discarded_corrections_are_a_turn_and_a_shift_of_a_training_view_and_end_with_the_stage():
     poses = session()
     learned = learn_something(refinement(poses, TRAIN, "free-discarded"))
-    assert moved_by(learned, poses, 3)[1] > 0.01
-    assert moved_by(learned, poses, 4)[1] == 0.0
+    shift, turn = np.split(learned.pose_adjustment[2].detach().numpy(), 2)
+    corrected = poses.copy()
+    corrected[3, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ poses[3, :3, :3]
+    corrected[3, :3, 3] += shift
+    assert_moves_like(learned, poses, corrected, 3)
+    assert moved_by(learned, poses, 4)[1] == 0.0  # held out
     learned.freeze(False)
     assert moved_by(learned, poses, 3)[1] > 0.01
     learned.freeze(True)
