@@ -120,10 +120,9 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[BenchmarkRun], clock: Cloc
     lines = [("-", "--", ":", "-.")[(i // len(COLOURS)) % 4] for i in range(len(runs))]
     for axes, (metric, title) in zip(panels.ravel(), _PANELS.items(), strict=True):
         for run, colour, line in zip(runs, colours, lines, strict=True):
-            curve = np.array(
-                [(getattr(point, _SECONDS[clock]), point.metrics[metric]) for point in run.checkpoints]
-            ).T
             ends = [point.ends_stage for point in run.checkpoints]
+            seconds = [getattr(point, _SECONDS[clock]) for point in run.checkpoints]
+            curve = np.array([seconds, [point.metrics[metric] for point in run.checkpoints]])
             axes.plot(*curve, color=colour, linestyle=line, label=run.name, marker="o", markersize=2.5)
             axes.plot(*curve[:, ends], "o", color=colour, markersize=7, fillstyle="none")
         if metric in _LOGARITHMIC:

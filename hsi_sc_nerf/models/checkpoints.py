@@ -100,8 +100,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of the staged trainer to the CPU.
 
     Raises:
-        InputError: the file is damaged, missing or no such checkpoint, or an older version made it with averaged
-            weights.
+        InputError: the file is damaged, missing or no such checkpoint.
     """
     try:
         state = torch.load(path, map_location="cpu")
@@ -109,6 +108,4 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is no readable checkpoint ({error}); take an earlier one.") from error
     if not isinstance(state, dict) or not state.keys() >= CHECKPOINT_KEYS:
         raise InputError(f"{path}: is no checkpoint that hsi-sc-nerf can go on from; train anew.")
-    if state["training"].get("weights"):
-        raise InputError(f"{path}: was made with --ema-decay, which this version does not have; train anew.")
     return state

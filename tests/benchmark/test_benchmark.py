@@ -223,6 +223,7 @@ def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_pat
     assert cv2.imread(str(tmp_path / "benchmark.png")).std() > 5
 
 
+@pytest.mark.slow
 def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
     job = benchmark._job(named_configuration("ours"), command(tiny_dataset, tmp_path), tiny_dataset[0])
     ends = []
@@ -309,6 +310,7 @@ def test_table_has_a_row_for_each_stage():
     assert "GPU memory, MiB" in table([made_up_run("a", 5.0)])[0]
 
 
+@pytest.mark.slow
 def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
     runs = [made_up_run(f"run-{i}") for i in range(9)]
     write_csv(tmp_path / "runs.csv", runs)

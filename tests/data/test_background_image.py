@@ -185,14 +185,9 @@ def test_everything_below_the_object_turns_where_the_container_is_not_known(tmp_
     (rims,) = turntable_cylinders(dataset)
     np.testing.assert_allclose(np.hypot(rims[:, 0], rims[:, 1]), 0.09)
     np.testing.assert_allclose([rims[:, 2].min(), rims[:, 2].max()], [-0.005, 0.03])
-
-
-def test_lens_distortion_moves_the_silhouette(tmp_path):
-    dataset = write_dataset(tmp_path, [np.zeros((LENS.h, LENS.w, 1), np.uint16)], [np.zeros((LENS.h, LENS.w), bool)])
     pose = dataset.frames[0].camera_to_world
-    plain = turntable_silhouette(dataset, pose)
-    barrel = turntable_silhouette(replace(dataset, distortion=np.array([-0.8, 0.0, 0.0, 0.0])), pose)
-    assert barrel.sum() < 0.97 * plain.sum()
+    barrel = replace(dataset, distortion=np.array([-0.8, 0.0, 0.0, 0.0]))
+    assert turntable_silhouette(barrel, pose).sum() < 0.97 * turntable_silhouette(dataset, pose).sum()
 
 
 def test_median_over_frames_agrees_with_numpy():
@@ -237,16 +232,11 @@ def test_wiener_filter_keeps_an_image_without_noise_and_values_that_are_not_meas
     image = rng.random((20, 20, 2)).astype(np.float32)
     image[5:9, 5:9, 0] = np.nan
     np.testing.assert_allclose(wiener_filter(image, np.zeros_like(image), 5), image, atol=1e-6)
+    bands = np.broadcast_to(np.float32([0.0, 1.0, 0.0]), (12, 12, 3))  # are not mixed
+    np.testing.assert_allclose(wiener_filter(bands, np.full_like(bands, 0.01), 5), bands, atol=1e-6)
     lonely = np.full((9, 9, 1), np.nan, np.float32)
     lonely[4, 4] = 0.25
     np.testing.assert_allclose(wiener_filter(lonely, np.ones_like(lonely), 3), lonely, atol=1e-6)
-
-
-def test_wiener_filter_does_not_mix_bands():
-    image = np.zeros((12, 12, 3), np.float32)
-    image[..., 1] = 1.0
-    filtered = wiener_filter(image, np.full_like(image, 0.01), 5)
-    np.testing.assert_allclose(filtered, image, atol=1e-6)
 
 
 def test_inpainting_keeps_a_ramp_and_every_inpainted_cell_is_its_neighbours_mean():

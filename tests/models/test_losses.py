@@ -34,19 +34,19 @@ def test_angular_loss_knows_shape_only() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-30, 1e-6, 1.0, 6e4, 1e30, 3e38])
+@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-6, 1.0, 6e4, 3e38])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_and_gradients_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
     predicted, target = pair()
-    largest = torch.finfo(dtype).max
-    predicted = (scale * predicted.double()).clamp(max=largest).to(dtype).requires_grad_()
-    for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
-        predicted.grad = None
-        value = loss(predicted, against)
-        value.backward()
-        assert value.dtype == torch.float32
-        assert torch.isfinite(value)
-        assert torch.isfinite(predicted.grad).all()
+    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
+    for valid in (None, some_valid()):
+        for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
+            predicted.grad = None
+            value = loss(predicted, against, valid)
+            value.backward()
+            assert value.dtype == torch.float32
+            assert torch.isfinite(value)
+            assert torch.isfinite(predicted.grad).all()
 
 
 def test_a_dark_spectrum_pulls_no_harder_than_the_floor_allows() -> None:
@@ -79,9 +79,8 @@ def test_losses_are_the_papers_formulas_over_valid_values(flagged) -> None:
     predicted, target = pair()
     valid = some_valid() if flagged else torch.ones(5, 6, 31, dtype=torch.bool)
     squares, angles = [], []
-    for bands, p, t in zip(
-        *(x.reshape(30, 31).numpy() for x in (valid, predicted.double(), target.double())), strict=True
-    ):
+    spectra = (values.reshape(30, 31).numpy() for values in (valid, predicted.double(), target.double()))
+    for bands, p, t in zip(*spectra, strict=True):
         p, t = p[bands], t[bands]
         squares.extend((p - t) ** 2)
         if bands.sum() >= 2:
@@ -90,20 +89,6 @@ def test_losses_are_the_papers_formulas_over_valid_values(flagged) -> None:
     valid = valid if flagged else None
     assert hsi_loss(predicted, target, valid).item() == pytest.approx(np.mean(squares), rel=1e-6)
     assert angular_loss(predicted, target, valid).item() == pytest.approx(np.mean(angles), rel=1e-6)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_everything_valid_changes_nothing(loss) -> None:
-    predicted, target = (values.requires_grad_() for values in pair())
-    everything = torch.ones_like(predicted, dtype=torch.bool)
-    gradients = []
-    for valid in (None, everything):
-        predicted.grad = None
-        value = loss(predicted, target, valid)
-        value.backward()
-        gradients.append((value.detach(), predicted.grad))
-    for with_none, with_valid in zip(*gradients, strict=True):
-        torch.testing.assert_close(with_valid, with_none, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("anything", [0.0, 1e30, float("nan"), float("inf")])
@@ -141,24 +126,12 @@ def test_the_direction_floor_is_a_root_mean_square_of_the_valid_bands() -> None:
     assert angular_loss(predicted, target, valid=valid).item() == pytest.approx(alone.item(), rel=1e-6)
 
 
+@pytest.mark.parametrize("flagged", [False, True])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_gradients_over_valid_values_match_finite_differences(loss) -> None:
+def test_gradients_match_finite_differences(loss, flagged) -> None:
     predicted, target = (values.double() for values in pair((2, 3, 5)))
-    valid = some_valid()[1:3, :3, :5]
-    assert torch.autograd.gradcheck(lambda values: loss(values, target, valid=valid), (predicted.requires_grad_(),))
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-38, 1.0, 6e4, 3e38])
-@pytest.mark.parametrize("loss", LOSSES)
-def test_losses_of_valid_values_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
-    predicted, target = pair()
-    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
-    value = loss(predicted, target.to(dtype), some_valid())
-    value.backward()
-    assert value.dtype == torch.float32
-    assert torch.isfinite(value)
-    assert torch.isfinite(predicted.grad).all()
+    valid = some_valid()[1:3, :3, :5] if flagged else None
+    assert torch.autograd.gradcheck(lambda values: loss(values, target, valid), (predicted.requires_grad_(),))
 
 
 @pytest.mark.parametrize("loss", LOSSES)

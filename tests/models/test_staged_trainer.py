@@ -105,24 +105,17 @@ def test_several_devices_are_refused(tiny_dataset, tmp_path):
 
 
 @pytest.mark.slow
-def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
+def test_stage_one_alone_can_be_continued_and_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()
     kept = first.base_dir / "stage-full-frame"
     assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
-
     second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
     assert second._start_step == 3
     second.train()
     assert second.step == STEPS - 1
     assert second._stage.config.name == "masked"
-
-
-@pytest.mark.slow
-def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path)
-    made.train()
-    again = trainer(tiny_dataset, tmp_path / "again", load_dir=made.checkpoint_dir)
+    again = trainer(tiny_dataset, tmp_path / "again", load_dir=first.checkpoint_dir)
     with pytest.raises(SystemExit, match="max-num-iterations"):
         again.train()
 
