@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.lie_groups import exp_map_SE3
 from nerfstudio.cameras.rays import RayBundle
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.geometry.camera import look_at, rotation_about_z, rotation_angle_deg, turntable_camera_to_world
+from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX, pinhole_cameras
+from hsi_sc_nerf.geometry.camera import (
+    PinholeIntrinsics,
+    look_at,
+    rotation_about_z,
+    rotation_angle_deg,
+    turntable_camera_to_world,
+)
 from hsi_sc_nerf.models.pose_refinement import (
-    CAMERA_ROTATION,
-    FRAME_INDEX,
     PoseRefinement,
     PoseRefinementConfig,
     TurntableRefinement,
@@ -44,26 +48,10 @@ def wobbling_session(num_frames=12, tilt_deg=0.2):
     return np.stack([np.linalg.inv(motion) @ FIRST for motion in motions])
 
 
-def cameras(poses, frames):
-    rotations = poses[frames, :3, :3].reshape(-1, 9)
-    return Cameras(
-        camera_to_worlds=torch.from_numpy(poses[frames, :3]).float(),
-        fx=50.0,
-        fy=50.0,
-        cx=8.0,
-        cy=8.0,
-        width=16,
-        height=16,
-        camera_type=CameraType.PERSPECTIVE,
-        metadata={
-            FRAME_INDEX: torch.tensor(frames)[:, None].float(),
-            CAMERA_ROTATION: torch.from_numpy(rotations).float(),
-        },
-    )
-
-
 def rays_of(poses, frame):
-    return cameras(poses, [frame]).generate_rays(camera_indices=0, keep_shape=True)
+    lens = PinholeIntrinsics(16, 16, 50.0, 50.0, 8.0, 8.0)
+    cameras = pinhole_cameras(poses[[frame]], lens, np.zeros(4), np.array([frame]))
+    return cameras.generate_rays(camera_indices=0, keep_shape=True)
 
 
 def refinement(poses, train, mode="turntable", pose_method=None):
