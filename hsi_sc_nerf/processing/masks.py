@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from skimage.filters import threshold_otsu
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -99,53 +100,47 @@ def spectral_bin_width(bands: int) -> int:
     return -(-bands // SPECTRAL_BINS)
 
 
-def foreground_score(
-    binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX
-) -> Float[np.ndarray, "h w"]:
+def foreground_score(binned: Float[np.ndarray, "bins h w"]) -> Float[np.ndarray, "h w"]:
     """Standard deviation over spectral bins of the slightly smoothed reflectance: 0 for a flat spectrum.
 
     The score of a mixed pixel of object and flat background is nearly the object's score times its fraction.
     """
     # Differences from the first bin keep their squares within single precision, and a flat spectrum at exactly 0.
-    first = _smoothed(binned[0], smoothing_px)
+    first = _smoothed(binned[0])
     difference, total, squares = np.empty_like(first), np.zeros_like(first), np.zeros_like(first)
     for image in binned[1:]:
-        cv2.subtract(_smoothed(image, smoothing_px), first, dst=difference)
+        cv2.subtract(_smoothed(image), first, dst=difference)
         cv2.accumulate(difference, total)
         cv2.accumulateSquare(difference, squares)
     total /= len(binned)
     return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
 
 
-def brightness(binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX) -> Float[np.ndarray, "h w"]:
+def brightness(binned: Float[np.ndarray, "bins h w"]) -> Float[np.ndarray, "h w"]:
     """Mean over spectral bins of the slightly smoothed reflectance."""
-    return _smoothed(binned.mean(axis=0), smoothing_px)
+    return _smoothed(binned.mean(axis=0))
 
 
 def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, float]:
     """Otsu's threshold over all frames together, and the contrast: the difference of the two classes' means.
 
-    N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979).
-
     Args:
         scores: of each frame, 0 or more. Equal scores have a contrast of 0.
     """
+    # Found from a histogram of all frames; equal scores cannot be divided.
     top = max(float(score.max()) for score in scores)
     if not top > 0.0:
         return 0.0, 0.0
     counts = sum(np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores)
-    edges = np.linspace(0.0, top, _HISTOGRAM_BINS + 1)
-    weights = counts / np.sum(counts)
-    below = np.cumsum(weights)[:-1]
-    moment = np.cumsum(weights * (edges[:-1] + edges[1:]) / 2.0)
-    split = (below > 0.0) & (below < 1.0)
-    low = np.divide(moment[:-1], below, out=np.zeros_like(below), where=split)
-    high = np.divide(moment[-1] - moment[:-1], 1.0 - below, out=np.zeros_like(below), where=split)
-    between = below * (1.0 - below) * (high - low) ** 2
-    # Empty bins between two clear classes tie: take the middle of the plateau.
-    best = np.flatnonzero(between >= between.max() * (1.0 - 1e-9))
-    middle = int(best[len(best) // 2])
-    return float(edges[middle + 1]), float(high[middle] - low[middle])
+    centres = (np.arange(_HISTOGRAM_BINS) + 0.5) * top / _HISTOGRAM_BINS
+    threshold = threshold_otsu(hist=(counts, centres))
+    high = centres > threshold
+    if not counts[high].any():
+        return threshold, 0.0
+    low_mean, high_mean = (np.average(centres[part], weights=counts[part]) for part in (~high, high))
+    # The middle of the gap between two clear classes.
+    threshold = (threshold + centres[high & (counts > 0)][0]) / 2.0
+    return float(threshold), float(high_mean - low_mean)
 
 
 def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:
@@ -243,17 +238,16 @@ def above_lid(
         container: upright cylinder about the z axis, from z = 0 up.
         overhang: the space above the lid is a cylinder of this multiple of the container's radius.
     """
-    origin, directions = pixel_rays(intrinsics, camera_to_world, _undistorted_pixels(intrinsics, distortion))
-    radius = container.diameter_m / 2.0
-    above = _intersect(
-        _cylinder_interval(origin, directions, overhang * radius),
-        _slab_interval(origin, directions, container.height_m, np.inf),
-    )
-    solid = _intersect(
-        _cylinder_interval(origin, directions, radius), _slab_interval(origin, directions, 0.0, container.height_m)
-    )
-    blocked = (solid[0] < solid[1]) & (solid[0] <= above[0])
-    return (above[0] < above[1]) & ~blocked
+    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
+    pixels = np.stack([x, y], axis=-1)
+    if np.any(distortion):
+        matrix = intrinsics.matrix()
+        pixels = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, P=matrix).reshape(pixels.shape)
+    origin, directions = pixel_rays(intrinsics, camera_to_world, pixels)
+    radius, height = container.diameter_m / 2.0, container.height_m
+    above, above_end = _cylinder_interval(origin, directions, overhang * radius, height, np.inf)
+    solid, solid_end = _cylinder_interval(origin, directions, radius, 0.0, height)
+    return (above < above_end) & ~((solid < solid_end) & (solid <= above))
 
 
 def mask_picture(
@@ -286,48 +280,20 @@ def mask_picture(
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
-def _smoothed(image: Float[np.ndarray, "h w"], sigma_px: float) -> Float[np.ndarray, "h w"]:
-    return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.0 else image
-
-
-_Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]
-
-
-def _undistorted_pixels(
-    intrinsics: PinholeIntrinsics, distortion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "h w 2"]:
-    """Pixel coordinates of all pixel centres with the lens distortion removed."""
-    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
-    pixels = np.stack([x, y], axis=-1)
-    if not np.any(distortion):
-        return pixels
-    matrix = intrinsics.matrix()
-    return cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, np.asarray(distortion), P=matrix).reshape(
-        pixels.shape
-    )
+def _smoothed(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX)
 
 
 def _cylinder_interval(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float
-) -> _Interval:
-    """Ray parameters between which x² + y² <= radius² (an empty interval for a miss)."""
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float, low: float, high: float
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Ray parameters, 0 or more, between which x² + y² <= radius² and low <= z <= high; begin > end for a miss."""
     a = np.maximum(np.sum(directions[..., :2] ** 2, axis=-1), 1e-18)
     b = np.sum(directions[..., :2] * origin[:2], axis=-1)
     discriminant = b**2 - a * (np.sum(origin[:2] ** 2) - radius**2)
     root = np.sqrt(np.maximum(discriminant, 0.0))
-    hit = discriminant > 0.0
-    return np.where(hit, (-b - root) / a, np.inf), np.where(hit, (-b + root) / a, -np.inf)
-
-
-def _slab_interval(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], low: float, high: float
-) -> _Interval:
-    """Ray parameters between which low <= z <= high."""
     slope = np.where(np.abs(directions[..., 2]) < 1e-12, 1e-12, directions[..., 2])
     first, second = (low - origin[2]) / slope, (high - origin[2]) / slope
-    return np.minimum(first, second), np.maximum(first, second)
-
-
-def _intersect(a: _Interval, b: _Interval) -> _Interval:
-    """The common part of two intervals, in front of the camera."""
-    return np.maximum(np.maximum(a[0], b[0]), 0.0), np.minimum(a[1], b[1])
+    begin = np.maximum(np.maximum((-b - root) / a, np.minimum(first, second)), 0.0)
+    end = np.minimum((-b + root) / a, np.maximum(first, second))
+    return np.where(discriminant > 0.0, begin, np.inf), end

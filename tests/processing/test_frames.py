@@ -14,7 +14,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame, read_cache
 from hsi_sc_nerf.processing.masks import foreground_score
-from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 
 WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
 BANDS = len(WAVELENGTHS_NM)
@@ -134,12 +133,3 @@ def test_a_cache_does_not_vouch_for_a_cube_of_other_settings(cube, tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
     assert not paths.cache.exists()
-
-
-def test_pictures_of_bands():
-    reflectance = np.zeros((2, 2, BANDS), np.float32)
-    reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, -0.5, 1.5]
-    image = to_8_bit(reflectance[..., nearest_bands(WAVELENGTHS_NM, (990.0, 640.0, 490.0))])
-    assert image[0, 0].tolist() == [255, 0, round(0.2 * 255)]
-    assert bands_within(WAVELENGTHS_NM, (500.0, 700.0)).tolist() == [1, 2, 3, 4]
-    assert bands_within(WAVELENGTHS_NM, (2000.0, 2500.0)).tolist() == list(range(BANDS))

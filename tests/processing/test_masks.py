@@ -15,6 +15,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing.masks import (
+    SMOOTHING_PX,
     MaskConfig,
     above_lid,
     brightness,
@@ -38,8 +39,8 @@ CONTAINER = Container(diameter_m=0.09, height_m=0.07)
 
 def test_score_is_the_spread_over_bins():
     bins = np.random.default_rng(1).random((6, 5, 4), dtype=np.float32)
-    np.testing.assert_allclose(foreground_score(bins, smoothing_px=0.0), bins.std(axis=0), atol=1e-6)
-    assert (foreground_score(bins) < foreground_score(bins, smoothing_px=0.0)).mean() > 0.9
+    smoothed = np.stack([cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX) for image in bins])
+    np.testing.assert_allclose(foreground_score(bins), smoothed.std(axis=0), atol=1e-6)
     assert foreground_score(np.full((6, 4, 4), 0.4, np.float32)).max() < 1e-6
 
 
@@ -51,8 +52,8 @@ def test_bins_of_one_width(bands, width):
 def test_score_is_linear_in_the_fraction_of_a_mixed_pixel():
     plant = np.linspace(0.1, 0.6, 12)
     fractions = np.array([0.0, 0.25, 0.5, 1.0])
-    cube = (fractions[:, None] * plant + (1 - fractions[:, None]) * 0.8)[None].astype(np.float32)
-    score = foreground_score(np.moveaxis(cube, -1, 0), smoothing_px=0.0)[0]
+    spectra = (fractions[:, None] * plant + (1 - fractions[:, None]) * 0.8).astype(np.float32)
+    score = np.array([foreground_score(np.full((3, 3, 12), s).transpose(2, 0, 1))[1, 1] for s in spectra])
     np.testing.assert_allclose(score, fractions * score[-1], atol=1e-6)
 
 
@@ -63,15 +64,6 @@ def test_otsu_separates_two_classes_and_says_how_far_they_are_apart():
     threshold, contrast = otsu_threshold(scores)
     assert 0.1 < threshold < 0.2
     assert contrast == pytest.approx(0.28, abs=0.01)
-
-
-def test_otsu_agrees_with_opencv():
-    rng = np.random.default_rng(3)
-    gray = np.clip(np.concatenate([rng.normal(60, 20, 4000), rng.normal(180, 25, 2000)]), 1, 255).astype(np.uint8)
-    gray[0] = 255
-    expected, _ = cv2.threshold(gray.reshape(60, 100), 0, 255, cv2.THRESH_OTSU)
-    threshold, _ = otsu_threshold([gray.reshape(60, 100).astype(float)])
-    assert abs(threshold - expected) < 2.0  # OpenCV's bins are 1 wide and its threshold is the lower bin
 
 
 def test_no_contrast():
@@ -201,7 +193,7 @@ def test_mask_picture_draws_each_outline(tmp_path):
 def test_the_shaded_underside_is_the_objects(tmp_path):
     """A simulated session in the chamber's uneven light, where the fruit's underside lies in its own shade."""
     effects = ("photon_noise", "read_noise", "chamber_shading")
-    scene = override(load_scene("apple"), frames=8, size_px=128, bands=24, effects=effects)
+    scene = override(load_scene("apple"), frames=6, size_px=96, bands=24, effects=effects)
     session = simulate_session(scene, tmp_path / "session", progress=False)
     truth = load_truth(session)
 
