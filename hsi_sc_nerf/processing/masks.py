@@ -1,9 +1,8 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
-The reflectance of plant tissue changes strongly between 400 and 1000 nm, that of Teflon, plastic, paper and ink
-hardly. A pixel's foreground score is the standard deviation of its spectrum, and Otsu's threshold separates the
-object's scores from the others. What lies below the container's lid is excluded by geometry. Dark parts next to the
-object are compared by score relative to brightness, for the score falls with the light.
+Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
+excluded by geometry. Dark parts next to the object are compared by score relative to brightness, for the score falls
+with the light.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from skimage.filters import threshold_otsu
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -29,19 +27,17 @@ from hsi_sc_nerf.morphology import (
     touching,
 )
 from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 
-SPECTRAL_BINS = 24
-"""Neighbouring bands are averaged into this number of bins, or a few less, before the score: it reduces noise."""
-SMOOTHING_PX = 0.5
-"""Standard deviation of the Gaussian that smooths the bins over neighbouring pixels."""
-MIN_CONTRAST = 0.03
+MIN_CONTRAST = 0.005
 """Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
+MIN_SEPARATION = 6.0
+"""Smallest such difference as a multiple of the background's scatter; noise alone has 3 to 5."""
 CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
-_HISTOGRAM_BINS = 512
-# Fractions of the object's median brightness. Before a darker background noise alone gives a high relative score; so
-# it does in darker pixels.
-_MIN_BACKGROUND_BRIGHTNESS = 0.5
+# Fractions of the object's median brightness. Before a darker background noise and pixels that are partly background
+# have a high relative score; so does noise in darker pixels.
+_MIN_BACKGROUND_BRIGHTNESS = 0.9
 _MIN_BRIGHTNESS = 0.1
 
 
@@ -50,8 +46,8 @@ class MaskConfig:
     """Settings of the foreground masks."""
 
     threshold: float | None = None
-    """Foreground score (standard deviation of reflectance over the spectrum) from which a pixel is the object's.
-    Otsu's threshold over all frames if not given."""
+    """Foreground score (the part of the reflectance that the background's spectra cannot explain, RMS over the
+    spectrum) from which a pixel is the object's. Otsu's threshold over all frames if not given."""
     weak_fraction: float = 0.5
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
     shaded_fraction: float | None = 0.4
@@ -62,16 +58,14 @@ class MaskConfig:
 
 
 def foreground_masks(
-    scores: Sequence[Float[np.ndarray, "h w"]],
-    brightnesses: Sequence[Float[np.ndarray, "h w"]],
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
     config: MaskConfig,
     regions: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Bool[np.ndarray, "frames h w"]:
     """Masks of the object in all frames, with one threshold.
 
     Args:
-        scores: foreground score of each frame (`foreground_score`).
-        brightnesses: mean reflectance of each frame (`brightness`).
+        bins: of each frame (`smoothed_bins`).
         config: settings.
         regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
 
@@ -79,68 +73,33 @@ def foreground_masks(
         InputError: the spectra of object and background hardly differ.
 
     Example:
-        >>> score, bright = foreground_score(binned), brightness(binned)  # binned: (24, 512, 512) reflectance
-        >>> foreground_masks([score], [bright], MaskConfig()).shape
+        >>> foreground_masks([smoothed_bins(binned)], MaskConfig()).shape  # binned: (24, 512, 512) reflectance
         (1, 512, 512)
     """
+    background = background_subspace(bins, regions)
+    scores = [foreground_score(image, background) for image in bins]
     threshold = select_threshold(scores, config.threshold)
+    lowest = _background_level(scores, threshold)
+    weak_fraction = max(config.weak_fraction, min(1.0, lowest / threshold))
     masks = []
-    for index, (score, bright) in enumerate(zip(scores, brightnesses, strict=True)):
+    for index, score in enumerate(scores):
         region = np.ones(score.shape, bool) if regions is None else regions[index]
-        mask = foreground_mask(score, threshold, region=region, weak_fraction=config.weak_fraction)
+        mask = foreground_mask(score, threshold, region=region, weak_fraction=weak_fraction)
         if config.shaded_fraction is not None:
-            shaded = shaded_parts(mask, score, bright, region=region, fraction=config.shaded_fraction)
-            mask = fill_holes(mask | shaded)
+            brightness = bins[index].mean(axis=0, dtype=np.float32)
+            shaded = shaded_parts(mask, score, brightness, region=region, fraction=config.shaded_fraction)
+            mask = fill_holes(mask | (shaded & (score > lowest)))
         masks.append(mask)
     return np.stack(masks)
 
 
-def spectral_bin_width(bands: int) -> int:
-    """Number of neighbouring bands in a bin, so that there are `SPECTRAL_BINS` or fewer bins of one width."""
-    return -(-bands // SPECTRAL_BINS)
-
-
-def foreground_score(binned: Float[np.ndarray, "bins h w"]) -> Float[np.ndarray, "h w"]:
-    """Standard deviation over spectral bins of the slightly smoothed reflectance: 0 for a flat spectrum.
-
-    The score of a mixed pixel of object and flat background is nearly the object's score times its fraction.
-    """
-    # Differences from the first bin keep their squares within single precision, and a flat spectrum at exactly 0.
-    first = _smoothed(binned[0])
-    difference, total, squares = np.empty_like(first), np.zeros_like(first), np.zeros_like(first)
-    for image in binned[1:]:
-        cv2.subtract(_smoothed(image), first, dst=difference)
-        cv2.accumulate(difference, total)
-        cv2.accumulateSquare(difference, squares)
-    total /= len(binned)
-    return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
-
-
-def brightness(binned: Float[np.ndarray, "bins h w"]) -> Float[np.ndarray, "h w"]:
-    """Mean over spectral bins of the slightly smoothed reflectance."""
-    return _smoothed(binned.mean(axis=0))
-
-
-def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, float]:
-    """Otsu's threshold over all frames together, and the contrast: the difference of the two classes' means.
-
-    Args:
-        scores: of each frame, 0 or more. Equal scores have a contrast of 0.
-    """
-    # Found from a histogram of all frames; equal scores cannot be divided.
-    top = max(float(score.max()) for score in scores)
-    if not top > 0.0:
-        return 0.0, 0.0
-    counts = sum(np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores)
-    centres = (np.arange(_HISTOGRAM_BINS) + 0.5) * top / _HISTOGRAM_BINS
-    threshold = threshold_otsu(hist=(counts, centres))
-    high = centres > threshold
-    if not counts[high].any():
-        return threshold, 0.0
-    low_mean, high_mean = (np.average(centres[part], weights=counts[part]) for part in (~high, high))
-    # The middle of the gap between two clear classes.
-    threshold = (threshold + centres[high & (counts > 0)][0]) / 2.0
-    return float(threshold), float(high_mean - low_mean)
+def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float) -> float:
+    """Score that the background hardly exceeds: six standard deviations over its median, both robust."""
+    low = np.concatenate([score[score <= threshold] for score in scores])
+    if len(low) == 0:
+        return 0.0
+    median = np.median(low)
+    return float(median + 6.0 * 1.4826 * np.median(np.abs(low - median)))
 
 
 def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:
@@ -151,8 +110,8 @@ def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: floa
     """
     if threshold is not None:
         return threshold
-    threshold, contrast = otsu_threshold(scores)
-    if contrast < MIN_CONTRAST:
+    threshold, contrast, separation = otsu_threshold(scores)
+    if contrast < MIN_CONTRAST or separation < MIN_SEPARATION:
         raise InputError(
             f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
             "object is in view, or give a threshold with --masks.threshold."
@@ -207,7 +166,7 @@ def shaded_parts(
         fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
 
     Returns:
-        The pixels to add. None where the background is less than half as bright as the body.
+        The pixels to add. None where the background is darker than the body.
     """
     empty = np.zeros_like(body)
     if not body.any() or body.all():
@@ -278,10 +237,6 @@ def mask_picture(
     rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
     rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
-
-
-def _smoothed(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX)
 
 
 def _cylinder_interval(
