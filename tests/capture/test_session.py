@@ -146,7 +146,7 @@ def test_wavelengths_of_a_list_beside_session_json(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("wavelength_nm\n400\n500\n", "the list of 2 band centres does not fit its 12 bands"),
+        ("wavelength_nm\n400\n500\n", "2 band centres do not fit"),
         ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
         ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
         ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
@@ -197,7 +197,7 @@ def test_session_info_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "no JSON"),
+        ("{", "no JSON object"),
         ("[]", "no JSON object"),
         ('{"marker_size": 1}', "does not know the key marker_size"),
         ('{"marker_side_m": "2 cm"}', "marker_side_m is '2 cm'"),
