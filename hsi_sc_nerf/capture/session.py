@@ -186,7 +186,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
         raise InputError(f"{path}: has no capture {', '.join(sorted(unknown))} to leave out; check the name.")
     damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
     kept = [files for files in found.captures if files.name not in exclude]
-    captures = _open_captures(kept, info, path, damaged)
+    captures = open_captures(kept, info, path, damaged)
     white_name = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
     if broken_white is not None:
@@ -243,7 +243,7 @@ def _check_whites(path: Path, info: SessionInfo, tarp: Capture | None, frames: l
             )
 
 
-def _open_captures(
+def open_captures(
     captures: list[CaptureFiles], info: SessionInfo, root: Path, damaged: dict[str, str]
 ) -> list[Capture]:
     """Open captures; those that cannot be opened are added to ``damaged``.
