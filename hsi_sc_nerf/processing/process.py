@@ -40,7 +40,6 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
@@ -71,8 +70,6 @@ class ProcessConfig:
     poses: PoseMethod = "auto"
     """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
     angles that session.json gives (angles); or by the first of these that works (auto)."""
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    """Poses from features."""
     camera: Path | None = None
     """An earlier dataset of the same camera and turntable: with known angles and its camera, poses need neither
     markers nor texture."""
@@ -159,7 +156,6 @@ def process_session(
         info,
         camera,
         config.poses,
-        config.features,
         output_dir,
         console,
         estimate_poses,
