@@ -8,15 +8,14 @@ come with a red finding.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
 from jaxtyping import Float
 
-from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
 from hsi_sc_nerf.simulate.scene import Scene, Sphere, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -83,7 +82,6 @@ SCENES: dict[str, Scene] = {
     ),
 }
 if __name__ == "__main__":
-    import sys
     for name, scene in SCENES.items():
         out = Path("/tmp/masks/sessions") / name.replace(" ", "_").replace(",", "")
         if not out.exists():
