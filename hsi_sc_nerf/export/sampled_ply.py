@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.surface_files import read_surface
+from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.export.cloud import estimate_normals
 from hsi_sc_nerf.export.description import comment_lines
 from hsi_sc_nerf.export.ply import band_property_names

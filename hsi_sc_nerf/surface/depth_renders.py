@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from hsi_sc_nerf.data.cameras import FRAME_INDEX
+from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.models.spectral_model import SpectralModel

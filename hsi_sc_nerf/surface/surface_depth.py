@@ -23,7 +23,7 @@ MIN_OPACITY = 0.5
 SURFACE_OPACITY = 0.07
 """Opacity that a ray along the surface's normal has collected at the surface. Density begins at the true surface, for
 other views keep the space outside empty; how deep a ray gets before it is half absorbed depends on the length of the
-training (benchmarks/surface_depth.py)."""
+training (docs/validation/surface.md)."""
 INTERIOR_OPACITY = 0.25
 """Opacity at which the density gradient is read. Further out the gradient is noise."""
 SEARCH_DEPTH = 0.1

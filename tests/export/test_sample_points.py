@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from hsi_sc_nerf.cli.sample import SampleCommand
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.surface_files import read_surface
+from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.sample_points import frontal_views, outward_normals
 from hsi_sc_nerf.export.sampled_ply import read_points
