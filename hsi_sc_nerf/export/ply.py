@@ -103,8 +103,8 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")
-        >>> cloud.spectra.shape
-        (1000000, 204)
+        >>> len(cloud.wavelengths_nm)
+        204
     """
     path = Path(path)
     if not path.is_file():
