@@ -46,7 +46,7 @@ def test_comments_state_frame_run_and_the_unit_of_every_column(tmp_path: Path) -
     comments = PlyData.read(str(path)).comments
     assert f"source: hsi-sc-nerf {__version__}" in comments
     assert "run: b\\xe4r/hsi-sc-nerf/now end_header" in comments
-    assert any(line.startswith("comment: object frame: metres") for line in comments)
+    assert any(line.startswith("comment: object frame: z points up") for line in comments)
     described = {name: line for line in comments for name in line.split(" [")[0].split()}
     for name in ("x", "nz", "blue", "opacity", "views", "bands"):
         assert " [m]: " in described[name] if name == "x" else " [1]: " in described[name]
