@@ -11,8 +11,8 @@ from pathlib import Path
 from hsi_sc_nerf import __version__
 
 FRAME = (
-    "object frame: z points up along the turntable's axis, 0 on the disc; x points from the axis to the camera of the "
-    "first frame"
+    "object frame: z points up along the turntable's axis, 0 on the disc; x points from the axis to the camera of "
+    "the first frame"
 )
 REFLECTANCE = ("1", "reflectance factor relative to the white reference in full light")
 _POSITION = ("m", "position in the object frame")
