@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.poses.track_adjustment import AdjustedTracks
-from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project
+from hsi_sc_nerf.poses.turntable import Tracks, Turntable, project
 
 FRAMES, REACH = 24, 3
 LOOKS_DOWN = np.deg2rad(20.0)
@@ -23,7 +23,7 @@ def creeping(creep_deg, noise_px=0.0, last_frame_sees=True):
     radius, height = rng.uniform(0.05, 0.1, points), rng.uniform(-0.45, -0.3, points)
     angles = np.linspace(0.0, 2.0 * np.pi, FRAMES, endpoint=False)
     about = -angles[azimuth] + rng.uniform(-0.1, 0.1, points)
-    turntable = PointTurntable(
+    turntable = Turntable(
         focal_px=400.0,
         centre_px=(128.0, 128.0),
         camera_rotation=np.array([[0.0, 1.0, 0.0], [S, 0.0, -C], [-C, 0.0, -S]]),
