@@ -2,15 +2,15 @@
 
     uv run python benchmarks/independent_session.py SESSION
 
-A glossy lumpy fruit on a white container turns clockwise before a wooden wall, under two lamps in a white room. Markers
-lie on the disc only. The lamps lose 5 % of their light (10 % in the blue). The path tracer's noise stays in: about
-5 % a pixel, common to all bands of a pixel and independent from frame to frame. The pictures are upright.
+A glossy lumpy fruit on a white container turns clockwise before a wooden wall, under two lamps in a white room.
+Markers lie on the disc only. The lamps lose 5 % of their light (10 % in the blue). The path tracer's noise stays in:
+about 5 % a pixel, common to all bands of a pixel and independent from frame to frame. The pictures are upright.
 
 Three renderings of three wavelengths each use the same paths. The 204 bands are mixed from these nine: spectra of
 materials and their products (one bounce) are linear combinations of their values there, by least squares.
 
-``truth/`` holds truth.json (camera, poses, angles, markers, spectra, drift), masks.npz (fraction of each pixel that the
-fruit covers) and mesh.ply.
+``truth/`` holds truth.json (camera, poses, angles, markers, spectra, drift), masks.npz (fraction of each pixel that
+the fruit covers) and mesh.ply.
 """
 
 from __future__ import annotations
@@ -226,7 +226,14 @@ class IndependentSession:
         focal_px = self.size / 2.0 / np.tan(np.deg2rad(FIELD_OF_VIEW_DEG) / 2.0)
         centre = self.size / 2.0
         truth = {
-            "intrinsics": dict(w=self.size, h=self.size, fl_x=focal_px, fl_y=focal_px, cx=centre, cy=centre),
+            "intrinsics": {
+                "w": self.size,
+                "h": self.size,
+                "fl_x": focal_px,
+                "fl_y": focal_px,
+                "cx": centre,
+                "cy": centre,
+            },
             "frames": [
                 {
                     "capture": name,
