@@ -19,7 +19,7 @@ import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import mitsuba as mi
@@ -118,6 +118,8 @@ class IndependentSession:
     """Width and height of the images, pixels."""
     rays: int = 64
     """Rays in each pixel; fewer make more noise."""
+    fruit: Literal["quince", "long"] = "quince"
+    """Shape of the fruit."""
     seed: int = 0
     """Seed of paths, angles and noise."""
 
@@ -125,7 +127,7 @@ class IndependentSession:
         """Render, mix, expose and write."""
         shutil.rmtree(self.session, ignore_errors=True)
         rng = np.random.default_rng(self.seed)
-        fruit = fruit_mesh()
+        fruit = fruit_mesh(self.fruit)
         scenes = [_objects(fruit, nodes_nm) for nodes_nm in NODES_NM]
         camera = _look_at(AIM_M + DISTANCE_M * _direction(0.0, ELEVATION_DEG), AIM_M)
         # The disc stops a little off its marks.
@@ -280,13 +282,14 @@ def lamp_drift(frames: int) -> Float[np.ndarray, "frames bands"]:
     return 1.0 - progress[:, None] / progress[-1] * loss
 
 
-def fruit_mesh() -> trimesh.Trimesh:
-    """A lumpy quince on the container's lid that no turn brings on to itself."""
+def fruit_mesh(name: str) -> trimesh.Trimesh:
+    """A lumpy fruit on the container's lid that no turn brings on to itself."""
     ball = trimesh.creation.icosphere(subdivisions=6)
     x, y, z = ball.vertices.T
     radius = 1.0 + 0.10 * z * (1.0 - z) + 0.06 * x * y + 0.07 * np.exp(-7.0 * (1.0 - x)) - 0.05 * x * z**2
     radius += 0.03 * np.sin(5.0 * np.arctan2(y, x)) * (1.0 - z**2) ** 2 - 0.25 * np.exp(-14.0 * (1.0 - z))
-    vertices = 0.043 * radius[:, None] * ball.vertices * [1.0, 0.94, 1.12]
+    vertices = 0.043 * radius[:, None] * ball.vertices
+    vertices *= [1.0, 0.94, 1.12] if name == "quince" else [0.62, 0.7, 1.35]
     # It stands on a flat patch.
     vertices[:, 2] = np.maximum(vertices[:, 2] - vertices[:, 2].min(), 0.002) - 0.002 + CONTAINER_HEIGHT_M
     return trimesh.Trimesh(vertices, ball.faces, process=False)
