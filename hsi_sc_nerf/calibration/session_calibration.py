@@ -200,7 +200,7 @@ def _drift(
 ) -> LampDriftEstimate | NotMeasurable:
     """The lamps' drift, from counts at the first frame's integration time."""
     captures = session.frames
-    survey = survey_lines(captures[0].cube.shape[0])
+    survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
