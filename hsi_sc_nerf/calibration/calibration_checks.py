@@ -35,11 +35,7 @@ def check_calibration(session: Session, calibration: SessionCalibration) -> list
         >>> session = open_session(Path("captures"))
         >>> refuse_red(check_calibration(session, calibrate_session(session, CalibrationConfig())))
     """
-    return [
-        _check_drift(session, calibration),
-        _check_clipped(session, calibration),
-        _check_noise(session, calibration),
-    ]
+    return [check(session, calibration) for check in (_check_drift, _check_clipped, _check_noise)]
 
 
 def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
@@ -58,9 +54,7 @@ def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
         level: Level = "red" if change > IMPLAUSIBLE_DRIFT else "amber"
         return Finding("drift", level, f"{session.path}: {told}; check lamps and exposure times.", values)
     if error > MAX_ERROR:
-        sentence = (
-            f"{told}, known to {100.0 * error:.1f} % only, from {pixels} pixels; show more of the still chamber."
-        )
+        sentence = f"{told}, but only to {100.0 * error:.1f} %, from {pixels} pixels; show more of the still chamber."
         return Finding("drift", "amber", f"{session.path}: {sentence}", values)
     return Finding("drift", "green", f"Lamps: {told}, known to {100.0 * error:.2f} %.", values)
 
