@@ -16,8 +16,8 @@ from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
 
-LINES = 16
-"""Lines of each cube that are read, evenly spread."""
+LINES, DARK_LINES = 16, 8
+"""Lines of each cube that are read, evenly spread, and of each dark cube."""
 CLIPPED_FROM = 1.05
 """Reflectance that counts as clipped: noise and uneven light alone take a white wall's values just above 1."""
 CLIPPED_AMBER, CLIPPED_RED = 0.01, 0.05
@@ -190,5 +190,6 @@ def _light(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "lines samples ba
     rows = np.unique(np.linspace(0, cube.shape[0] - 1, min(LINES, cube.shape[0]) + 2).round().astype(int)[1:-1])
     counts = np.asarray(cube.memmap()[rows])
     missing = no_data(counts, cube.ignore_value)
-    light = counts.astype(np.float32) - dark_columns(None if dark is None else dark.memmap(), *cube.shape[1:])
+    dark_lines = None if dark is None else dark.memmap()[:DARK_LINES]
+    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:])
     return light if missing is None else np.where(missing, 0.0, light)
