@@ -11,17 +11,19 @@ from jaxtyping import Float, UInt8
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import in_object_frame, lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
+    adjust_together,
     adjust_tracks,
-    adjust_with_markers,
     split_half_error_deg,
     with_lost_frames,
 )
@@ -84,7 +86,7 @@ def _posed(
         markers, _, _ = usable(observe(images, dictionary, progress=False).observations)
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
-    adjusted, markers = adjust_with_markers(found, markers, free_angles=free_angles)
+    adjusted, markers = adjust_together(found, markers, FreeParameters(angles=free_angles))
     height, width = images[0].shape
     findings = _split_half_finding(split_half_error_deg(found, free_angles=free_angles))
     if scale_of(adjusted.turntable, info)[0] is None:

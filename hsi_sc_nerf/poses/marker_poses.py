@@ -17,7 +17,8 @@ from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
-from hsi_sc_nerf.poses.object_frame import in_object_frame, lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames

@@ -130,27 +130,50 @@ class MarkerResiduals(Residuals):
 class PointResiduals(Residuals):
     """Points of the object, over their standard deviation. The loss is that of a residual's length."""
 
-    def __init__(self, turntable: Turntable, tracks: Tracks, loss_scale: float, sigma_px: float = 1.0) -> None:
+    def __init__(
+        self,
+        turntable: Turntable,
+        tracks: Tracks,
+        loss_scale: float,
+        sigma_px: float = 1.0,
+        fields: Float[np.ndarray, "n 2 k"] | None = None,
+    ) -> None:
         super().__init__(turntable, tracks, loss_scale, 3)
         self.numbers = 2 * len(tracks)
-        self.pixels, self.sigma_px = tracks.pixels, sigma_px
+        self.pixels, self.sigma_px, self.fields = tracks.pixels, sigma_px, fields
 
     def values(self, turntable: Turntable) -> Float[np.ndarray, "n 1 2"]:
         """Reprojection errors, infinite for a point behind the camera."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
         behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
-        return np.where(behind, np.inf, (projection.pixels - self.pixels) / self.sigma_px)[:, None]
+        creep_px = 0.0 if self.fields is None else self.fields @ turntable.creep_px
+        return np.where(behind, np.inf, (projection.pixels + creep_px - self.pixels) / self.sigma_px)[:, None]
 
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
         """By the point's coordinates."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        pixel = projection_jacobian(turntable, self.frame, projection)
+        pixel = replace(projection_jacobian(turntable, self.frame, projection), creep=self.fields)
         scaled = {name: None if by is None else by / self.sigma_px for name, by in vars(pixel).items()}
         return Jacobian(**scaled), scaled["point"]
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:
         """The turntable with its points shifted."""
         return replace(turntable, points_3d=turntable.points_3d + step)
+
+
+def creep_fields(tracks: Tracks) -> Float[np.ndarray, "n 2 k"]:
+    """Smooth displacements by which features may creep over an object before a camera and lamps that stand still.
+
+    Shade, gloss and outlines stay in the image while the object turns below them, and take features along; so does a
+    lens. The fields are polynomials of the place in the image up to the third degree, each with a root mean square
+    of 1 px.
+    """
+    place = tracks.pixels - np.median(tracks.pixels, axis=0)
+    x, y = (place / np.abs(place).max()).T
+    shapes = np.stack([x**i * y ** (n - i) for n in (1, 2, 3) for i in range(n + 1)], axis=-1)
+    shapes /= np.sqrt((shapes**2).mean(axis=0))
+    nothing = np.zeros_like(shapes)
+    return np.stack([np.concatenate(pair, axis=-1) for pair in ((shapes, nothing), (nothing, shapes))], axis=1)
 
 
 def whitening(covariance: Float[np.ndarray, "n 8 8"]) -> Float[np.ndarray, "n 8 8"]:

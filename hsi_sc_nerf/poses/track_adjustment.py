@@ -16,7 +16,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
-from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, loop_closure_deg
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, creep_fields, loop_closure_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
@@ -32,6 +32,11 @@ _OUTLIER_ROUNDS = 4
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
+# Standard deviation of the amplitude of each field of creep.
+_CREEP_PX = 0.1
+# Errors of one feature in neighbouring frames are alike: residuals count as if they were so many times larger.
+_CORRELATION = 2.0
+_LEAST_SIGMA_PX = 0.05
 # A marker whose rays are nearly parallel is not placed.
 _LEAST_EIGENVALUE = 1e-3
 # Points seen in fewer frames, and frames that show fewer points, are left out.
@@ -109,28 +114,34 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True)
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def adjust_with_markers(
-    found: AdjustedTracks, markers: MarkerObservations | None, *, free_angles: bool = True
+def adjust_together(
+    found: AdjustedTracks, markers: MarkerObservations | None, free: FreeParameters
 ) -> tuple[Adjusted, MarkerObservations | None]:
-    """Adjust tracks and markers together, which tells focal length and distance from each other.
+    """Adjust tracks, the markers that are seen, and prior knowledge together, with a covariance that can be believed.
+
+    Features that creep over the object err together, which their residuals hardly show and a camera with another
+    focal length and distance explains: their creep is adjusted too (``creep_fields``), with a prior.
 
     Args:
         found: the turntable adjusted to the tracks alone.
         markers: seen in its frames; their side is in any unit.
-        free_angles: as ``adjust_tracks``.
+        free: whether angles are adjusted, and prior knowledge.
 
     Returns:
         The turntable, with markers if they determine their places; and the markers that it was adjusted to.
     """
-    sigma_px = float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
-    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
-    free = FreeParameters(distance=False, angles=free_angles)
-    start = found.turntable
+    fields = creep_fields(found.tracks)
+    sigma_px = _CORRELATION * float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
+    sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
+    free = replace(free, creep_sigma_px=_CREEP_PX, distance=False)
+    start = replace(found.turntable, creep_px=np.zeros(fields.shape[-1]))
+    points = partial(PointResiduals, tracks=found.tracks, loss_scale=LOSS_SIGMAS, sigma_px=sigma_px, fields=fields)
     if markers is not None and len(markers):
         start = with_markers(start, markers)
         markers = markers.select(start.knows(markers))
     if markers is None or not len(markers):
-        return Adjusted(start, Problem(start, points(start), free=free)), None
+        problem = Problem(start, points(start), free=free)
+        return Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem), None
     free = replace(free, distance=True)
     for last in (False, True):
         problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)

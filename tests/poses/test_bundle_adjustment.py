@@ -1,12 +1,14 @@
 """The normal equations against numerical derivatives, for markers and points alone and together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, Problem
-from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, creep_fields
 
 NO_LOSS = 1e9
 """So large a loss scale leaves the squares."""
@@ -27,6 +29,7 @@ def markers(turntable, rng, **free):
         ("sides", FreeParameters(camera=False, angles=False)),
         ("p", FreeParameters(distance=False, radial_terms=2)),
         ("mp", FreeParameters()),
+        ("mp", FreeParameters(creep_sigma_px=0.1, known_focal=(200.0, 0.01), known_angles=(np.ones(3), 0.01))),
     ],
 )
 def test_a_step_is_that_of_numerical_derivatives(kinds, free):
@@ -40,7 +43,9 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
         residuals.append(markers(start, rng, **options.get(kinds, {})))
     if "p" in kinds:
         start = point_turntable(start, 12)
-        residuals.append(PointResiduals(start, point_tracks(start, noise_px=0.5), NO_LOSS, sigma_px=0.7))
+        tracks = point_tracks(start, noise_px=0.5)
+        start = replace(start, creep_px=np.zeros(18))
+        residuals.append(PointResiduals(start, tracks, NO_LOSS, 0.7, creep_fields(tracks)))
     problem = Problem(start, *residuals, free=free)
     layout = problem.layout
 
@@ -48,7 +53,7 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
         return problem.moved(turntable, step[: layout.motion_size], [step[columns] for columns in layout.landmarks])
 
     def numbers(turntable):
-        prior = problem.scaled_motions(turntable).ravel()
+        _, prior, _ = problem.priors(turntable)
         return np.concatenate([*(part.values(turntable).ravel() for part in residuals), prior])
 
     here = start if kinds == "sides" else moved(start, 0.03 * rng.normal(size=layout.size))
@@ -70,4 +75,4 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
     np.testing.assert_allclose(found, whole, atol=2e-5 * np.abs(whole).max())
     m = layout.motion_size
     schur = normal[:m, :m] - normal[:m, m:] @ np.linalg.pinv(normal[m:, m:], hermitian=True) @ normal[m:, :m]
-    np.testing.assert_allclose(equations.information(), schur, atol=1e-4 * np.abs(schur).max())
+    np.testing.assert_allclose(equations.information(), schur, atol=1e-3 * np.abs(schur).max())
