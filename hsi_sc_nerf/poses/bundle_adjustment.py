@@ -42,8 +42,6 @@ class FreeParameters:
     motion_sigmas: tuple[float, float] | None = None
     """Standard deviations of the table's tilts (rad) and shifts over the frames, a prior on them; infinite for none.
     None: the motions are held."""
-    creep_sigma_px: float | None = None
-    """Standard deviation of the amplitudes of the points' creep; None: there is none."""
     known_focal: tuple[float, float] | None = None
     """Focal length (px) by an earlier session, and its standard deviation as a fraction."""
     known_angles: tuple[Float[np.ndarray, "f"], float] | None = None
@@ -52,7 +50,7 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Columns of the parameters: camera, radial terms, angles, motions, creep; behind these p come the landmarks."""
+    """Columns of the parameters: camera, radial terms, angles, motions, hidden errors; behind these p the landmarks."""
 
     motion_size: int
     """p, the number of parameters without the landmarks'."""
@@ -62,7 +60,7 @@ class ParameterLayout:
     angle: Int[np.ndarray, "f"]
     """Held angles have the column p, which is dropped."""
     motion: Int[np.ndarray, "f 5"]
-    creep: Int[np.ndarray, "k"]
+    hidden: Int[np.ndarray, "k"]
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
     """Of each kind of residuals."""
 
@@ -72,14 +70,14 @@ class ParameterLayout:
         return self.motion_size + sum(columns.size for columns in self.landmarks)
 
     @staticmethod
-    def of(free: FreeParameters, frames: int, fields: int, residuals: Sequence[Residuals]) -> ParameterLayout:
-        """The columns for a number of frames, of fields of creep, and the landmarks of the residuals."""
+    def of(free: FreeParameters, frames: int, residuals: Sequence[Residuals]) -> ParameterLayout:
+        """The columns for a number of frames, and the landmarks and hidden errors of the residuals."""
         camera = (4 + free.distance) * free.camera
         radial = camera + free.radial_terms
         held = frames if not free.angles else int(free.camera)
         angle = radial + frames - held
-        creep = angle + (5 * frames if free.motion_sigmas else 0)
-        size = end = creep + (fields if free.creep_sigma_px else 0)
+        motion = angle + (5 * frames if free.motion_sigmas else 0)
+        size = end = motion + sum(part.hidden.shape[-1] for part in residuals if part.hidden is not None)
         landmarks = []
         for part in residuals:
             landmarks.append(end + np.arange(part.size * part.d).reshape(part.size, part.d))
@@ -89,8 +87,8 @@ class ParameterLayout:
             camera=np.arange(camera),
             radial=np.arange(camera, radial),
             angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
-            motion=np.arange(angle, creep).reshape(-1, 5),
-            creep=np.arange(creep, size),
+            motion=np.arange(angle, motion).reshape(-1, 5),
+            hidden=np.arange(motion, size),
             landmarks=tuple(landmarks),
         )
 
@@ -160,7 +158,7 @@ class Problem:
         free: parameters to adjust beside the landmarks; by default camera and angles.
         """
         self.residuals, self.free = residuals, free or FreeParameters()
-        self.layout = ParameterLayout.of(self.free, len(start.frames), len(start.creep_px), residuals)
+        self.layout = ParameterLayout.of(self.free, len(start.frames), residuals)
         self.numbers = sum(part.numbers for part in residuals)
 
     def cost(self, turntable: Turntable) -> float:
@@ -176,8 +174,6 @@ class Problem:
         known = [(np.zeros(0, int), np.zeros(0), np.ones(0))]
         if free.motion_sigmas is not None:
             known.append((c.motion, turntable.tilts_and_shifts(), np.repeat(free.motion_sigmas, (2, 3))))
-        if free.creep_sigma_px is not None:
-            known.append((c.creep, turntable.creep_px, np.array(free.creep_sigma_px)))
         if free.known_focal is not None:
             focal_px, sigma = free.known_focal
             known.append((c.camera[:1], np.log([turntable.focal_px / focal_px]), np.array(sigma)))
@@ -202,9 +198,9 @@ class Problem:
         if jacobian.motion is not None and c.motion.size:
             columns.append(c.motion[part.frame])
             values.append(jacobian.motion)
-        if jacobian.creep is not None and c.creep.size:
-            columns.append(np.broadcast_to(c.creep, (n, len(c.creep))))
-            values.append(jacobian.creep)
+        if jacobian.hidden is not None:
+            columns.append(np.broadcast_to(c.hidden, (n, len(c.hidden))))
+            values.append(jacobian.hidden)
         return np.concatenate(columns, axis=1), np.concatenate(values, axis=2)
 
     def normal_equations(self, turntable: Turntable) -> NormalEquations:
@@ -256,8 +252,6 @@ class Problem:
         if c.motion.size:
             motion = turntable.tilts_and_shifts() + step[c.motion]
             turntable = replace(turntable, tilts_rad=motion[:, :2], shifts=motion[:, 2:])
-        if c.creep.size:
-            turntable = replace(turntable, creep_px=turntable.creep_px + step[c.creep])
         for part, landmark_step in zip(self.residuals, landmark_steps, strict=True):
             turntable = part.moved(turntable, landmark_step) if part.d else turntable
         return turntable
@@ -310,6 +304,9 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
 
+    inflation: float = 1.0
+    """The standard deviations are known to be so many times larger than the residuals say."""
+
     @cached_property
     def cost(self) -> float:
         """Of the problem at the turntable."""
@@ -326,9 +323,18 @@ class Adjusted:
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``."""
+        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
+
+        Hidden errors, of unit variance, were not adjusted: they add what they do to the parameters.
+        """
         information = self.problem.normal_equations(self.turntable).information()
-        return self.variance * np.linalg.pinv(information, hermitian=True)
+        hidden = self.problem.layout.hidden
+        shown = np.setdiff1d(np.arange(len(information)), hidden)
+        inverse = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True)
+        response = inverse @ information[np.ix_(shown, hidden)]
+        covariance = np.zeros_like(information)
+        covariance[np.ix_(shown, shown)] = self.inflation**2 * self.variance * inverse + response @ response.T
+        return covariance
 
     def angle_sigmas_deg(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "f"]:
         """Standard deviations of the frames' angles relative to the mean of all, degrees."""

@@ -12,6 +12,7 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
+from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
@@ -102,7 +103,7 @@ def poses_from_markers(
     with np.errstate(invalid="ignore"):
         errors_px = np.sqrt(np.bincount(kept.frame, squared_px2, len(names)) / seen)
     return in_object_frame(
-        adjusted,
+        with_hidden_errors(adjusted, kept),
         kept,
         names,
         (width, height),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ def in_object_frame(
     to_object = to_object_frame(turntable, disc_height(turntable))
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
-    uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, n)
+    uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres)
     return TurntablePoses(
         names=tuple(names),
         intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
@@ -62,7 +63,7 @@ def in_object_frame(
         wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
         metric=source is not None,
         scale=None if source is None else _scale(adjusted, turntable, markers, uncertainty.size, source, info),
-        uncertainty=uncertainty,
+        uncertainty=replace(uncertainty, angle_deg=turntable.over_session(uncertainty.angle_deg, n)),
         **specific,
     )
 

@@ -35,6 +35,8 @@ class Residuals(ABC):
 
     numbers: int
     """Of all residuals: n g r."""
+    hidden: np.ndarray | None = None
+    """Displacements (rows, 2, k) that count in the covariance alone."""
 
     def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
         """Args:
@@ -82,6 +84,7 @@ class MarkerResiduals(Residuals):
         *,
         free: bool = True,
         free_sides: bool = False,
+        hidden: Float[np.ndarray, "4*n 2 k"] | None = None,
     ) -> None:
         """Args:
         turntable: as ``Residuals``.
@@ -90,9 +93,10 @@ class MarkerResiduals(Residuals):
         weights: multiply the residuals (x0, y0, x1, ...) of an observation; by default they whiten its covariance.
         free: whether the markers' poses are adjusted.
         free_sides: whether the log of each marker's side is adjusted.
+        hidden: displacements of the corners, px, that are not adjusted but count in the covariance.
         """
         super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
-        self.free, self.free_sides = free, free_sides
+        self.free, self.free_sides, self.hidden = free, free_sides, hidden
         self.numbers = 8 * len(observations)
         self.corners_px = observations.corners_px.reshape(-1, 8, 1)
         self.whitening = whitening(observations.covariance_px2) if weights is None else weights
@@ -104,6 +108,7 @@ class MarkerResiduals(Residuals):
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 8 d"]]:
         """By a marker's parameters: a small rotation in the object's axes, a shift, and the log of its side."""
         pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
+        pixel = replace(pixel, hidden=self.hidden)
         whitened = {name: None if by is None else self._whiten(by) for name, by in vars(pixel).items()}
         offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
         parts = [np.zeros((len(offset), 2, 0))]
@@ -136,44 +141,27 @@ class PointResiduals(Residuals):
         tracks: Tracks,
         loss_scale: float,
         sigma_px: float = 1.0,
-        fields: Float[np.ndarray, "n 2 k"] | None = None,
     ) -> None:
         super().__init__(turntable, tracks, loss_scale, 3)
         self.numbers = 2 * len(tracks)
-        self.pixels, self.sigma_px, self.fields = tracks.pixels, sigma_px, fields
+        self.pixels, self.sigma_px = tracks.pixels, sigma_px
 
     def values(self, turntable: Turntable) -> Float[np.ndarray, "n 1 2"]:
         """Reprojection errors, infinite for a point behind the camera."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
         behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
-        creep_px = 0.0 if self.fields is None else self.fields @ turntable.creep_px
-        return np.where(behind, np.inf, (projection.pixels + creep_px - self.pixels) / self.sigma_px)[:, None]
+        return np.where(behind, np.inf, (projection.pixels - self.pixels) / self.sigma_px)[:, None]
 
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
         """By the point's coordinates."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        pixel = replace(projection_jacobian(turntable, self.frame, projection), creep=self.fields)
+        pixel = projection_jacobian(turntable, self.frame, projection)
         scaled = {name: None if by is None else by / self.sigma_px for name, by in vars(pixel).items()}
         return Jacobian(**scaled), scaled["point"]
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:
         """The turntable with its points shifted."""
         return replace(turntable, points_3d=turntable.points_3d + step)
-
-
-def creep_fields(tracks: Tracks) -> Float[np.ndarray, "n 2 k"]:
-    """Smooth displacements by which features may creep over an object before a camera and lamps that stand still.
-
-    Shade, gloss and outlines stay in the image while the object turns below them, and take features along; so does a
-    lens. The fields are polynomials of the place in the image up to the third degree, each with a root mean square
-    of 1 px.
-    """
-    place = tracks.pixels - np.median(tracks.pixels, axis=0)
-    x, y = (place / np.abs(place).max()).T
-    shapes = np.stack([x**i * y ** (n - i) for n in (1, 2, 3) for i in range(n + 1)], axis=-1)
-    shapes /= np.sqrt((shapes**2).mean(axis=0))
-    nothing = np.zeros_like(shapes)
-    return np.stack([np.concatenate(pair, axis=-1) for pair in ((shapes, nothing), (nothing, shapes))], axis=1)
 
 
 def whitening(covariance: Float[np.ndarray, "n 8 8"]) -> Float[np.ndarray, "n 8 8"]:

@@ -98,8 +98,6 @@ class Turntable:
     points: Int[np.ndarray, "p"] = field(default_factory=_no_numbers)
     """The tracks' numbers of the points, ascending."""
     points_3d: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    creep_px: Float[np.ndarray, "k"] = field(default_factory=lambda: np.zeros(0))
-    """Amplitudes of the fields by which points creep over the object (``residuals.creep_fields``)."""
 
     def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
         """Rotation T and shift s of the object in each frame."""
@@ -232,8 +230,8 @@ class Jacobian:
     """By the frame's tilt (2, rad) and shift (3); None for a turntable without."""
     point: Float[np.ndarray, "n 2 3"]
     """By the point, in the object's axes."""
-    creep: Float[np.ndarray, "n 2 k"] | None = None
-    """By the amplitudes of the points' creep."""
+    hidden: Float[np.ndarray, "n 2 k"] | None = None
+    """By the amplitudes of displacements that the residuals hardly show."""
 
 
 def project(turntable: Turntable, frame: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]) -> Projection:

@@ -11,14 +11,13 @@ from hsi_sc_nerf.poses.residuals import PointResiduals
 from hsi_sc_nerf.poses.result import Uncertainty
 
 
-def pose_uncertainty(adjusted: Adjusted, covariance: Float[np.ndarray, "p p"], metres: float, n: int) -> Uncertainty:
+def pose_uncertainty(adjusted: Adjusted, covariance: Float[np.ndarray, "p p"], metres: float = 1.0) -> Uncertainty:
     """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
 
     Args:
         adjusted: the turntable.
         covariance: of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
-        n: number of the session's frames.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())
@@ -38,7 +37,7 @@ def pose_uncertainty(adjusted: Adjusted, covariance: Float[np.ndarray, "p p"], m
         focal=float(sigmas[0]),
         distance=distance,
         size=float(np.sqrt(size @ covariance @ size)),
-        angle_deg=turntable.over_session(adjusted.angle_sigmas_deg(covariance), n),
+        angle_deg=adjusted.angle_sigmas_deg(covariance),
         rotation_deg=float(np.rad2deg(np.sqrt(variance.max()))),
         position_m=metres * float(np.sqrt(np.trace(place @ covariance @ place.T))),
     )

@@ -257,7 +257,7 @@ def test_uncertainties_are_those_of_the_errors():
                 np.log(adjusted.turntable.focal_px / machine.focal_px) / np.sqrt(covariance[0, 0]),
                 np.log(adjusted.turntable.distance / machine.distance) / np.sqrt(covariance[4, 4]),
                 np.log(radius / np.linalg.norm(machine.marker_poses[:, :2, 3]))
-                / pose_uncertainty(adjusted, covariance, 1.0, 12).size,
+                / pose_uncertainty(adjusted, covariance).size,
             ]
         )
     spread = np.sqrt(np.mean(np.square(errors), axis=0))
