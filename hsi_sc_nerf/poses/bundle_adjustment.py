@@ -50,7 +50,7 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Columns of the parameters: camera, radial terms, angles, motions, hidden errors; behind these p the landmarks."""
+    """Columns of camera, radial terms, angles, motions and hidden errors; behind these p come the landmarks."""
 
     motion_size: int
     """p, the number of parameters without the landmarks'."""

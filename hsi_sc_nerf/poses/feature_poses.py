@@ -184,8 +184,7 @@ def _camera_findings(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCam
     if not moved and abs(focal) <= _SIGMAS * np.hypot(alone, _FOCAL_SIGMA):
         return []
     sentence = (
-        "The camera is not as in the earlier session: its focal length differs by "
-        f"{100.0 * focal:+.1f} % and the axis leans by {tilt_deg:.1f} degrees; do without --camera, or take a session "
-        "of the unmoved camera."
+        f"The camera is not as in the earlier session: its focal length differs by {100.0 * focal:+.1f} % and the "
+        f"axis leans by {tilt_deg:.1f} degrees; do without --camera, or take a session of the unmoved camera."
     )
     return [Finding("poses-camera", "red", sentence, {"focal_percent": 100.0 * focal, "tilt_deg": tilt_deg})]
