@@ -25,6 +25,7 @@ from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
     adjust_together,
     adjust_tracks,
+    halves_differ,
     with_lost_frames,
 )
 from hsi_sc_nerf.poses.turntable import Turntable

@@ -12,7 +12,7 @@ from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 
-_FIELD_PX = 0.02
+_FIELD_PX = 0.007
 """Standard deviation of each field's amplitude: print, lens and pixels are that far from the model's."""
 
 
