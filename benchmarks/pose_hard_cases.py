@@ -46,13 +46,13 @@ COLUMNS = (
 FEATURE_COLUMNS = (
     "session",
     "rotation, deg",
-    "stated",
+    "stated, deg",
     "position, mm",
-    "stated",
+    "stated, mm",
     "focal, %",
-    "stated",
+    "stated focal, %",
     "size, %",
-    "stated",
+    "stated size, %",
     "findings",
 )
 WORKERS = 2
