@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import contextmanager
 from html.parser import HTMLParser
 
 import ball_run
@@ -139,14 +140,13 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     assert not (tmp_path / "report.html").exists()
 
 
-@pytest.mark.slow
-@needs_browser
-def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
-    """No message in the console, colours that follow from the numbers, the spectrum of the point under a click."""
+@contextmanager
+def opened(report, **window):
+    """The report in a browser, and what its console said."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     with sync_api.sync_playwright() as playwright:
         browser = launch(playwright)
-        page = browser.new_page(viewport={"width": 700, "height": 600}, reduced_motion="reduce")
+        page = browser.new_page(reduced_motion="reduce", **window)
         page.set_default_timeout(120_000)
         messages, requests = [], []
         page.on("console", lambda message: messages.append(message.text))
@@ -154,6 +154,22 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
         page.on("request", lambda request: requests.append(request.url))
         page.goto(report.as_uri())
         assert page.locator("#cloud").get_attribute("data-state") == "ready"
+        yield page
+        assert messages == []
+        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
+        browser.close()
+
+
+def picked_mm(page):
+    """Position of the last picked point."""
+    return np.array(re.findall(r"-?[\d.]+", page.locator(".picked li").last.inner_text()), float)
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
+    """Colours that follow from the numbers, the spectrum of the point under a click."""
+    with opened(report, viewport={"width": 700, "height": 600}) as page:
         canvas = page.locator("#cloud canvas")
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")
@@ -177,16 +193,51 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
         click(0.5, 0.65)
         click(0.02, 0.02)
         assert page.locator(".picked li").count() == 1
-        point_mm = [float(word) for word in re.findall(r"-?[\d.]+", page.locator(".picked li").inner_text())]
-        assert np.linalg.norm(point_mm) == pytest.approx(30.0, abs=0.2)
-        assert point_mm[2] < 0.0
+        assert page.locator(".missed").is_visible()
+        assert np.linalg.norm(picked_mm(page)) == pytest.approx(30.0, abs=0.2)
+        assert picked_mm(page)[2] < 0.0
         with page.expect_download() as download:
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)
         np.testing.assert_allclose(saved[:, 1], np.linspace(0.2, 0.4, len(saved)), atol=2e-3)
-        before = canvas.screenshot()
-        canvas.press("ArrowUp")
-        assert canvas.screenshot() != before
-        assert messages == []
-        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
-        browser.close()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_spectrum_is_picked_by_keyboard(report):
+    """The page is entered by tabulator; the cross shows where; arrows move what is under it."""
+    with opened(report, viewport={"width": 1280, "height": 900}) as page:
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.tagName") == "CANVAS":
+                break
+        assert page.locator(".cross").is_visible()
+        page.keyboard.press("Enter")
+        front = picked_mm(page)
+        for _ in range(8):
+            page.keyboard.press("ArrowUp")
+        page.keyboard.press("Enter")
+        above = picked_mm(page)
+        assert above[2] > front[2] + 10.0
+        for _ in range(16):
+            page.keyboard.press("Shift+ArrowRight")
+        page.keyboard.press("Enter")
+        assert page.locator(".picked li").count() == 2
+        assert page.locator(".missed").is_visible()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(report):
+    with opened(report, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
+        size = "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
+        assert page.locator("section > .card[open]").count() == 1
+        width, height = page.evaluate(size)
+        assert width == 390
+        assert height < 5000
+        page.evaluate("for (const one of document.querySelectorAll('details')) one.open = true")
+        assert page.evaluate(size)[0] == 390
+        names = page.locator("tbody th").evaluate_all("all => all.map((one) => one.clientWidth)")
+        assert min(names) >= 80
+        reach = "all => all.map((one) => one.getBoundingClientRect().right)"
+        assert max(page.locator("main :is(p, li, img, svg, canvas, .wide)").evaluate_all(reach)) <= 391
