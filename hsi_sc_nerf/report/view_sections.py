@@ -167,7 +167,7 @@ def bands_section(
             f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
         )
     figure = Figure(list(charts.values()), caption, list(charts), columns=2)
-    findings = judge_bands(rmse[0].y, wavelengths_nm, typical_uncertainty)
+    findings = judge_bands(rmse[0].y, wavelengths_nm)
     return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
 

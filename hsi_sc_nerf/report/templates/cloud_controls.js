@@ -210,7 +210,7 @@ function start(root, cloud) {
 if (window.matchMedia("(max-width: 48rem)").matches) {
   for (const card of document.querySelectorAll("section:not(#object) > .card")) card.open = false;
 }
-document.querySelector("nav").addEventListener("click", ({ target }) => {
+document.querySelector("header").addEventListener("click", ({ target }) => {
   const card = target.hash && document.querySelector(`${target.hash} > .card`);
   if (card) card.open = true;
 });
