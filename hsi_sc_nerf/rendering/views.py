@@ -12,8 +12,8 @@ import numpy as np
 from nerfstudio.cameras.camera_paths import get_path_from_json
 from nerfstudio.cameras.cameras import Cameras
 
-from hsi_sc_nerf.data.cameras import pinhole_cameras
 from hsi_sc_nerf.data.datamanager import SpectralDataset
+from hsi_sc_nerf.data.dataparser import pinhole_cameras
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.models.trained_run import TrainedRun

@@ -24,8 +24,8 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.datamanager import SpectralDataset
+from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
 from hsi_sc_nerf.spectra.composites import COMPOSITES, available_composites, composite

@@ -20,7 +20,7 @@ from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights
 from hsi_sc_nerf.simulate.scene import Fruit
-from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 25)
 STAND_M = 0.07
