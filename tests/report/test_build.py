@@ -4,6 +4,7 @@ import json
 import re
 from contextlib import contextmanager
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import ball_run
 import capture_factory as factory
@@ -16,14 +17,20 @@ from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section
+from hsi_sc_nerf.report.dataset_sections import (
+    calibration_section,
+    inspection_section,
+    masks_section,
+    poses_section,
+)
 from hsi_sc_nerf.report.page import html_page
 from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
-SECTIONS = ["object", "views", "bands", "spectra", "comparison", "traits", "training"]
+SECTIONS = ["inspection", "object", "views", "bands", "spectra", "comparison", "traits", "training"]
 SECTIONS += ["calibration", "masks", "poses", "settings"]
 COMPARISON = {
     "scores": {
@@ -59,6 +66,8 @@ def run(tmp_path_factory):
     data = ball_run.write_ball_dataset(folder / "data")
     transforms = (data / "transforms.json").read_text()
     (data / "transforms.json").write_text(transforms.replace('"ball"', json.dumps(HOSTILE)))
+    finding = {"name": "white", "level": "amber", "sentence": HOSTILE, "values": {}}
+    write_json(data / "report" / "inspection.json", {"findings": [finding]})
     run = ball_run.write_untrained_run(data, folder / "runs").parent
     write_spectral_ply(run / "point_cloud.ply", ball(factory.WAVELENGTHS_NM))
     (run / "comparison.json").write_text(json.dumps(COMPARISON))
@@ -103,7 +112,7 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report):
     assert set(addresses) <= {"http://www.w3.org/2000/svg"}  # a name, which nothing fetches
 
     assert "<img src=x" not in text
-    assert text.count("{{ 7 * 7 }}") > 3
+    assert text.count("{{ 7 * 7 }}") > 5
     assert len(page.all("script")) == 2
     for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229 ± 1", "250 ± 2", "cm²", "mL"):
         assert shown in text
@@ -123,6 +132,10 @@ def test_sections_on_a_processed_session(flagged_dataset):
 
 
 def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, tmp_path):
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "inspection.json").write_text('{"findings": ["white"]}')
+    with pytest.raises(InputError, match=r"inspection\.json: holds no findings"):
+        inspection_section(SimpleNamespace(root=tmp_path))
     with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
