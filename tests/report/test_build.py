@@ -50,9 +50,10 @@ TRAITS = trait_content(
 
 
 def ball(wavelengths_nm, count=4000):
-    """A ball whose northern half has twice the reflectance of its southern."""
-    normals = np.random.default_rng(0).normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    """A ball of evenly spread points whose northern half has twice the reflectance of its southern."""
+    z, azimuth = 1.0 - 2.0 * (np.arange(count) + 0.5) / count, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    wide = np.sqrt(1.0 - z**2)
+    normals = np.stack([wide * np.cos(azimuth), wide * np.sin(azimuth), z], axis=-1)
     shape = np.linspace(0.2, 0.4, len(wavelengths_nm))
     spectra = np.where(normals[:, 2:] > 0, 2.0, 1.0) * shape
     colours = np.full((count, 3), 128, np.uint8)
@@ -209,6 +210,10 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
         assert page.locator(".missed").is_visible()
         assert np.linalg.norm(picked_mm(page)) == pytest.approx(30.0, abs=0.2)
         assert picked_mm(page)[2] < 0.0
+        style = page.locator(".picked .line").evaluate(
+            "line => [getComputedStyle(line)].map((s) => [s.stroke, s.fill])[0]"
+        )
+        assert style == ["rgb(0, 114, 178)", "none"]
         with page.expect_download() as download:
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)

@@ -71,16 +71,16 @@ function start(root, cloud) {
       "aria-label": "Reflectance over wavelength of the points that were clicked" }, undefined, SVG);
     const add = (name, attributes, text) => svg.append(element(name, attributes, text, SVG));
     for (let value = 0; value <= highest; value += step) {
-      add("path", { class: "grid", d: `M${left} ${y(value)}H${width - 16}` });
-      add("text", { class: "number", x: left - 5, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(2));
+      add("path", { stroke: "var(--rule)", d: `M${left} ${y(value)}H${width - 16}` });
+      add("text", { x: left - 5, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(2));
     }
     for (let nm = Math.ceil(first / 100) * 100; nm <= last; nm += last - first > 450 ? 200 : 100) {
-      add("text", { class: "number", x: x(nm), y: height - 19, "text-anchor": "middle" }, String(nm));
+      add("text", { x: x(nm), y: height - 19, "text-anchor": "middle" }, String(nm));
     }
     add("text", { x: (left + width) / 2, y: height - 4, "text-anchor": "middle" }, "wavelength (nm)");
     for (const { spectrum, series } of picked) {
       const d = spectrum.map((v, i) => `${i ? "L" : "M"}${x(cloud.wavelengths[i]).toFixed(1)} ${y(v).toFixed(1)}`);
-      add("path", { class: `line s${series}`, d: d.join("") });
+      add("path", { class: "line", stroke: `var(--s${series})`, d: d.join("") });
     }
     const list = element("ul", {});
     for (const { point, series } of picked) {
