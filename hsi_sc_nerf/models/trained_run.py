@@ -12,7 +12,6 @@ import torch
 import yaml
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.utils.eval_utils import eval_setup
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
@@ -82,6 +81,8 @@ def open_run(load_config: Path) -> TrainedRun:
     config = read_config(load_config)
     if not isinstance(config.pipeline.model, SpectralModelConfig):
         raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
+    from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
+
     find_checkpoint(_relocated(config, load_config).get_checkpoint_dir())
     _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _relocated(c, load_config))
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))

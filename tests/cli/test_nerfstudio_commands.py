@@ -1,4 +1,4 @@
-"""nerfstudio's own commands on a small run and a dataset of this package, as docs/how-to/nerfstudio_commands.md says."""
+"""nerfstudio's own commands on a small run and a dataset of this package: the table of its how-to page."""
 
 from __future__ import annotations
 
@@ -41,12 +41,9 @@ def scripts():
 def call(scripts, config_path):
     def called(program, *words):
         module, commands = scripts[program]
-        leading = words[:1] if commands == "Commands" else ()
-        rest = words[len(leading) :]
-        made = tyro.cli(
-            getattr(module, commands), args=[*leading, "--load-config", str(config_path), *map(str, rest)]
-        )
-        made.main()
+        split = 1 if commands == "Commands" else 0
+        arguments = [*words[:split], "--load-config", config_path, *words[split:]]
+        tyro.cli(getattr(module, commands), args=[str(word) for word in arguments]).main()
 
     return called
 
