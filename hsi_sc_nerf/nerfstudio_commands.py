@@ -72,12 +72,14 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
 
 def _export_spectral_cloud(options: Any) -> None:
     """`export_cloud` with the options of nerfstudio's `ExportPointCloud`."""
+    from hsi_sc_nerf.export.description import run_name
     from hsi_sc_nerf.export.options import CloudOptions
     from hsi_sc_nerf.export.spectral_export import export_cloud
     from hsi_sc_nerf.models.trained_run import open_run
 
     cloud_options = CloudOptions.from_nerfstudio(options)
-    export_cloud(open_run(options.load_config), options.output_dir, cloud_options)
+    run = open_run(options.load_config)
+    export_cloud(run, options.output_dir, cloud_options, run_name(options.load_config))
 
 
 def prepare(command: Any) -> bool:

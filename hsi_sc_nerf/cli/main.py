@@ -14,6 +14,7 @@ from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
 from hsi_sc_nerf.cli.export import ExportCommand
 from hsi_sc_nerf.cli.inspect import InspectCommand
+from hsi_sc_nerf.cli.markers import MarkersCommand
 from hsi_sc_nerf.cli.process import ProcessCommand
 from hsi_sc_nerf.cli.render import RenderCommand
 from hsi_sc_nerf.cli.report import ReportCommand
@@ -28,6 +29,7 @@ Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[RunCommand, tyro.conf.subcommand("run")]
+    | Annotated[MarkersCommand, tyro.conf.subcommand("markers")]
     | Annotated[InspectCommand, tyro.conf.subcommand("inspect")]
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
