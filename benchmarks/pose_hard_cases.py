@@ -21,14 +21,13 @@ import cv2
 import numpy as np
 import tyro
 from jaxtyping import Float, UInt8
-from pose_errors import align_poses, pose_errors, transformed_poses
 from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
-from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
@@ -140,6 +139,7 @@ class Posed:
 
     Attributes:
         simulation: the session.
+        info: what is known of it.
         poses: of its frames.
         rotation_deg: errors of the used frames' rotations.
         position_mm: errors of the used frames' positions.
@@ -147,6 +147,7 @@ class Posed:
     """
 
     simulation: Simulation
+    info: SessionInfo
     poses: TurntablePoses
     rotation_deg: Float[np.ndarray, "n"]
     position_mm: Float[np.ndarray, "n"]
@@ -211,7 +212,41 @@ def pose(
             truth = transformed_poses(align_poses(truth, found, rigid=True), truth)
         if case.any_height:
             truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
-    return Posed(simulation, poses, *pose_errors(found, truth), seconds)
+    return Posed(simulation, info, poses, *pose_errors(found, truth), seconds)
+
+
+def pose_errors(
+    found: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Errors of rotation (degrees) and position (millimetres) of each camera-to-world pose (metres)."""
+    degrees = np.array([rotation_angle_deg(a, b) for a, b in zip(found, true, strict=True)])
+    return degrees, 1e3 * np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=-1)
+
+
+def align_poses(
+    poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], rigid: bool = False
+) -> Similarity:
+    """The similarity that brings poses closest to a reference: first their orientations, then their positions.
+
+    Args:
+        poses: camera-to-world, metres.
+        reference: likewise.
+        rigid: keep the scale.
+    """
+    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], poses[:, :3, :3]))
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    turned, target = poses[:, :3, 3] @ rotation.T, reference[:, :3, 3]
+    centred = turned - turned.mean(axis=0)
+    scale = 1.0 if rigid else float(np.sum(centred * target) / np.sum(centred**2))
+    return Similarity(scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0))
+
+
+def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Camera-to-world poses in the frame that the similarity leads to."""
+    moved = poses.copy()
+    moved[:, :3, :3] = similarity.rotation @ poses[:, :3, :3]
+    moved[:, :3, 3] = similarity(poses[:, :3, 3])
+    return moved
 
 
 def marker_info(simulation: Simulation) -> SessionInfo:
@@ -266,7 +301,7 @@ def _cells(posed: Posed) -> tuple[str, ...]:
         f"{posed.focal_percent:+.3f}",
         f"{poses.overall_error_px:.3f}",
         f"{posed.seconds:.0f}",
-        "; ".join([poses.model, *pose_report(poses)["warnings"]]),
+        "; ".join([poses.model, *(f.sentence for f in check_poses(poses, posed.info) if f.level != "green")]),
     )
 
 

@@ -1,6 +1,6 @@
 """ENVI cubes: opened without loading them, read line by line, written whole or not at all.
 
-SPy maps the data files and writes the headers; ``envi_header.py`` reads the headers.
+SPy writes the headers; ``envi_header.py`` reads them.
 """
 
 from __future__ import annotations
@@ -14,19 +14,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num, Shaped
 from spectral.io import envi
-from spectral.io.bilfile import BilFile
-from spectral.io.bipfile import BipFile
-from spectral.io.bsqfile import BsqFile
 
 from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 
-_SPY_FILES = {"bil": BilFile, "bip": BipFile, "bsq": BsqFile}
 # Order of a cube's axes (lines, samples, bands) in a data file.
 _AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
 DATA_SUFFIXES = ("", ".raw", ".dat", ".img", ".bil", ".bip", ".bsq", ".bin", ".hyspex")
-"""Endings of ENVI data files; "" for ``NAME`` beside ``NAME.hdr`` (and ``NAME.raw`` beside ``NAME.raw.hdr``)."""
+"""Endings of ENVI data files; "" for ``NAME`` beside ``NAME.hdr``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +39,9 @@ class Cube(EnviHeader):
 
     def memmap(self) -> Num[np.ndarray, "lines samples bands"]:
         """A read-only view of the data file; only the pages of the pixels that are used are read."""
-        parameters = envi.gen_params(self.fields)
-        parameters.filename = str(self.data_path)
-        return _SPY_FILES[self.interleave](parameters, self.fields).open_memmap(interleave="bip")
+        axes = _AXES[self.interleave]
+        stored = np.memmap(self.data_path, self.dtype, "r", self.offset, tuple(self.shape[axis] for axis in axes))
+        return stored.transpose(np.argsort(axes))
 
     def read(self) -> Num[np.ndarray, "lines samples bands"]:
         """The stored numbers in memory, contiguous, in the machine's byte order."""
@@ -75,15 +71,11 @@ def open_cube(header: Path | EnviHeader, wavelengths_nm: Float[np.ndarray, "band
         header = read_header(Path(header))
     if header.wavelengths_nm is not None:
         wavelengths_nm = header.wavelengths_nm
-    if wavelengths_nm is None:
+    if wavelengths_nm is None or len(wavelengths_nm) != header.shape[2]:
+        unfit = "" if wavelengths_nm is None else f", and {len(wavelengths_nm)} band centres do not fit its bands"
         raise InputError(
-            f"{header.header_path}: gives no wavelengths; add a 'wavelength' list with one number a band, or name a "
-            "CSV of the band centres as 'band_centres' in session.json."
-        )
-    if len(wavelengths_nm) != header.shape[2]:
-        raise InputError(
-            f"{header.header_path}: gives no wavelengths, and the list of {len(wavelengths_nm)} band centres does "
-            f"not fit its {header.shape[2]} bands; add a 'wavelength' list with one number a band."
+            f"{header.header_path}: gives no wavelengths{unfit}; add a 'wavelength' list with one number a band, or "
+            "name a CSV of the band centres as 'band_centres' in session.json."
         )
     data_path = _find_data_file(header)
     actual = data_path.stat().st_size
@@ -144,10 +136,10 @@ def write_cube(
 
 
 class CubeLines:
-    """Context manager that reads a cube line by line, ``(samples, bands)``, into one buffer.
+    """Context manager that reads a cube line by line, ``(samples, bands)``; each line overwrites the one before.
 
-    Each line overwrites the one before. This is several times faster than touching new pages of a memory map, most of
-    all with several threads. The lines of a BSQ file are scattered over the file and come from a memory map.
+    This is several times faster than touching new pages of a memory map, most of all with several threads. The lines
+    of a BSQ file are scattered over the file and come from a memory map.
     """
 
     def __init__(self, cube: Cube) -> None:

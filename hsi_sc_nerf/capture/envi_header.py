@@ -1,12 +1,12 @@
-"""ENVI headers: parsed by SPy, mended where SPy refuses valid files, and checked where SPy checks nothing."""
+"""ENVI headers: read in every variation that instruments write, and checked.
+
+SPy's own reader refuses valid files (byte order marks, letters beyond ASCII, indented comments) and checks nothing.
+"""
 
 from __future__ import annotations
 
-import codecs
 import math
 import re
-import tempfile
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,26 +14,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 from spectral.io import envi
-from spectral.io.spyfile import InvalidFileError
 
 from hsi_sc_nerf.errors import InputError
 
 INTERLEAVES = ("bil", "bip", "bsq")
-_INDENTED_COMMENT = re.compile(rb"^[ \t]+;", re.MULTILINE)
+_FIELD = re.compile(r"^([^=\n{}]+)=[ \t]*(\{[^}]*\}|[^\n{]*$)[^\n]*$", re.MULTILINE)
 _REQUIRED = ("lines", "samples", "bands", "data type", "interleave")
 _NM_PER_UNIT = {
     "nm": 1.0,
     "nanometer": 1.0,
-    "nanometre": 1.0,
     "um": 1000.0,
-    "\N{MICRO SIGN}m": 1000.0,
-    "\N{GREEK SMALL LETTER MU}m": 1000.0,
     "micrometer": 1000.0,
-    "micrometre": 1000.0,
     "micron": 1000.0,
     "mm": 1e6,
     "millimeter": 1e6,
-    "millimetre": 1e6,
     "angstrom": 0.1,
 }
 # ENVI's units that are no lengths.
@@ -54,11 +48,11 @@ class EnviHeader:
         offset: bytes before the first number.
         wavelengths_nm: band centres; None where the header lists none.
         fwhm_nm: full width of each band at half its maximum; None where the header lists none.
-        good_bands: which bands the bad-band list ``bbl`` keeps; all without such a list.
+        good_bands: which bands the bad-band list ``bbl`` keeps; all without one.
         reflectance_scale: ``reflectance scale factor``, the stored number of reflectance 1 (1 by default).
         ignore_value: ``data ignore value``, the stored number that stands for "no data".
         integration_time_ms: Specim's ``tint``.
-        fields: all fields as SPy parses them, after mending.
+        fields: all fields by their names in lower case; values in braces are lists of texts, others texts.
     """
 
     header_path: Path
@@ -81,10 +75,7 @@ class EnviHeader:
 
 
 def read_header(path: Path) -> EnviHeader:
-    """Parse, mend and check a header; the data file is not read.
-
-    Mended are a missing ``byte order`` (little endian) or ``header offset``, upper-case interleaves, "envi" in lower
-    case, byte order marks, Latin-1 letters, indented comments, and a comma after a list's last number.
+    """Read and check a header; the data file is not read.
 
     Raises:
         InputError: there is no such file, it is no ENVI header, a field is missing or unreadable, a list does not
@@ -94,11 +85,11 @@ def read_header(path: Path) -> EnviHeader:
     fields = mended_fields(path)
     try:
         shape = (int(fields["lines"]), int(fields["samples"]), int(fields["bands"]))
-        parameters = envi.gen_params(fields)
+        offset = int(fields.get("header offset") or 0)
+        dtype = np.dtype(envi.envi_to_dtype[fields["data type"]])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
-    dtype = np.dtype(parameters.dtype)
-    check_layout(path, fields, shape, dtype, parameters.offset)
+    check_layout(path, fields, shape, dtype, offset)
     scale = number_in(path, fields, "reflectance scale factor")
     if scale is not None and not scale > 0.0:
         raise InputError(f"{path}: reflectance scale factor {scale:g} is not positive; correct it.")
@@ -110,8 +101,8 @@ def read_header(path: Path) -> EnviHeader:
         header_path=path,
         shape=shape,
         interleave=fields["interleave"],
-        dtype=dtype,
-        offset=parameters.offset,
+        dtype=dtype.newbyteorder(">" if fields["byte order"] == "1" else "<"),
+        offset=offset,
         wavelengths_nm=wavelengths_nm,
         fwhm_nm=None if fwhm is None else fwhm * nm_per_unit,
         good_bands=np.ones(shape[2], bool) if bad_band_list is None else bad_band_list != 0.0,
@@ -123,49 +114,38 @@ def read_header(path: Path) -> EnviHeader:
 
 
 def mended_fields(path: Path) -> dict[str, Any]:
-    """SPy's dictionary of the header, with ENVI's defaults filled in."""
+    """The header's fields as in `EnviHeader.fields`; a missing ``byte order`` is filled in as little endian.
+
+    Raises:
+        InputError: there is no such file, it is no ENVI header, or a required field is missing.
+    """
     if not path.is_file():
         raise InputError(f"{path}: there is no such ENVI header; check the path.")
-    try:
-        fields = _parse(path)
-    except (InvalidFileError, OSError) as error:
-        raise InputError(f"{path}: is no readable ENVI header; export the file again.") from error
-    fields.setdefault("byte order", "0")
-    missing = [key for key in _REQUIRED if not fields.get(key)]
-    if missing:
-        raise InputError(f"{path}: the header does not give {', '.join(missing)}; add it.")
-    fields["interleave"] = str(fields["interleave"]).lower()
-    # Some writers set a comma after a list's last number.
-    return {
-        key: value[:-1] if isinstance(value, list) and value[-1] == "" else value for key, value in fields.items()
-    }
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    """SPy's dictionary of the header. A header that SPy cannot parse is corrected in a temporary copy."""
-    with open(path, "rb") as file:
-        start = file.read(64).removeprefix(codecs.BOM_UTF8).lstrip()
-        if not start.upper().startswith(b"ENVI") or b"\0" in start:
-            raise InvalidFileError(f"{path} does not begin with ENVI")
-        file.seek(0)
-        content = file.read()
-    if content.isascii() and content.startswith(b"ENVI") and not _INDENTED_COMMENT.search(content):
-        return _parse_with_spy(path)
+    with path.open("rb") as file:
+        content = file.read(64)
+        is_envi = content.removeprefix(b"\xef\xbb\xbf").lstrip()[:4].upper() == b"ENVI" and b"\0" not in content
+        content += file.read() if is_envi else b""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")
-    fields = [line for line in text.lstrip().splitlines()[1:] if not line.lstrip().startswith(";")]
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "mended.hdr"
-        copy.write_text("\n".join(["ENVI", *fields, ""]), errors="replace")  # in the encoding that SPy reads with
-        return _parse_with_spy(copy)
-
-
-def _parse_with_spy(path: Path) -> dict[str, Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # field names are case-insensitive; SPy warns that it lowers them
-        return envi.read_envi_header(str(path))
+    lines = text.lstrip().splitlines()[1:]
+    text = "\n".join(line.rstrip() for line in lines if not line.lstrip().startswith(";"))
+    if not is_envi or "{" in _FIELD.sub("", text):
+        raise InputError(f"{path}: is no readable ENVI header; export the file again.")
+    fields: dict[str, Any] = {"byte order": "0"}
+    for name, value in _FIELD.findall(text):
+        key, value = name.strip().lower(), value.strip()
+        if value.startswith("{") and key != "description":
+            # Some writers set a comma after a list's last number.
+            fields[key] = [item.strip() for item in value[1:-1].strip().removesuffix(",").split(",")]
+        else:
+            fields[key] = value.strip("{}").strip()
+    missing = [key for key in _REQUIRED if not fields.get(key)]
+    if missing:
+        raise InputError(f"{path}: the header does not give {', '.join(missing)}; add it.")
+    fields["interleave"] = str(fields["interleave"]).lower()
+    return fields
 
 
 def check_layout(
@@ -193,34 +173,30 @@ def check_layout(
 
 def number_in(path: Path, fields: dict[str, Any], key: str) -> float | None:
     """A field's number; None where the field is missing or empty."""
-    value = fields.get(key, "")
-    if not value:
-        return None
-    try:
-        return float(value[0] if isinstance(value, list) else value)
-    except ValueError as error:
-        raise InputError(f"{path}: {key} is no number ({error}); correct it.") from error
+    numbers = _numbers(path, {key: np.atleast_1d(fields.get(key, ""))[0]}, key, 1)
+    return None if numbers is None else float(numbers[0])
 
 
-def _numbers(path: Path, fields: dict[str, Any], key: str, bands: int) -> Float[np.ndarray, "bands"] | None:
-    """A field's list of one number a band; None where the field is missing or empty."""
+def _numbers(path: Path, fields: dict[str, Any], key: str, count: int) -> Float[np.ndarray, "count"] | None:
+    """A field's list of numbers, one a band; None where the field is missing or empty."""
     listed = fields.get(key, "")
-    if not listed:
+    if listed in ("", [""]):
         return None
     try:
         numbers = np.array([float(value) for value in np.atleast_1d(listed)])
     except ValueError as error:
-        raise InputError(f"{path}: {key} holds what is not a number ({error}); correct the list.") from error
-    if len(numbers) != bands:
-        raise InputError(f"{path}: {key} lists {len(numbers)} numbers for {bands} bands; correct the list.")
-    if not np.isfinite(numbers).all() or numbers.min() < 0.0:
+        raise InputError(f"{path}: {key} holds what is not a number ({error}); correct it.") from error
+    if len(numbers) != count:
+        raise InputError(f"{path}: {key} lists {len(numbers)} numbers for {count} bands; correct the list.")
+    if count > 1 and (not np.isfinite(numbers).all() or numbers.min() < 0.0):
         raise InputError(f"{path}: {key} holds numbers that are negative or not finite; correct the list.")
     return numbers
 
 
 def wavelengths_of(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
     """The factor from the header's unit to nm, and the band centres, or None where it lists none."""
-    unit = str(fields.get("wavelength units", "")).strip().lower().removesuffix("s")
+    unit = re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", str(fields.get("wavelength units", "")).lower())
+    unit = unit.strip().removesuffix("s").replace("metre", "meter")
     listed = _numbers(path, fields, "wavelength", bands)
     if listed is None or unit == "index":
         return _NM_PER_UNIT.get(unit, 1.0), None

@@ -6,16 +6,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.capture.envi import Cube, open_cube
-from hsi_sc_nerf.capture.envi_header import read_header
-from hsi_sc_nerf.capture.layout import CaptureFiles, find_captures, holds_captures
+from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
+from hsi_sc_nerf.capture.layout import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.capture.specim_iq import SpecimMetadata, dark_of_white, image_rotation_deg, read_metadata
@@ -83,6 +83,9 @@ class Session:
         white: the capture of the white tarp, if there is one.
         frames: the other captures, in natural order of their names.
         image_rotation_deg: rotation of the files' images from upright, counter-clockwise.
+        damaged: captures that cannot be used and are left out, by name, with the reason.
+        skipped: folders and cubes that are no captures, by name, with the reason.
+        excluded: captures that the user leaves out.
     """
 
     path: Path
@@ -90,6 +93,9 @@ class Session:
     white: Capture | None
     frames: tuple[Capture, ...]
     image_rotation_deg: int = 0
+    damaged: Mapping[str, str] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    excluded: tuple[str, ...] = ()
 
     @property
     def captures(self) -> tuple[Capture, ...]:
@@ -109,7 +115,7 @@ class Session:
     @property
     def has_own_whites(self) -> bool:
         """Whether every frame has raw counts and a white of its own."""
-        return self.has_counts and all(frame.white is not None for frame in self.frames)
+        return all(frame.has_counts and frame.white is not None for frame in self.frames)
 
     @property
     def has_products(self) -> bool:
@@ -140,15 +146,25 @@ class Session:
 def is_session(path: Path) -> bool:
     """Whether ``path`` is a folder that holds captures, by its files' names."""
     path = Path(path)
-    return path.is_dir() and holds_captures(path)
+    if not path.is_dir():
+        return False
+    cubes = (file for pattern in ("*", "results/REFLECTANCE_*") for file in path.glob(f"*/{pattern}"))
+    return any(file.suffix.lower() == ".hdr" for file in path.iterdir()) or any(
+        file.name == "capture" or file.suffix.lower() == ".hdr" for file in cubes
+    )
 
 
-def open_session(path: Path) -> Session:
+def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: bool = False) -> Session:
     """Find the captures of a session, open their cubes and check that they belong together.
+
+    Args:
+        path: the session's folder.
+        exclude: names of captures to leave out.
+        skip_damaged: whether captures that cannot be used are left out (`Session.damaged`) instead of refused.
 
     Raises:
         InputError: no such folder; fewer than two frames; no white reference for every frame and no finished
-            reflectance of every frame; a cube that cannot be opened; frames that differ in shape or bands; or a
+            reflectance of every frame; captures that cannot be opened, or differ from most in shape or bands; or a
             ``session.json`` that cannot be used.
 
     Example:
@@ -160,43 +176,58 @@ def open_session(path: Path) -> Session:
     if not path.is_dir():
         raise InputError(f"{path}: there is no such session folder; check the path.")
     info = read_session_info(path / SESSION_INFO_NAME)
-    found = find_captures(path)
-    if not found:
+    found = list_captures(path)
+    if not found.captures and not found.damaged:
         raise InputError(
             f"{path}: holds no captures; give a folder with NAME/capture/NAME.hdr or with ENVI header and data pairs."
         )
-    tarps = [files for files in found if files.name.lower() == info.white_reference.lower()]
-    frames = [files for files in found if files not in tarps]
-    tarp = next((files for files in tarps if files.counts is not None), None)
+    unknown = set(exclude) - {files.name for files in found.captures} - set(found.damaged) - set(found.skipped)
+    if unknown:
+        raise InputError(f"{path}: has no capture {', '.join(sorted(unknown))} to leave out; check the name.")
+    damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
+    kept = [files for files in found.captures if files.name not in exclude]
+    captures = open_captures(kept, info, path, damaged)
+    white_name = info.white_reference.lower()
+    broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
+    if broken_white is not None:
+        raise InputError(f"{broken_white}.")
+    tarp = next((c for c in captures if c.name.lower() == white_name and c.has_counts), None)
+    frames = [capture for capture in captures if capture.name.lower() != white_name]
+    frames = _consistent(frames, tarp, damaged)
+    if damaged and not skip_damaged:
+        _refuse_damaged(path, damaged)
     _check_whites(path, info, tarp, frames)
     if len(frames) < 2:
         raise InputError(
             f"{path}: has {'a single frame' if frames else 'no frames'} beside the white reference; a reconstruction "
             "needs several frames of the turning object."
         )
-    cubes = _open_cubes(
-        [header for files in (*frames, *([tarp] if tarp else [])) for header in files.headers], info, path
-    )
     # The images of all frames are rotated as the first frame's metadata say.
-    first = _capture(frames[0], cubes, needs_instrument=info.image_rotation_deg is None)
-    session = Session(
-        path=path,
-        info=info,
-        white=None if tarp is None else _capture(tarp, cubes),
-        frames=(first, *(_capture(files, cubes) for files in frames[1:])),
-        image_rotation_deg=(
-            image_rotation_deg(first.metadata, first.cube)
-            if info.image_rotation_deg is None
-            else info.image_rotation_deg
-        ),
+    rotation_deg = info.image_rotation_deg
+    if rotation_deg is None:
+        first = next(files for files in kept if files.name == frames[0].name)
+        if frames[0].metadata is None and first.metadata is not None:
+            frames[0] = replace(frames[0], metadata=read_metadata(first.metadata))
+        rotation_deg = image_rotation_deg(frames[0].metadata, frames[0].cube)
+    return Session(
+        path, info, tarp, tuple(frames), rotation_deg, damaged=damaged, skipped=found.skipped, excluded=tuple(exclude)
     )
-    _check_consistency(session)
-    return session
 
 
-def _check_whites(path: Path, info: SessionInfo, tarp: CaptureFiles | None, frames: list[CaptureFiles]) -> None:
+def _refuse_damaged(path: Path, damaged: Mapping[str, str]) -> None:
+    """Name all captures that cannot be used at once."""
+    if len(damaged) == 1:
+        raise InputError(f"{next(iter(damaged.values()))} (--skip-damaged leaves the capture out).")
+    reasons = ", ".join(f"{name} ({reason.split('; ')[0]})" for name, reason in damaged.items())
+    raise InputError(
+        f"{path}: {len(damaged)} captures cannot be used; copy them again or leave them out with --skip-damaged: "
+        f"{reasons}."
+    )
+
+
+def _check_whites(path: Path, info: SessionInfo, tarp: Capture | None, frames: list[Capture]) -> None:
     """Require a way to reflectance for every frame: the tarp, its own white, or the instrument's product."""
-    if all(files.product for files in frames) or all(files.counts and files.white for files in frames):
+    if all(frame.product for frame in frames) or all(frame.has_counts and frame.white for frame in frames):
         return
     if tarp is None:
         raise InputError(
@@ -204,68 +235,102 @@ def _check_whites(path: Path, info: SessionInfo, tarp: CaptureFiles | None, fram
             f"name as 'white_reference' in {SESSION_INFO_NAME}, or add a WHITEREF_NAME or REFLECTANCE_NAME to each "
             "frame."
         )
-    without_counts = next((files for files in frames if files.counts is None), None)
-    if without_counts is not None:
-        raise InputError(
-            f"{without_counts.product}: there are no raw counts of this frame, but of other frames there is nothing "
-            "else; copy its raw cube too, or the REFLECTANCE cube of every frame."
+    for frame in frames:
+        if not frame.has_counts:
+            raise InputError(
+                f"{frame.cube.header_path}: there are no raw counts of this frame, but of other frames there is "
+                "nothing else; copy its raw cube too, or the REFLECTANCE cube of every frame."
+            )
+
+
+def open_captures(
+    captures: list[CaptureFiles], info: SessionInfo, root: Path, damaged: dict[str, str]
+) -> list[Capture]:
+    """Open captures; those that cannot be opened are added to ``damaged``.
+
+    A header without wavelengths takes those of session.json or of another cube with as many bands.
+    """
+    listed = None if info.band_centres is None else read_band_centres(root / info.band_centres)
+    headers: dict[str, dict[str, EnviHeader]] = {}
+    by_band_count: dict[int, Float[np.ndarray, "bands"]] = {}
+    opened: list[Capture] = []
+
+    def read_headers(files: CaptureFiles) -> None:
+        headers[files.name] = {role: read_header(header) for role, header in files.headers.items()}
+        for header in headers[files.name].values():
+            if header.wavelengths_nm is not None:
+                by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
+
+    def open_cubes(files: CaptureFiles) -> None:
+        opened.append(
+            _capture(
+                files,
+                {
+                    role: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
+                    for role, header in headers[files.name].items()
+                },
+            )
         )
 
-
-def _open_cubes(headers: Iterable[Path], info: SessionInfo, root: Path) -> dict[Path, Cube]:
-    """Open cubes. A header without wavelengths takes those of session.json or of another cube with as many bands."""
-    read = {path: read_header(path) for path in headers}
-    listed = None if info.band_centres is None else read_band_centres(root / info.band_centres)
-    by_band_count: dict[int, Float[np.ndarray, "bands"]] = {}
-    for header in read.values():
-        if header.wavelengths_nm is not None:
-            by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
-    return {
-        path: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
-        for path, header in read.items()
-    }
+    for step in (read_headers, open_cubes):
+        for files in captures:
+            if files.name not in damaged:
+                try:
+                    step(files)
+                except InputError as error:
+                    damaged[files.name] = str(error).removesuffix(".")
+    return opened
 
 
-def _capture(files: CaptureFiles, cubes: dict[Path, Cube], needs_instrument: bool = False) -> Capture:
+def _capture(files: CaptureFiles, cubes: dict[str, Cube]) -> Capture:
     """A capture of opened cubes. Its XML is read only if it is needed."""
-    counts, dark, white, white_dark, product = (
-        None if header is None else cubes[header]
-        for header in (files.counts, files.dark, files.white, files.white_dark, files.product)
-    )
-    cube = product if counts is None else counts
-    assert cube is not None  # guaranteed by find_captures
-    needs_metadata = needs_instrument or white is not None or (counts and counts.integration_time_ms is None)
-    capture = Capture(
-        name=files.name,
-        cube=cube,
-        dark=dark,
-        white=white,
-        product=product,
-        metadata=read_metadata(files.metadata) if files.metadata is not None and needs_metadata else None,
-    )
+    counts, dark, white, product = (cubes.get(role) for role in ("counts", "dark", "white", "product"))
+    needs_metadata = white is not None or (counts and counts.integration_time_ms is None)
+    metadata = read_metadata(files.metadata) if files.metadata is not None and needs_metadata else None
+    cube = counts or cubes["product"]
+    capture = Capture(files.name, cube, dark, white, product=product, metadata=metadata)
     if white is None:
         return capture
-    mode = None if capture.metadata is None else capture.metadata.white_mode
     same_exposure = capture.white_integration_time_ms == capture.integration_time_ms
-    return replace(capture, white_dark=dark_of_white(mode, dark, white_dark, same_exposure))
+    mode = None if metadata is None else metadata.white_mode
+    return replace(capture, white_dark=dark_of_white(mode, dark, cubes.get("white_dark"), same_exposure))
 
 
-def _check_consistency(session: Session) -> None:
-    first = session.frames[0]
-    for capture in session.captures:
-        for cube in capture.cubes:
-            same_bands = cube.wavelengths_nm.shape == first.cube.wavelengths_nm.shape and np.allclose(
-                cube.wavelengths_nm, first.cube.wavelengths_nm, rtol=0.0, atol=_SAME_WAVELENGTH_NM
+def _consistent(frames: list[Capture], tarp: Capture | None, damaged: dict[str, str]) -> list[Capture]:
+    """The frames of the size and bands that most have; the others are added to ``damaged``.
+
+    Raises:
+        InputError: the tarp has other bands.
+    """
+    kinds = [(frame.cube.shape, frame.cube.wavelengths_nm.round(1).tobytes()) for frame in frames]
+    if not frames:
+        return frames
+    usual = frames[kinds.index(max(kinds, key=kinds.count))].cube
+    if tarp is not None and (reason := _difference(tarp, usual, same_size=False)):
+        raise InputError(f"{reason}.")
+    fitting = []
+    for frame in frames:
+        if reason := _difference(frame, usual):
+            damaged[frame.name] = reason
+        else:
+            fitting.append(frame)
+    return fitting
+
+
+def _difference(capture: Capture, usual: Cube, same_size: bool = True) -> str:
+    """How a capture's cubes differ from a session's usual cube; empty where they fit."""
+    for cube in capture.cubes:
+        same_bands = cube.wavelengths_nm.shape == usual.wavelengths_nm.shape and np.allclose(
+            cube.wavelengths_nm, usual.wavelengths_nm, rtol=0.0, atol=_SAME_WAVELENGTH_NM
+        )
+        if not same_bands:
+            return (
+                f"{cube.header_path}: its bands differ from those of {usual.header_path}; leave this capture out or "
+                "take it again with the same bands"
             )
-            if not same_bands:
-                raise InputError(
-                    f"{cube.header_path}: its bands differ from those of {first.cube.header_path}; "
-                    "leave this capture out or take it again with the same bands."
-                )
-        images = () if capture is session.white else (capture.cube, capture.product)
-        for image in images:
-            if image is not None and image.shape != first.cube.shape:
-                raise InputError(
-                    f"{image.header_path}: its {image.shape[:2]} lines and samples differ from the "
-                    f"{first.cube.shape[:2]} of {first.cube.header_path}; leave this capture out."
-                )
+        if same_size and cube in (capture.cube, capture.product) and cube.shape != usual.shape:
+            return (
+                f"{cube.header_path}: its {cube.shape[:2]} lines and samples differ from the {usual.shape[:2]} of "
+                f"{usual.header_path}; leave this capture out"
+            )
+    return ""

@@ -61,18 +61,14 @@ def read_session_info(path: Path) -> SessionInfo:
     """
     if not path.is_file():
         return SessionInfo()
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: is no JSON ({error}); correct it.") from error
     known = [field.name for field in fields(SessionInfo)]
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: is no JSON object; write {{...}} with any of the keys {', '.join(known)}.")
-    unknown = sorted(set(content) - set(known))
-    if unknown:
-        raise InputError(f"{path}: does not know the key {unknown[0]}; the keys are {', '.join(known)}.")
-    values = {key: value for key, value in content.items() if value is not None}
+    try:
+        values = {k: v for k, v in json.loads(path.read_text(encoding="utf-8")).items() if v is not None}
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{path}: is no JSON object ({error}); write {{...}} with keys of {known}.") from error
     for key, value in values.items():
+        if key not in known:
+            raise InputError(f"{path}: does not know the key {key}; the keys are {', '.join(known)}.")
         _check_value(path, key, value)
     if ("container_diameter_m" in values) != ("container_height_m" in values):
         raise InputError(

@@ -13,6 +13,7 @@ from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
 from hsi_sc_nerf.cli.export import ExportCommand
+from hsi_sc_nerf.cli.inspect import InspectCommand
 from hsi_sc_nerf.cli.process import ProcessCommand
 from hsi_sc_nerf.cli.render import RenderCommand
 from hsi_sc_nerf.cli.report import ReportCommand
@@ -24,6 +25,7 @@ from hsi_sc_nerf.errors import InputError
 Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[InspectCommand, tyro.conf.subcommand("inspect")]
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SampleCommand, tyro.conf.subcommand("sample")]

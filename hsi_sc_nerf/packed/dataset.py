@@ -18,6 +18,15 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 
 TRANSFORMS_NAME = "transforms.json"
+_DISTORTION = ("k1", "k2", "p1", "p2")
+# A frame's files and their keys; nerfstudio knows the first two.
+_FRAME_FILES = {
+    "image_path": "file_path",
+    "mask_path": "mask_path",
+    "cube_path": "cube_path",
+    "flags_path": "flags_path",
+}
+_MAY_BE_UNKNOWN = ("fwhm_nm", "typical_uncertainty")
 
 
 @dataclass(frozen=True)
@@ -171,7 +180,7 @@ def open_packed(path: Path) -> PackedDataset:
     if not dataset.frames:
         raise InputError(f"{path}: lists no frames; process the session again.")
     for frame in dataset.frames:
-        for file in (frame.image_path, frame.mask_path, frame.cube_path, frame.flags_path):
+        for file in (getattr(frame, name) for name in _FRAME_FILES):
             if not file.is_file():
                 raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
     return dataset
@@ -183,40 +192,24 @@ def write_transforms(dataset: PackedDataset) -> Path:
     Raises:
         InputError: the operating system refused to write.
     """
-
-    def relative(path: Path) -> str:
-        return path.relative_to(dataset.root).as_posix()
-
-    k1, k2, p1, p2 = (float(c) for c in dataset.distortion)
+    arrays = {name: getattr(dataset, name) for name in _shapes(0)}
     content: dict[str, Any] = {
         "camera_model": "OPENCV",
         **asdict(dataset.intrinsics),
-        "k1": k1,
-        "k2": k2,
-        "p1": p1,
-        "p2": p2,
+        **dict(zip(_DISTORTION, map(float, dataset.distortion), strict=True)),
         "object": dataset.object_name,
-        "pseudo_rgb_nm": dataset.pseudo_rgb_nm.tolist(),
-        "scene_box_m": dataset.scene_box_m.tolist(),
-        "object_box_m": dataset.object_box_m.tolist(),
         "container": None if dataset.container is None else asdict(dataset.container),
-        "pose_method": dataset.pose_method,
-        "fingerprint": dataset.fingerprint,
-        "wavelengths_nm": dataset.wavelengths_nm.tolist(),
-        "fwhm_nm": None if dataset.fwhm_nm is None else dataset.fwhm_nm.tolist(),
-        "background_reflectance": dataset.background_reflectance.tolist(),
-        "bad_bands_nm": dataset.bad_bands_nm.tolist(),
-        "flagged_values": dataset.flagged_values,
         "uncertainty": None
         if dataset.uncertainty is None
         else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
-        "typical_uncertainty": None if dataset.typical_uncertainty is None else dataset.typical_uncertainty.tolist(),
+        **{name: None if array is None else array.tolist() for name, array in arrays.items()},
+        **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "fingerprint")},
         "frames": [
             {
-                "file_path": relative(frame.image_path),
-                "mask_path": relative(frame.mask_path),
-                "cube_path": relative(frame.cube_path),
-                "flags_path": relative(frame.flags_path),
+                **{
+                    key: getattr(frame, name).relative_to(dataset.root).as_posix()
+                    for name, key in _FRAME_FILES.items()
+                },
                 "capture": frame.capture,
                 "angle_deg": float(frame.angle_deg),
                 "reprojection_error_px": frame.reprojection_error_px,
@@ -230,12 +223,24 @@ def write_transforms(dataset: PackedDataset) -> Path:
     return path
 
 
-def _float_or_none(value: Any) -> float | None:
-    return None if value is None else float(value)
+def _shapes(bands: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of a dataset's arrays by their keys (-1: however many there are)."""
+    return {
+        "wavelengths_nm": (-1,),
+        "pseudo_rgb_nm": (3,),
+        "scene_box_m": (2, 3),
+        "object_box_m": (2, 3),
+        "background_reflectance": (bands,),
+        "bad_bands_nm": (-1,),
+        "fwhm_nm": (bands,),
+        "typical_uncertainty": (bands,),
+    }
 
 
-def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
-    """The numbers under ``key``, in ``shape`` (-1: however many there are)."""
+def _numbers(content: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The numbers under ``key``; None for those that may be unknown and are."""
+    if content[key] is None and key in _MAY_BE_UNKNOWN:
+        return None
     try:
         return np.array(content[key], dtype=float).reshape(shape)
     except (TypeError, ValueError) as error:
@@ -243,48 +248,35 @@ def _numbers(content: dict[str, Any], key: str, *shape: int) -> np.ndarray:
         raise ValueError(f"{key} is no list of {expected} numbers".replace("  ", " ")) from error
 
 
-def _numbers_or_none(content: dict[str, Any], key: str, *shape: int) -> np.ndarray | None:
-    return None if content[key] is None else _numbers(content, key, *shape)
-
-
 def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
-    intrinsics = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
     container, uncertainty = content["container"], content["uncertainty"]
-    wavelengths_nm = _numbers(content, "wavelengths_nm", -1)
-    bands = len(wavelengths_nm)
+    bands = len(content["wavelengths_nm"])
+    arrays: dict[str, Any] = {key: _numbers(content, key, shape) for key, shape in _shapes(bands).items()}
+    terms: dict[str, Any] = {}
+    if uncertainty is not None:
+        terms = {field.name: _numbers(uncertainty, field.name, (bands,)) for field in fields(ReflectanceUncertainty)}
     return PackedDataset(
         root=root,
-        intrinsics=PinholeIntrinsics(**intrinsics),
-        distortion=np.array([content[key] for key in ("k1", "k2", "p1", "p2")], dtype=float),
-        wavelengths_nm=wavelengths_nm,
-        pseudo_rgb_nm=_numbers(content, "pseudo_rgb_nm", 3),
+        intrinsics=PinholeIntrinsics(**{field.name: content[field.name] for field in fields(PinholeIntrinsics)}),
+        distortion=np.array([content[key] for key in _DISTORTION], dtype=float),
         object_name=str(content["object"]),
-        scene_box_m=_numbers(content, "scene_box_m", 2, 3),
-        object_box_m=_numbers(content, "object_box_m", 2, 3),
-        background_reflectance=_numbers(content, "background_reflectance", bands),
         container=None if container is None else Container(container["diameter_m"], container["height_m"]),
         flagged_values=int(content["flagged_values"]),
-        bad_bands_nm=_numbers(content, "bad_bands_nm", -1),
-        fwhm_nm=_numbers_or_none(content, "fwhm_nm", bands),
-        uncertainty=None
-        if uncertainty is None
-        else ReflectanceUncertainty(
-            **{field.name: _numbers(uncertainty, field.name, bands) for field in fields(ReflectanceUncertainty)}
-        ),
-        typical_uncertainty=_numbers_or_none(content, "typical_uncertainty", bands),
-        frames=tuple(
-            PackedFrame(
-                capture=str(frame["capture"]),
-                image_path=root / frame["file_path"],
-                mask_path=root / frame["mask_path"],
-                cube_path=root / frame["cube_path"],
-                flags_path=root / frame["flags_path"],
-                angle_deg=float(frame["angle_deg"]),
-                reprojection_error_px=_float_or_none(frame["reprojection_error_px"]),
-                camera_to_world=_numbers(frame, "transform_matrix", 4, 4),
-            )
-            for frame in content["frames"]
-        ),
+        uncertainty=ReflectanceUncertainty(**terms) if terms else None,
+        frames=tuple(_parse_frame(root, frame) for frame in content["frames"]),
         pose_method=content.get("pose_method"),
         fingerprint=content.get("fingerprint"),
+        **arrays,
+    )
+
+
+def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
+    error_px, pose = frame["reprojection_error_px"], _numbers(frame, "transform_matrix", (4, 4))
+    assert pose is not None
+    return PackedFrame(
+        capture=str(frame["capture"]),
+        angle_deg=float(frame["angle_deg"]),
+        reprojection_error_px=None if error_px is None else float(error_px),
+        camera_to_world=pose,
+        **{name: root / frame[key] for name, key in _FRAME_FILES.items()},
     )

@@ -20,14 +20,11 @@ BOUNDARY_PX = 3
 
 
 class PixelReader:
-    """Reads the spectra of single pixels by their position in the files.
-
-    Memory stays at the size of one batch; memory maps would keep every page that was ever touched. Before a batch is
-    read, the system is told of all positions, so that a disk serves many at once (benchmarks/pixel_fetch.py).
+    """Reads the spectra of single pixels from files; memory maps would keep every page that was ever touched.
 
     Args:
-        cubes: memory maps of BIP cubes of one shape, one for each frame. A generator of them keeps at most two maps
-            open at a time; each is one of the files that a process may hold.
+        cubes: memory maps of BIP cubes of one shape, one for each frame; at most two maps of a generator are open at
+            a time.
     """
 
     def __init__(self, cubes: Iterable[np.memmap]) -> None:
@@ -56,7 +53,8 @@ class PixelReader:
         frames, pixels = indices[:, 0], indices[:, 1] * samples + indices[:, 2]
         offsets = (self._starts[frames] + pixels * size).tolist()
         files = [self._files[frame].fileno() for frame in frames.tolist()]
-        if hasattr(os, "posix_fadvise"):  # not on macOS
+        # A disk serves many positions at once (benchmarks/pixel_fetch.py); not on macOS.
+        if hasattr(os, "posix_fadvise"):
             for file, offset in zip(files, offsets, strict=True):
                 os.posix_fadvise(file, offset, size, os.POSIX_FADV_WILLNEED)
         spectra = b"".join(os.pread(file, size, offset) for file, offset in zip(files, offsets, strict=True))
@@ -105,7 +103,7 @@ class PixelSampler:
     def sample(
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
     ) -> dict[str, np.ndarray]:
-        """One batch: what `at` returns for the pixels that `draw` draws."""
+        """One batch: `at` the pixels that `draw` gives."""
         return self.at(self.draw(step, foreground_ray_fraction, boundary_ray_fraction))
 
     def draw(

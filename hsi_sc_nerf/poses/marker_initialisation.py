@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable, rotations_about_z, square_corners
+from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, rotations_about_z, square_corners
 
 # Fields of view over the width that are tried: from a tele lens to a very wide one.
 _FOV_RANGE_DEG = (5.0, 90.0)
@@ -24,7 +24,7 @@ _HORIZONTAL_COSINE = 0.95
 
 def initialise(
     observations: MarkerObservations, centre_px: tuple[float, float], width_px: int, side_m: float
-) -> MarkerTurntable:
+) -> Turntable:
     """Initial turntable from linked observations (``linked_rows``) of markers that each are in two or more frames."""
     fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
     focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
@@ -83,7 +83,7 @@ class _Circles:
         ideal = np.stack([around.real + self.on_axis[0], around.imag + self.on_axis[1], height[self.m]], -1)
         self.predicted = ideal @ self.basis
 
-    def turntable(self) -> MarkerTurntable:
+    def turntable(self) -> Turntable:
         """The circles as a turntable."""
         foot = self.basis[:2].T @ self.on_axis
         distance = np.linalg.norm(foot)
@@ -107,14 +107,14 @@ class _Circles:
             # Each frame gives two candidates; the one that fits all frames best is taken.
             size = np.linalg.norm(error, axis=-1).mean(-1)
             poses[k, :3, :3] = candidates[np.argmin(np.median(size, axis=-1))]
-        start = MarkerTurntable(
+        start = Turntable(
             focal_px=self.focal_px,
             centre_px=self.centre_px,
             camera_rotation=camera_rotation,
             distance=float(distance),
             frames=self.frames,
             angles_rad=angles,
-            side_m=self.side_m,
+            side=self.side_m,
             markers=self.markers,
             marker_poses=poses,
         )
@@ -123,7 +123,7 @@ class _Circles:
         return _turned_over(start) if flat.any() and up[flat].sum() < 0 else start
 
 
-def _turned_over(turntable: MarkerTurntable) -> MarkerTurntable:
+def _turned_over(turntable: Turntable) -> Turntable:
     """The same turntable with the axis pointing the other way (a half turn about x)."""
     half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
     return replace(

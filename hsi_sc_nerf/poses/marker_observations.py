@@ -23,7 +23,7 @@ from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers
 from hsi_sc_nerf.poses.marker_fit import FittedMarker, fit_marker, quad_area
 from hsi_sc_nerf.poses.result import RejectedMarker
 from hsi_sc_nerf.poses.session_pictures import FramePictures, SessionPictures
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
+from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
 # Frames that are searched at the same time: OpenCV and NumPy let other threads work meanwhile.
 _WORKERS = 2
@@ -74,7 +74,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
         def refine(i: int) -> list[tuple[int, FittedMarker | None]]:
             fitted: dict[int, FittedMarker | None] = {}
             for name, found in detections[i].items():
-                image = frames[i].pictures[name].astype(float)
+                image = frames[i].picture(name).astype(float)
                 for marker, corners in sorted(found.items()):
                     if fitted.get(marker) is None:
                         fitted[marker] = fit_marker(image, dictionary, marker, corners, blurs_px[i][name])
@@ -83,7 +83,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
         fitted = _all(pool.map(refine, range(len(frames))), "Refining corners", len(frames), progress)
     for i in _out_of_focus(fitted):
         for name, found in detections[i].items():
-            blurs_px[i][name] = find_blur([frames[i].pictures[name]], dictionary, [found])
+            blurs_px[i][name] = find_blur([frames[i].picture(name)], dictionary, [found])
         fitted[i] = refine(i)
     rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
     why = "its pattern does not explain the pixels: hidden, blurred or misread"
@@ -98,7 +98,7 @@ def _detect(frame: FramePictures, dictionary: str) -> dict[str, Detections]:
     """Markers by the picture's name, best picture first; the other pictures only where it shows few."""
     found: dict[str, Detections] = {}
     for name in frame.ranking:
-        found[name] = detect_markers(frame.pictures[name], dictionary)
+        found[name] = detect_markers(frame.picture(name), dictionary)
         if len(found) == 1 and len(found[name]) >= _FEW_MARKERS:
             break
     return {name: seen for name, seen in found.items() if seen}
@@ -148,7 +148,7 @@ def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detec
 def observe_expected(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     dictionary: str,
-    turntable: MarkerTurntable,
+    turntable: Turntable,
     seen: MarkerObservations,
     blur_px: Float[np.ndarray, "frames"],
 ) -> MarkerObservations:
@@ -188,7 +188,7 @@ def observe_expected(
 
         def fit(pair: tuple[int, int], rank=rank, names=names) -> FittedMarker | None:
             i, marker = pair
-            image = session.frames[i].pictures[names[i]].astype(float)
+            image = session.frames[i].picture(names[i]).astype(float)
             blur = float(blur_px[i]) if rank == 0 else blurs_px[names[i]]
             return fit_marker(image, dictionary, marker, expected[pair], blur, _FARTHEST_FROM_EXPECTED_PX)
 
@@ -214,7 +214,7 @@ def _by_frame(seen: MarkerObservations, frames: int) -> list[Detections]:
     return by_frame
 
 
-def _facing(turntable: MarkerTurntable) -> list[tuple[int, int]]:
+def _facing(turntable: Turntable) -> list[tuple[int, int]]:
     """Pairs of frame and marker where the marker's front faces the camera."""
     centres, normals = turntable.marker_poses[:, :3, 3], turntable.marker_poses[:, :3, 2]
     view = turntable.camera_positions()[:, None] - centres

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.marker_adjustment import whitening
-from hsi_sc_nerf.poses.model_selection import Adjusted, linked_rows, select_model
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted
+from hsi_sc_nerf.poses.model_selection import linked_rows, select_model
+from hsi_sc_nerf.poses.residuals import whitening
 from hsi_sc_nerf.poses.result import RejectedMarker
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, MarkerTurntable
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Turntable
 
 DISPLACED = "object, table or camera was displaced in this frame"
 # An observation is an outlier if its error is above this many pixels, this many times the median error, and this many
@@ -54,7 +55,7 @@ def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[RejectedM
 
 
 def adjust_without_outliers(
-    start: MarkerTurntable, observations: MarkerObservations
+    start: Turntable, observations: MarkerObservations
 ) -> tuple[Adjusted, MarkerObservations, list[RejectedMarker]]:
     """Select a model, adjust it, reject outliers, and repeat until nothing changes.
 
@@ -120,7 +121,7 @@ def without_uncertain_frames(
     return better, certain, rejected + _rejected_frames(displaced, better.displaced_frames)
 
 
-def _select_model(start: MarkerTurntable, observations: MarkerObservations) -> tuple[Adjusted, MarkerObservations]:
+def _select_model(start: Turntable, observations: MarkerObservations) -> tuple[Adjusted, MarkerObservations]:
     """The selected model, and the observations that it rests on."""
     best = select_model(start.restricted(observations), observations)
     return best, observations.without_frames(list(best.displaced_frames))

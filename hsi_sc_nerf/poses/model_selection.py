@@ -8,7 +8,7 @@ for motions of their own, the object, the table or the camera was displaced in t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,9 +17,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import f as f_distribution
 
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
 LOSS_SIGMAS = 3.0
 """Whitened residuals beyond this many standard deviations count by their size, not its square."""
@@ -40,40 +40,6 @@ _LEAST_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """An adjusted turntable and the problem that it solves."""
-
-    turntable: MarkerTurntable
-    problem: MarkerProblem
-    cost: float
-    displaced_frames: dict[int, float] = field(default_factory=dict)
-    """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
-    square distance of their corners from the turntable's at the best angle, px."""
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Number of residuals less parameters, at least 1."""
-        return max(1, 8 * len(self.problem.observations) - self.problem.layout.size)
-
-    @property
-    def variance(self) -> float:
-        """Of the whitened residuals: 1 if the corners' covariances are right; at least that."""
-        return max(1.0, self.cost / self.degrees_of_freedom)
-
-    def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of the parameters, in the order of ``ParameterLayout``."""
-        normal, _ = self.problem.normal_equations(self.turntable).dense()
-        return self.variance * np.linalg.pinv(normal, hermitian=True)
-
-    def angle_sigmas_deg(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "f"]:
-        """Standard deviations of the frames' angles relative to the mean of all, degrees."""
-        at = self.problem.layout.angle[1:]
-        angles = np.pad(covariance[np.ix_(at, at)], ((1, 0), (1, 0)))
-        variance = angles.diagonal() - 2.0 * angles.mean(axis=0) + angles.mean()
-        return np.rad2deg(np.sqrt(np.maximum(variance, 0.0)))
-
-
-@dataclass(frozen=True)
 class FrameMotions:
     """Evidence that frames moved beside the turntable."""
 
@@ -84,10 +50,10 @@ class FrameMotions:
     """Root mean square distance of the corners from the turntable's at the frame's best angle."""
 
 
-_Solve = Callable[[MarkerTurntable, FreeParameters], Adjusted]
+_Solve = Callable[[Turntable, FreeParameters], Adjusted]
 
 
-def select_model(start: MarkerTurntable, observations: MarkerObservations) -> Adjusted:
+def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted:
     """The simplest model that explains the corners, adjusted.
 
     The lens is decided first, on a table that does not wobble. If then the table should move, a few displaced frames
@@ -110,7 +76,7 @@ def select_model(start: MarkerTurntable, observations: MarkerObservations) -> Ad
     return _with_lens(wobbling, solve)
 
 
-def frame_motions(turntable: MarkerTurntable, observations: MarkerObservations) -> FrameMotions:
+def frame_motions(turntable: Turntable, observations: MarkerObservations) -> FrameMotions:
     """Test whether each frame fits the turntable by its angle, or needs tilts and shifts of its own.
 
     Camera, lens and markers are held. Frames of fewer than two markers, or of which fewer than half agree on one
@@ -122,15 +88,16 @@ def frame_motions(turntable: MarkerTurntable, observations: MarkerObservations) 
     """
     seen = observations.select(turntable.knows(observations))
     n, frame = len(turntable.frames), np.searchsorted(turntable.frames, seen.frame)
-    turning = FreeParameters(camera=False, landmarks=False)
+    turning = FreeParameters(camera=False)
     moving = replace(turning, motion_sigmas=(np.inf, np.inf))
 
-    def fitted(start: MarkerTurntable, rows: np.ndarray, free: FreeParameters) -> MarkerTurntable:
-        return MarkerProblem(start, seen.select(rows), LOSS_SIGMAS, free).minimise(start)
+    def fitted(start: Turntable, rows: np.ndarray, free: FreeParameters) -> Turntable:
+        residuals = MarkerResiduals(start, seen.select(rows), LOSS_SIGMAS, free=False)
+        return Problem(start, residuals, free=free).minimise(start)
 
-    everything = MarkerProblem(turntable, seen, LOSS_SIGMAS, turning)
+    everything = MarkerResiduals(turntable, seen, LOSS_SIGMAS, free=False)
     moved = fitted(turntable, np.ones(len(seen), bool), moving)
-    sigmas = np.sqrt((everything.residuals(moved) ** 2).mean(axis=(1, 2)))
+    sigmas = np.sqrt((everything.values(moved) ** 2).mean(axis=(1, 2)))
     agrees = sigmas < _MISFIT_SIGMAS * max(1.0, float(np.median(sigmas)))
     turned, moved = fitted(turntable, agrees, turning), fitted(moved, agrees, moving)
     by_motion, by_angle = (np.bincount(frame[agrees], everything.losses(t)[agrees], n) for t in (moved, turned))
@@ -156,13 +123,12 @@ def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np
     return label[f] == np.argmax(counts)
 
 
-def _solve(observations: MarkerObservations, turntable: MarkerTurntable, free: FreeParameters) -> Adjusted:
-    problem = MarkerProblem(turntable, observations, LOSS_SIGMAS, free)
-    adjusted = problem.minimise(turntable)
-    return Adjusted(adjusted, problem, problem.cost(adjusted))
+def _solve(observations: MarkerObservations, turntable: Turntable, free: FreeParameters) -> Adjusted:
+    problem = Problem(turntable, MarkerResiduals(turntable, observations, LOSS_SIGMAS), free=free)
+    return Adjusted(problem.minimise(turntable), problem)
 
 
-def _steady(start: MarkerTurntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
+def _steady(start: Turntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
     """The model without wobble; and the one with it, if the corners call for it."""
     steady = solve(replace(start, radial=(0.0, 0.0), tilts_rad=None, shifts=None), FreeParameters())
     steady = _with_lens(steady, solve)
@@ -171,7 +137,7 @@ def _steady(start: MarkerTurntable, solve: _Solve) -> tuple[Adjusted, Adjusted |
     return steady, wobbling if _is_better(wobbling, steady) else None
 
 
-def _without_displaced_frames(start: MarkerTurntable, observations: MarkerObservations) -> Adjusted | None:
+def _without_displaced_frames(start: Turntable, observations: MarkerObservations) -> Adjusted | None:
     """The model without wobble of all but a few displaced frames; None where these do not explain the motions."""
     most = max(1, round(_MOST_DISPLACED * len(start.frames)))
 
@@ -200,7 +166,7 @@ def _without_displaced_frames(start: MarkerTurntable, observations: MarkerObserv
     return replace(steady, displaced_frames=dict(errors))
 
 
-def _motion_spread(turntable: MarkerTurntable) -> tuple[float, float]:
+def _motion_spread(turntable: Turntable) -> tuple[float, float]:
     """Root mean squares of the tilts (rad) and the shifts (m)."""
     tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.tilts_and_shifts(), [2], axis=1))
     return max(tilt, _LEAST_SPREAD[0]), max(shift, _LEAST_SPREAD[1])
@@ -219,7 +185,7 @@ def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
 def _is_better(more: Adjusted, less: Adjusted) -> bool:
     """F-test of nested models."""
     extra = more.problem.layout.size - less.problem.layout.size
-    if 8 * len(more.problem.observations) <= more.problem.layout.size:
+    if more.problem.numbers <= more.problem.layout.size:
         return False
     ratio = (less.cost - more.cost) / extra / more.variance
     return bool(f_distribution.sf(ratio, extra, more.degrees_of_freedom) < _LEVEL)

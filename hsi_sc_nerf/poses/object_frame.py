@@ -1,21 +1,24 @@
 """The object frame and its scale: origin on the disc, x towards the first frame's camera, z along the axis, metres.
 
-Markers determine the disc. The scale comes from the markers' side, or from the container that carries markers.
+Markers determine the disc. The scale comes from the markers' side, from the container that carries markers, or from
+the camera's distance.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays, rotation_about_z
-from hsi_sc_nerf.poses.marker_adjustment import MarkerProblem
-from hsi_sc_nerf.poses.result import Scale
-from hsi_sc_nerf.poses.turntable import MarkerObservations, MarkerTurntable, Turntable
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
 # in marker sides.
@@ -26,9 +29,8 @@ _UPRIGHT_SINE = 0.2
 # A marker belongs to the container if its plane is this near the circle through all of them, in marker sides.
 _ON_CONTAINER_SIDES = 0.15
 _FEWEST_TO_FIND_THE_CENTRE = 3
-# A marker seen in fewer frames, or along rays that are nearly parallel, is not triangulated.
-_FEWEST_VIEWS = 2
-_LEAST_EIGENVALUE = 1e-3
+# Without any marker the origin is at the height of the lowest points.
+_LOWEST_POINTS_PERCENTILE = 1.0
 
 
 def to_object_frame(turntable: Turntable, disc: float) -> Float[np.ndarray, "4 4"]:
@@ -60,14 +62,19 @@ def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:
     return up & (height < height[up].min() + _COPLANAR_SIDES * side)
 
 
-def disc_height_m(turntable: MarkerTurntable) -> float:
-    """Height of the disc in the turntable frame; without markers on it that of the lowest marker corner."""
+def disc_height(turntable: Turntable) -> float:
+    """Height of the disc in the turntable frame; without markers on it that of the lowest marker corner, or, without
+    any marker, of the lowest points."""
     corners = turntable.corners()
     flat = lie_on_disc(corners)
-    return float(np.median(corners[flat, :, 2].mean(-1)) if flat.any() else corners[..., 2].min())
+    if flat.any():
+        return float(np.median(corners[flat, :, 2].mean(-1)))
+    if len(corners):
+        return float(corners[..., 2].min())
+    return float(np.percentile(turntable.points_3d[:, 2], _LOWEST_POINTS_PERCENTILE))
 
 
-def disc_tilt_deg(turntable: MarkerTurntable) -> float | None:
+def disc_tilt_deg(turntable: Turntable) -> float | None:
     """Angle between the axis and the normal of the plane through the disc's markers; None below three markers."""
     corners = turntable.corners()
     flat = lie_on_disc(corners)
@@ -78,28 +85,20 @@ def disc_tilt_deg(turntable: MarkerTurntable) -> float | None:
     return float(np.rad2deg(np.arctan2(np.hypot(normal[0], normal[1]), abs(normal[2]))))
 
 
-def container_diameter(
-    normals: Float[np.ndarray, "m 3"],
-    centres: Float[np.ndarray, "m 3"],
-    side: float,
-    disc: float,
-    container_height: float | None,
-) -> float | None:
-    """Diameter of the upright cylinder whose wall the markers around the container touch; any unit of length.
+def container_diameter(turntable: Turntable, container_height: float | None) -> float | None:
+    """Diameter of the upright cylinder whose wall the markers around the container touch, in the turntable's unit.
 
     The container need not stand on the axis: three or more markers determine its centre. Fewer are taken to stand
     around the axis. None where no upright marker faces outwards, or their planes touch no common circle.
 
     Args:
-        normals: of the markers, unit vectors out of their faces; z is the axis.
-        centres: of the markers.
-        side: the markers' side.
-        disc: height of the disc.
+        turntable: with markers.
         container_height: markers whose centre is above this height over the disc are not on the container.
     """
+    normals, centres = turntable.marker_poses[:, :3, 2], turntable.marker_poses[:, :3, 3]
     upright = (np.abs(normals[:, 2]) < _UPRIGHT_SINE) & ((normals[:, :2] * centres[:, :2]).sum(-1) > 0)
     if container_height is not None:
-        upright &= centres[:, 2] - disc < container_height
+        upright &= centres[:, 2] - disc_height(turntable) < container_height
     normals = normals[upright, :2] / np.linalg.norm(normals[upright, :2], axis=-1, keepdims=True)
     distance = (normals * centres[upright, :2]).sum(-1)
     if len(distance) == 0:
@@ -109,108 +108,108 @@ def container_diameter(
     if len(distance) < _FEWEST_TO_FIND_THE_CENTRE or np.linalg.cond(design) > 20.0:
         design[:, :2] = 0.0
     solution = np.linalg.lstsq(design, distance, rcond=None)[0]
-    if np.abs(design @ solution - distance).max() > _ON_CONTAINER_SIDES * side or solution[2] <= 0.0:
+    if np.abs(design @ solution - distance).max() > _ON_CONTAINER_SIDES * turntable.side or solution[2] <= 0.0:
         return None
     return 2.0 * float(solution[2])
 
 
-def length_sigma(turntable: MarkerTurntable, problem: MarkerProblem, covariance: Float[np.ndarray, "p p"]) -> float:
-    """Standard deviation, as a fraction, of lengths on the turntable: of the markers' distance from the axis (RMS).
-
-    The markers' side is taken for exact; the corners are not.
-    """
-    centres = turntable.marker_poses[:, :2, 3]
-    gradient = np.zeros(len(covariance))
-    gradient[problem.layout.landmark[:, 3:5]] = centres / (centres**2).sum()
-    return float(np.sqrt(gradient @ covariance @ gradient))
-
-
 def apparent_sides(
-    turntable: MarkerTurntable, problem: MarkerProblem
+    turntable: Turntable, seen: MarkerObservations
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
     """Each marker's side over the mean of all, if each had its own, and standard deviations (for unit variance).
 
-    One Gauss-Newton step from the adjusted turntable with the logs of the sides as further parameters of mean 0.
+    One Gauss-Newton step from the adjusted turntable, with camera and angles held.
     """
-    free = replace(problem.free, marker_sides=True)
-    with_sides = MarkerProblem(turntable, problem.observations, problem.loss_scale, free)
-    normal, gradient = with_sides.normal_equations(turntable).dense()
-    sides = with_sides.layout.landmark[:, 6]
-    normal[np.ix_(sides, sides)] += normal.diagonal().max() / len(sides)
-    inverse = np.linalg.inv(normal)
-    return np.exp(-(inverse @ gradient)[sides]), np.sqrt(inverse.diagonal()[sides])
+    residuals = MarkerResiduals(turntable, seen, LOSS_SIGMAS, free_sides=True)
+    held = FreeParameters(camera=False, angles=False)
+    (markers,) = Problem(turntable, residuals, free=held).normal_equations(turntable).landmarks
+    inverse = np.linalg.pinv(markers.normal, hermitian=True)
+    logs = -np.einsum("lij,lj->li", inverse, markers.gradient)[:, 6]
+    return np.exp(logs - logs.mean()), np.sqrt(inverse[:, 6, 6])
 
 
-def triangulate_markers(
-    observations: MarkerObservations, camera_to_world: Float[np.ndarray, "n 4 4"], intrinsics: PinholeIntrinsics
-) -> dict[int, Float[np.ndarray, "4 3"]]:
-    """Corners of markers by the rays of all frames, in the poses' unit of length.
+def scale_of(turntable: Turntable, info: SessionInfo) -> tuple[ScaleSource | None, float]:
+    """What gives the scale, None if nothing does; and the length of the turntable's unit in metres, 1 if unknown."""
+    if len(turntable.markers):
+        if info.marker_side_m is not None:
+            return "markers", info.marker_side_m / turntable.side
+        diameter = container_diameter(turntable, None)
+        if info.container_diameter_m is not None and diameter is not None:
+            return "container", info.container_diameter_m / diameter
+    if info.camera_distance_m is not None:
+        return "distance", info.camera_distance_m / turntable.distance
+    return None, 1.0
+
+
+def in_object_frame(
+    adjusted: Adjusted,
+    markers: MarkerObservations | None,
+    names: Sequence[str],
+    size_px: tuple[int, int],
+    info: SessionInfo,
+    **specific: Any,
+) -> TurntablePoses:
+    """The adjusted turntable in the object frame and in metres, frame by frame.
 
     Args:
-        observations: of markers that turn with the object; their frames are rows of ``camera_to_world``.
-        camera_to_world: nan where a frame has no pose.
-        intrinsics: of the camera; lens distortion is ignored.
+        adjusted: in any unit of length.
+        markers: that it was adjusted to.
+        names: of the session's frames.
+        size_px: width and height of the images.
+        info: what is known of the session.
+        specific: what the method itself knows for ``TurntablePoses``.
     """
-    posed = np.isfinite(camera_to_world).all(axis=(1, 2))
-    corners = {}
-    for marker in np.unique(observations.marker).tolist():
-        rows = np.flatnonzero((observations.marker == marker) & posed[observations.frame])
-        if len(rows) < _FEWEST_VIEWS:
-            continue
-        rays = [
-            pixel_rays(intrinsics, camera_to_world[observations.frame[r]], observations.corners_px[r]) for r in rows
-        ]
-        origins, directions = (np.stack(part) for part in zip(*rays, strict=True))
-        corner = np.tile(np.arange(4), (len(rows), 1))
-        points, eigenvalue = closest_point_to_rays(np.repeat(origins[:, None], 4, axis=1), directions, corner)
-        if eigenvalue.min() > _LEAST_EIGENVALUE * len(rows):
-            corners[marker] = points
-    return corners
-
-
-def scale_by_markers(
-    corners: dict[int, Float[np.ndarray, "4 3"]], disc: float, info: SessionInfo
-) -> tuple[Scale | None, float]:
-    """The scale of poses from features, by markers in the same frames.
-
-    Args:
-        corners: of each marker, in the poses' unit of length.
-        disc: height of the disc in that unit.
-        info: the markers' side, the container's size, or the camera's distance.
-
-    Returns:
-        The scale, None where markers do not give it; and the length of the unit in metres, 1 if it is not known.
-    """
-    nothing = None, info.camera_distance_m or 1.0
-    if not corners:
-        return nothing
-    sides = {m: float(np.linalg.norm(c - np.roll(c, 1, axis=0), axis=-1).mean()) for m, c in corners.items()}
-    typical = float(np.median(list(sides.values())))
-    relative = {m: side / typical for m, side in sides.items()}
-    spread = float(np.std(list(relative.values()))) if len(sides) > 1 else 0.0
-    faces = np.stack(list(corners.values()))
-    # Corners go round clockwise from the upper left one, so this points out of the face.
-    normals = np.cross(faces[:, 3] - faces[:, 0], faces[:, 1] - faces[:, 0])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-
-    def diameter(height: float | None) -> float | None:
-        return container_diameter(normals, faces.mean(axis=1), typical, disc, height)
-
-    source: Literal["markers", "container"]
-    if info.marker_side_m is not None:
-        source, metres = "markers", info.marker_side_m / typical
-    elif info.container_diameter_m is not None and (diameter_in_units := diameter(None)) is not None:
-        source, metres = "container", info.container_diameter_m / diameter_in_units
-    else:
-        return nothing
-    measured = diameter(None if info.container_height_m is None else info.container_height_m / metres)
-    scale = Scale(
-        source=source,
-        marker_side_m=typical * metres,
-        uncertainty=spread / np.sqrt(len(sides)),
-        marker_sides=relative,
-        marker_side_sigmas=dict.fromkeys(sides, spread),
-        container_diameter_m=info.container_diameter_m,
-        measured_container_diameter_m=None if measured is None else measured * metres,
+    source, metres = scale_of(adjusted.turntable, info)
+    turntable, n = adjusted.turntable.resized(metres), len(names)
+    to_object = to_object_frame(turntable, disc_height(turntable))
+    corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
+    on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
+    covariance = adjusted.covariance()
+    # In logarithms: the focal length, and the distance where it is no unit of length.
+    lens = np.zeros((2, 2))
+    free = np.intersect1d([0, 4], adjusted.problem.layout.camera)
+    lens[: len(free), : len(free)] = covariance[np.ix_(free, free)]
+    return TurntablePoses(
+        names=tuple(names),
+        intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
+        distortion=(*turntable.radial, 0.0, 0.0),
+        camera_to_world=turntable.over_session(to_object @ turntable.camera_to_world(), n),
+        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
+        used=np.isin(np.arange(n), turntable.frames),
+        marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},
+        disc_markers=tuple(turntable.markers[on_disc].tolist()),
+        disc_tilt_deg=disc_tilt_deg(turntable),
+        model="turntable" if tilts is None else "free poses",
+        wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
+        metric=source is not None,
+        scale=None if source is None else _scale(adjusted, turntable, markers, lens, source, info),
+        uncertainty=Uncertainty(
+            *np.sqrt(lens.diagonal()).tolist(), turntable.over_session(adjusted.angle_sigmas_deg(covariance), n)
+        ),
+        **specific,
     )
-    return scale, metres
+
+
+def _scale(
+    adjusted: Adjusted,
+    turntable: Turntable,
+    markers: MarkerObservations | None,
+    lens: Float[np.ndarray, "2 2"],
+    source: ScaleSource,
+    info: SessionInfo,
+) -> Scale:
+    # A length at the axis is its size in the image times the distance over the focal length, in logarithms.
+    variance = float(lens[0, 0] + lens[1, 1] - 2.0 * lens[0, 1])
+    ids, sides, sigmas = turntable.markers.tolist(), np.ones(len(turntable.markers)), np.zeros(len(turntable.markers))
+    if markers is not None and len(ids) > 1:
+        sides, sigmas = apparent_sides(adjusted.turntable, markers)
+        variance += float(np.var(sides, ddof=1)) / len(ids)
+    return Scale(
+        source=source,
+        marker_side_m=turntable.side if ids else None,
+        uncertainty=float(np.sqrt(variance)),
+        marker_sides=dict(zip(ids, sides.tolist(), strict=True)),
+        marker_side_sigmas=dict(zip(ids, (sigmas * np.sqrt(adjusted.variance)).tolist(), strict=True)),
+        container_diameter_m=info.container_diameter_m,
+        measured_container_diameter_m=container_diameter(turntable, info.container_height_m),
+    )

@@ -12,17 +12,17 @@ from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
-from hsi_sc_nerf.poses.feature_poses import Images, poses_from_angles, poses_from_colmap
+from hsi_sc_nerf.poses.feature_poses import Images, poses_from_features
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 
 PoseMethod: TypeAlias = Literal["auto", "markers", "colmap", "angles"]
 
 FIELD_OF_VIEW_DEG = (4.0, 100.0)
 """Over the image's width, from a long tele lens to a very wide one. Features that give another camera are too few."""
-_ORDER: tuple[Literal["markers", "colmap", "angles"], ...] = ("markers", "colmap", "angles")
+# In the order in which they are tried.
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
 
 
@@ -38,25 +38,16 @@ class KnownCamera:
     """The turntable's turn seen from above; None where the earlier session does not tell."""
 
 
-@dataclass(frozen=True)
-class PoseEstimators:
-    """The functions behind the methods."""
-
-    markers: Callable[..., TurntablePoses] = poses_from_markers
-    colmap: Callable[..., TurntablePoses] = poses_from_colmap
-    angles: Callable[..., TurntablePoses] = poses_from_angles
-
-
 def find_poses(
     images: Images,
     names: Sequence[str],
     info: SessionInfo,
     method: PoseMethod = "auto",
-    config: FeatureConfig | None = None,
     *,
     camera: KnownCamera | None = None,
     progress: bool = True,
-    estimators: PoseEstimators | None = None,
+    from_markers: Callable[..., TurntablePoses] = poses_from_markers,
+    from_features: Callable[..., TurntablePoses] = poses_from_features,
 ) -> TurntablePoses:
     """Poses by one method, or by the first that works; the result tells which was taken and why.
 
@@ -65,10 +56,10 @@ def find_poses(
         names: the frames' names.
         info: what is known of the session: markers, container, nominal step or angles, direction, distance.
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
-        config: settings of poses from features.
         camera: of an earlier session; with known angles, poses then need neither markers nor texture.
         progress: show progress bars.
-        estimators: the functions behind the methods.
+        from_markers: the function behind the method.
+        from_features: likewise.
 
     Raises:
         InputError: the method, or every method, fails; says why.
@@ -78,14 +69,35 @@ def find_poses(
         >>> poses.chosen
         'by markers'
     """
-    find = _Finder(images, names, info, config or FeatureConfig(), camera, progress, estimators or PoseEstimators())
+
+    def by(method: str) -> TurntablePoses:
+        if method == "markers":
+            return from_markers(images, names, info, progress=progress)
+        if method == "colmap":
+            return _checked(from_features(images, names, info))
+        told = info if camera is None else _with_direction(info, camera)
+        angles_deg = known_angles_deg(told, len(names))
+        if angles_deg is None:
+            raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+        if camera is None:
+            return _checked(from_features(images, names, info, angles_deg=angles_deg))
+        height, width = images[0].shape
+        return poses_from_known_camera(names, (width, height), angles_deg, camera)
+
     # Many small systems of equations are solved side by side, which BLAS's own threads would slow down.
     with threadpool_limits(limits=1, user_api="blas"):
-        if method == "auto":
-            return find.first_that_works()
-        if method == "colmap":
-            return find.by_colmap_or_adjusted_angles()
-        return replace(find.by(method), chosen=_as_set(method))
+        if method != "auto":
+            return replace(by(method), chosen=f"by {_NAMES[method]}, as the settings say")
+        failed = []
+        for name, words in _NAMES.items():
+            try:
+                poses = by(name)
+            except InputError as error:
+                failed.append(f"{words}: {str(error).rstrip('.')}")
+                continue
+            why_not = f" (not by {'; nor by '.join(failed)})" if failed else ""
+            return replace(poses, chosen=f"by {words}{why_not}")
+    raise InputError(f"no method finds poses: {'; '.join(failed)}.")
 
 
 def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] | None:
@@ -109,7 +121,6 @@ def poses_from_known_camera(
     size_px: tuple[int, int],
     angles_deg: Float[np.ndarray, "n"],
     camera: KnownCamera,
-    info: SessionInfo,
 ) -> TurntablePoses:
     """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
 
@@ -118,7 +129,6 @@ def poses_from_known_camera(
         size_px: width and height of the images.
         angles_deg: relative to the first frame, counter-clockwise seen from above.
         camera: of the earlier session.
-        info: its nominal step and direction go into the report.
 
     Raises:
         InputError: images of another size than the camera's.
@@ -139,83 +149,11 @@ def poses_from_known_camera(
         used=np.ones(n, bool),
         markers_per_frame=(0,) * n,
         overall_error_px=float("nan"),
-        nominal_step_deg=info.nominal_step_deg,
-        nominal_direction=info.direction,
-        warnings=("poses are as given, by the camera of an earlier session and the angles; nothing was measured",),
+        findings=(
+            Finding("poses-given", "amber", "Poses are as given, by an earlier camera; nothing was measured."),
+        ),
         method="angles",
     )
-
-
-@dataclass(frozen=True)
-class _Finder:
-    """The arguments of ``find_poses``."""
-
-    images: Images
-    names: Sequence[str]
-    info: SessionInfo
-    config: FeatureConfig
-    camera: KnownCamera | None
-    progress: bool
-    estimators: PoseEstimators
-
-    def first_that_works(self) -> TurntablePoses:
-        failed = []
-        for method in _ORDER:
-            try:
-                poses = self.by(method)
-            except InputError as error:
-                failed.append(f"{_NAMES[method]}: {str(error).rstrip('.')}")
-                continue
-            why_not = f" (not by {'; nor by '.join(failed)})" if failed else ""
-            return replace(poses, chosen=f"by {_NAMES[method]}{why_not}")
-        raise InputError(f"no method finds poses: {'; '.join(failed)}.")
-
-    def by_colmap_or_adjusted_angles(self) -> TurntablePoses:
-        """By COLMAP; where that fails, as it may at low resolution, from the known angles, adjusted to features."""
-        try:
-            return replace(self.by("colmap"), chosen=_as_set("colmap"))
-        except InputError as error:
-            angles_deg, failed = known_angles_deg(self.info, len(self.names)), str(error).rstrip(".")
-            if angles_deg is None:
-                raise
-        try:
-            poses = self._from_angles(self.info, angles_deg, free_angles=True)
-        except InputError as error:
-            raise InputError(f"{failed}; nor do features fit the known angles: {error}") from error
-        warning = (
-            f"features gave no poses by themselves ({failed}), so the known angles were taken to start from and "
-            "adjusted; compare them with the nominal steps"
-        )
-        return replace(
-            poses,
-            chosen=f"by features, from known angles that were adjusted (not by {_NAMES['colmap']}: {failed})",
-            warnings=(warning, *poses.warnings),
-        )
-
-    def by(self, method: Literal["markers", "colmap", "angles"]) -> TurntablePoses:
-        if method == "markers":
-            return self.estimators.markers(self.images, self.names, self.info, progress=self.progress)
-        if method == "colmap":
-            return _checked(self.estimators.colmap(self.images, self.names, self.info, self.config))
-        info = self.info if self.camera is None else _with_direction(self.info, self.camera)
-        angles_deg = known_angles_deg(info, len(self.names))
-        if angles_deg is None:
-            raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
-        if self.camera is None:
-            return self._from_angles(info, angles_deg, free_angles=False)
-        height, width = self.images[0].shape
-        return poses_from_known_camera(self.names, (width, height), angles_deg, self.camera, info)
-
-    def _from_angles(
-        self, info: SessionInfo, angles_deg: Float[np.ndarray, "n"], *, free_angles: bool
-    ) -> TurntablePoses:
-        return _checked(
-            self.estimators.angles(self.images, self.names, angles_deg, info, self.config, free_angles=free_angles)
-        )
-
-
-def _as_set(method: str) -> str:
-    return f"by {_NAMES[method]}, as the settings say"
 
 
 def _checked(poses: TurntablePoses) -> TurntablePoses:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 
 
@@ -22,17 +23,21 @@ class RejectedMarker:
     why: str
 
 
+ScaleSource: TypeAlias = Literal["markers", "container", "distance"]
+
+
 @dataclass(frozen=True)
 class Scale:
     """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
 
-    source: Literal["markers", "container"]
-    marker_side_m: float
-    """As given; as measured against the container where that gives the scale."""
+    source: ScaleSource
+    """The markers' side, the container that carries markers, or the given distance of the camera."""
+    marker_side_m: float | None
+    """As given, or as measured; None without markers."""
     uncertainty: float
     """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
     marker_sides: dict[int, float]
-    """Each marker's apparent side over the mean of all; empty for a single marker."""
+    """Each marker's apparent side over the mean of all."""
     marker_side_sigmas: dict[int, float]
     """Standard deviations of these."""
     container_diameter_m: float | None
@@ -91,9 +96,8 @@ class TurntablePoses:
     disc_markers: tuple[int, ...] = ()
     disc_tilt_deg: float | None = None
     loop_closure_deg: float | None = None
-    nominal_step_deg: float | None = None
-    nominal_direction: Literal["ccw", "cw"] | None = None
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    """What the method found beside the poses."""
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
     chosen: str = ""

@@ -6,11 +6,10 @@ inks are transparent beyond 700 nm.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -21,7 +20,7 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
-from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 GRAY = "gray"
 """The mean over the range in which markers are printed to be seen; it is there always."""
@@ -56,15 +55,15 @@ _WORKERS = 2
 
 @dataclass(frozen=True, eq=False)
 class FramePictures:
-    """Pictures of one frame by their names, all of one size, linear in reflectance.
+    """Pictures of one frame, all of one size, linear in reflectance.
 
     Attributes:
-        pictures: by name.
+        picture: the picture of a name.
         scores: by the names of those in which markers are looked for, best first (``edge_precision``).
         flagged: pixels with so many flagged values that the best picture does not measure them well; None if all are.
     """
 
-    pictures: Mapping[str, UInt8[np.ndarray, "h w"]]
+    picture: Callable[[str], UInt8[np.ndarray, "h w"]]
     scores: Mapping[str, float]
     flagged: Bool[np.ndarray, "h w"] | None = None
 
@@ -76,77 +75,35 @@ class FramePictures:
     @property
     def ill_exposed(self) -> Bool[np.ndarray, "h w"]:
         """Pixels of the best picture that are black, clipped or flagged."""
-        best = self.pictures[self.ranking[0]]
+        best = self.picture(self.ranking[0])
         clipped = (best == 0) | (best == 255)
         return clipped if self.flagged is None else clipped | self.flagged
-
-
-class LazyMapping(Mapping[str, UInt8[np.ndarray, "h w"]]):
-    """Pictures that are computed once, at the first access; safe for several threads."""
-
-    def __init__(
-        self,
-        names: Sequence[str],
-        make: Callable[[str], UInt8[np.ndarray, "h w"]],
-        made: Mapping[str, UInt8[np.ndarray, "h w"]],
-    ) -> None:
-        """Args:
-        names: of all pictures.
-        make: makes the picture of a name.
-        made: pictures that are there already.
-        """
-        self._names = tuple(names)
-        self._make = make
-        self._made = dict(made)
-        self._lock = threading.Lock()
-
-    def __getitem__(self, name: str) -> UInt8[np.ndarray, "h w"]:
-        with self._lock:
-            if name not in self._made:
-                if name not in self._names:
-                    raise KeyError(name)
-                self._made[name] = self._make(name)
-            return self._made[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._names
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
 
 
 class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
     """All frames' pictures; as a sequence, of each frame the one in which its edges stand out best."""
 
-    def __init__(self, frames: Sequence[FramePictures], features: str = GRAY) -> None:
-        """Args:
-        frames: in order.
-        features: name of the pictures on which features are measured.
-        """
+    def __init__(self, frames: Sequence[FramePictures]) -> None:
         self.frames = tuple(frames)
-        self.features = features
 
     @classmethod
     def of(cls, images: Sequence[UInt8[np.ndarray, "h w"]]) -> SessionPictures:
         """Session pictures as they are; plain images as sessions that show one picture a frame."""
         if isinstance(images, SessionPictures):
             return images
-        return cls([FramePictures({GRAY: image}, {GRAY: 1.0}) for image in images])
+        return cls([FramePictures({GRAY: image}.__getitem__, {GRAY: 1.0}) for image in images])
 
     def named(self, name: str) -> SessionPictures:
         """The picture of that name of every frame, as the only one in which it is shown."""
-        alone = [FramePictures(frame.pictures, {name: frame.scores.get(name, 1.0)}) for frame in self.frames]
-        return SessionPictures(alone, name)
+        alone = [FramePictures(frame.picture, {name: frame.scores.get(name, 1.0)}) for frame in self.frames]
+        return SessionPictures(alone)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __getitem__(self, index):
         frame = self.frames[index]
-        return frame.pictures[frame.ranking[0]]
+        return frame.picture(frame.ranking[0])
 
 
 def check_frames(images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str]) -> None:
@@ -170,7 +127,6 @@ def frame_pictures(
     flags_path: Path,
     gray: UInt8[np.ndarray, "h w"],
     gray_nm: tuple[float, float],
-    extra_nm: Mapping[str, float],
 ) -> FramePictures:
     """Pictures of a packed frame: scored from a few bands of each group, computed from all at the first access.
 
@@ -179,7 +135,6 @@ def frame_pictures(
         flags_path: its pixels' flags (docs/reference/files.md).
         gray: the mean over ``gray_nm``, made when the frame was packed.
         gray_nm: its range.
-        extra_nm: further single bands by name; they are not searched for markers.
     """
     cube = open_cube(cube_path)
     wavelengths_nm = cube.wavelengths_nm
@@ -198,14 +153,14 @@ def frame_pictures(
         for name, mean in zip(members, means, strict=True)
     }
     best_first = sorted(scores, key=lambda name: -scores[name] * (_CLEARLY_BETTER if name == GRAY else 1.0))
-    for name, nm in extra_nm.items():
-        members[name] = np.arange(len(wavelengths_nm)) == nearest_bands(wavelengths_nm, [nm])[0]
-    pictures = LazyMapping(
-        tuple(members), lambda name: _picture(cube.memmap(), flags_path, members[name]), {GRAY: gray}
-    )
+
+    @cache
+    def picture(name: str) -> UInt8[np.ndarray, "h w"]:
+        return gray if name == GRAY else _picture(cube.memmap(), flags_path, members[name])
+
     best_well = well[best_first[0]]
     return FramePictures(
-        pictures, {name: scores[name] for name in best_first}, None if best_well.all() else ~best_well
+        picture, {name: scores[name] for name in best_first}, None if best_well.all() else ~best_well
     )
 
 
@@ -234,13 +189,12 @@ def read_pictures(
     flags_paths: Sequence[Path],
     grays: Sequence[UInt8[np.ndarray, "h w"]],
     gray_nm: tuple[float, float],
-    feature_nm: float | None,
 ) -> SessionPictures:
-    """``frame_pictures`` of all frames; features are measured in the band nearest to ``feature_nm``, if given."""
-    extra_nm = {} if feature_nm is None else {f"{feature_nm:g} nm": feature_nm}
+    """``frame_pictures`` of all frames."""
     with ThreadPoolExecutor(_WORKERS) as pool:
-        one = partial(frame_pictures, gray_nm=gray_nm, extra_nm=extra_nm)
-        return SessionPictures(list(pool.map(one, cube_paths, flags_paths, grays)), *extra_nm)
+        return SessionPictures(
+            list(pool.map(partial(frame_pictures, gray_nm=gray_nm), cube_paths, flags_paths, grays))
+        )
 
 
 def group_means(

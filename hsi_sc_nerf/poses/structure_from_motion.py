@@ -7,8 +7,7 @@ and ``turntable_from_poses`` fits one turntable to them.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,8 +15,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, ellipse_close_open, touching
@@ -37,6 +34,8 @@ _FEWEST_NEIGHBOURS = 3
 # bundle adjustment of the turntable finds it.
 _FOCAL_FACTOR = 1.5
 _SEED = 0
+# Least contrast of a SIFT feature: less than COLMAP's 0.0067, for skin is smooth.
+_PEAK_THRESHOLD = 0.004
 # Standard deviation of the Gaussian that lowers the images' noise, pixels.
 _SMOOTHING_PX = 1.0
 # A pixel moves if its brightness varies over the frames by more than so many times the noise, and by more than this
@@ -53,17 +52,6 @@ _LEAST_AREA_FRACTION = 0.0005
 _BRIGHTNESS_CLASSES = 16
 # At least this fraction of a class stands still; otherwise a brighter class gives its noise.
 _STILL_FRACTION = 0.1
-
-
-@dataclass(frozen=True)
-class FeatureConfig:
-    """Settings of poses from features of the object."""
-
-    band_nm: float | None = None
-    """Detect features in the band nearest to this wavelength, nm, in which the object shows patterns; by default in
-    the mean of the visible bands."""
-    peak_threshold: float = 0.004
-    """Least contrast of a SIFT feature; a smaller one finds more features on smooth skin, and more noise."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +75,6 @@ class FreePoses:
 def structure_from_motion(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     names: Sequence[str],
-    config: FeatureConfig | None = None,
     *,
     moving: Bool[np.ndarray, "h w"] | None = None,
 ) -> FreePoses:
@@ -96,35 +83,36 @@ def structure_from_motion(
     Args:
         images: one gray image per frame in the order of the turn, all of one size.
         names: the frames' names, for messages.
-        config: settings; the defaults suit fruit of 512 x 512 pixels in 20 to 60 frames.
         moving: where features are detected; by default ``moving_pixels``.
 
     Raises:
         InputError: nothing moves, or the object has too little texture to pose three frames.
         ValueError: images of different sizes, or not one name per image.
     """
-    with _matched(images, names, config, moving) as folder:
+    check_frames(images, names)
+    moving = moving_pixels(images) if moving is None else moving
+    if not moving.any():
+        raise InputError(
+            f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "
+            "between the frames, and that the object has some texture"
+        )
+    # The images are stretched to the contrast of what moves.
+    low, high = np.percentile(np.stack(images)[:, moving], _STRETCH_PERCENTILES)
+    table = np.rint(np.clip((np.arange(256) - low) / max(high - low, 1.0), 0.0, 1.0) * 255.0).astype(np.uint8)
+    with tempfile.TemporaryDirectory(prefix="hsi-sc-nerf-colmap-") as name:
+        folder = Path(name)
+        (folder / "images").mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
+        cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
+        _match(folder, len(images), images[0].shape)
         reconstruction = _map(folder)
         if reconstruction is None:
-            raise _too_little_texture(names)
+            raise InputError(
+                f"the frames {names[0]} ... {names[-1]} show too little texture to find poses from features; take "
+                "markers or smaller steps"
+            )
         return _free_poses(reconstruction, len(names))
-
-
-def matched_tracks(
-    images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str], config: FeatureConfig | None = None
-) -> Tracks:
-    """Features that several frames share, without any pose: enough where the turntable's angles are known.
-
-    Matches are joined to tracks. A track with two pixels in one frame is a mistake and left out.
-
-    Raises:
-        InputError, ValueError: as ``structure_from_motion``.
-    """
-    with _matched(images, names, config, None) as folder:
-        tracks = _joined(folder)
-    if len(tracks) == 0:
-        raise _too_little_texture(names)
-    return tracks
 
 
 def moving_pixels(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
@@ -160,36 +148,6 @@ def neighbour_pairs(frames: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(frames) for j in range(i + 1, frames) if min(j - i, frames - (j - i)) <= most]
 
 
-@contextmanager
-def _matched(images, names, config, moving) -> Iterator[Path]:
-    """A temporary folder with COLMAP's database of features and matches, after checks of the input."""
-    check_frames(images, names)
-    moving = moving_pixels(images) if moving is None else moving
-    if not moving.any():
-        raise InputError(
-            f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "
-            "between the frames, and that the object has some texture"
-        )
-    # The images are stretched to the contrast of what moves.
-    low, high = np.percentile(np.stack(images)[:, moving], _STRETCH_PERCENTILES)
-    table = np.rint(np.clip((np.arange(256) - low) / max(high - low, 1.0), 0.0, 1.0) * 255.0).astype(np.uint8)
-    with tempfile.TemporaryDirectory(prefix="hsi-sc-nerf-colmap-") as name:
-        folder = Path(name)
-        (folder / "images").mkdir()
-        for i, image in enumerate(images):
-            cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
-        cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
-        _match(folder, len(images), images[0].shape, config or FeatureConfig())
-        yield folder
-
-
-def _too_little_texture(names):
-    return InputError(
-        f"the frames {names[0]} ... {names[-1]} show too little texture to find poses from features; take markers, "
-        "smaller steps, or a band in which the object shows patterns"
-    )
-
-
 def _file_name(frame: int) -> str:
     return f"{frame:05d}.png"
 
@@ -198,7 +156,7 @@ def _frame_of(file_name: str) -> int:
     return int(Path(file_name).stem)
 
 
-def _match(folder: Path, frames: int, shape: tuple[int, ...], config: FeatureConfig) -> None:
+def _match(folder: Path, frames: int, shape: tuple[int, ...]) -> None:
     """Features of all images, and those that neighbours in the turn share, into the folder's database."""
     import pycolmap
 
@@ -210,7 +168,7 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: FeatureCon
     reader.camera_params = f"{_FOCAL_FACTOR * width},{width / 2},{height / 2}"
     reader.camera_mask_path = str(folder / "mask.png")
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.peak_threshold = config.peak_threshold
+    extraction.sift.peak_threshold = _PEAK_THRESHOLD
     # Images are numbered here, in their order: extraction would number them as its threads come along.
     pycolmap.Database.open(folder / "database.db").close()
     pycolmap.import_images(
@@ -238,30 +196,6 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], config: FeatureCon
         verification_options=verification,
         device=pycolmap.Device.cpu,
     )
-
-
-def _joined(folder: Path) -> Tracks:
-    """Tracks of the verified matches in the folder's database."""
-    import pycolmap
-
-    with pycolmap.Database.open(folder / "database.db") as database:
-        images = {image.image_id: _frame_of(image.name) for image in database.read_all_images()}
-        keypoints = {i: database.read_keypoints(i)[:, :2] for i in images}
-        pairs, geometries = database.read_two_view_geometries()
-    order = sorted(images, key=images.__getitem__)
-    first = dict(zip(order, np.cumsum([0] + [len(keypoints[i]) for i in order[:-1]]).tolist(), strict=True))
-    links = [np.zeros((0, 2), int)]
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        links.append(geometry.inlier_matches.astype(int) + [first[i] for i in pycolmap.pair_id_to_image_pair(pair)])
-    a, b = np.concatenate(links).T
-    frame = np.concatenate([np.full(len(keypoints[i]), images[i]) for i in order])
-    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(frame), len(frame)))
-    track = connected_components(graph, directed=False)[1]
-    _, one, twice = np.unique(np.stack([track, frame]), axis=1, return_inverse=True, return_counts=True)
-    contradicts = np.isin(track, track[twice[one.ravel()] > 1])
-    keep = (np.bincount(track)[track] > 1) & ~contradicts
-    _, point = np.unique(track[keep], return_inverse=True)
-    return Tracks(frame[keep], point, np.concatenate([keypoints[i] for i in order])[keep].astype(float))
 
 
 def _map(folder: Path) -> pycolmap.Reconstruction | None:

@@ -6,21 +6,18 @@ Features alone give no scale: the unit of length is the distance between camera 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, ParameterLayout, Problem, loop_closure_deg
-from hsi_sc_nerf.poses.turntable import (
-    FEWEST_FRAMES,
-    Jacobian,
-    PointTurntable,
-    Tracks,
-    project,
-    projection_jacobian,
-)
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, loop_closure_deg
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
@@ -28,14 +25,15 @@ _LOSS_PX = 0.1
 # Far from the solution a small loss scale holds on to what fits by chance.
 _FIRST_LOSS_PX = 1.0
 _SMALLEST_GAIN = 1e-6
-# Points nearer to the camera's plane than this, in distances of the camera, are behind it.
-_NEAREST_DEPTH = 1e-3
 # Outliers are farther than this many standard deviations, measured on the residuals, and than this, pixels.
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
 _OUTLIER_ROUNDS = 4
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
+_LEAST_MARKER_OUTLIER_PX = 0.5
+# A marker whose rays are nearly parallel is not placed.
+_LEAST_EIGENVALUE = 1e-3
 # Points seen in fewer frames, and frames that show fewer points, are left out.
 _FEWEST_VIEWS = 3
 _FEWEST_POINTS = 8
@@ -50,7 +48,7 @@ _NEAR_FRACTION = 0.5
 class AdjustedTracks:
     """The adjusted turntable, and how well it explains the tracks."""
 
-    turntable: PointTurntable
+    turntable: Turntable
     tracks: Tracks
     """The rows that were used."""
     outliers: Bool[np.ndarray, "n"]
@@ -74,10 +72,10 @@ class AdjustedTracks:
 
     def loop_closure_deg(self) -> float | None:
         """What is left of a full turn after adding up the steps between neighbouring frames."""
-        return loop_closure_deg(PointProblem(self.turntable, self.tracks, _LOSS_PX), self.turntable)
+        return loop_closure_deg(PointResiduals(self.turntable, self.tracks, _LOSS_PX), self.turntable)
 
 
-def adjust_tracks(start: PointTurntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
+def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
     """Adjust camera, angles and points to the tracks, reject outliers, and adjust again.
 
     Args:
@@ -89,10 +87,12 @@ def adjust_tracks(start: PointTurntable, tracks: Tracks, *, free_angles: bool = 
         InputError: too few tracks fit to determine an axis.
     """
 
-    def adjusted(turntable: PointTurntable, kept: Tracks, loss_px: float) -> PointTurntable:
+    def adjusted(turntable: Turntable, kept: Tracks, loss_px: float) -> Turntable:
         turntable = turntable.restricted(kept)
-        problem = PointProblem(turntable, kept, loss_px, FreeParameters(angles=free_angles))
-        return problem.minimise(turntable, _SMALLEST_GAIN)
+        free = FreeParameters(distance=False, angles=free_angles)
+        return Problem(turntable, PointResiduals(turntable, kept, loss_px), free=free).minimise(
+            turntable, _SMALLEST_GAIN
+        )
 
     good = _enough(tracks, start.knows(tracks))
     turntable = adjusted(start, tracks.select(good), _FIRST_LOSS_PX)
@@ -107,6 +107,41 @@ def adjust_tracks(start: PointTurntable, tracks: Tracks, *, free_angles: bool = 
         fits[np.flatnonzero(good)[outlier]] = False
         good = _enough(tracks, fits)
     return AdjustedTracks(turntable, kept, ~good)
+
+
+def adjust_with_markers(
+    found: AdjustedTracks, markers: MarkerObservations | None, *, free_angles: bool = True
+) -> tuple[Adjusted, MarkerObservations | None]:
+    """Adjust tracks and markers together, which tells focal length and distance from each other.
+
+    Args:
+        found: the turntable adjusted to the tracks alone.
+        markers: seen in its frames; their side is in any unit.
+        free_angles: as ``adjust_tracks``.
+
+    Returns:
+        The turntable, with markers if they determine their places; and the markers that it was adjusted to.
+    """
+    sigma_px = float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
+    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    free = FreeParameters(distance=False, angles=free_angles)
+    start = found.turntable
+    if markers is not None and len(markers):
+        start = with_markers(start, markers)
+        markers = markers.select(start.knows(markers))
+    if markers is None or not len(markers):
+        return Adjusted(start, Problem(start, points(start), free=free)), None
+    free = replace(free, distance=True)
+    for last in (False, True):
+        problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
+        start = problem.minimise(start, _SMALLEST_GAIN)
+        away_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
+        fits = away_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(away_px)))
+        if last or fits.all():
+            break
+        markers = markers.select(fits)
+        start = start.restricted(found.tracks, markers)
+    return Adjusted(start, problem), markers
 
 
 def split_half_error_deg(found: AdjustedTracks, *, free_angles: bool = True) -> float | None:
@@ -127,7 +162,7 @@ def split_half_error_deg(found: AdjustedTracks, *, free_angles: bool = True) -> 
     return float(np.rad2deg(Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()) / 2.0)
 
 
-def with_lost_frames(turntable: PointTurntable, tracks: Tracks) -> PointTurntable:
+def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:
     """Add the frames that structure from motion lost or got wrong, at the angle that suits their points.
 
     All angles are tried, for a turntable may have stopped or jumped; a frame on whose points no angle agrees stays
@@ -143,42 +178,35 @@ def with_lost_frames(turntable: PointTurntable, tracks: Tracks) -> PointTurntabl
     return replace(turntable, frames=frames, angles_rad=angles[0] + np.unwrap(angles - angles[0]))
 
 
-class PointProblem(Problem[PointTurntable]):
-    """Points of the object, in pixels. The loss is that of a residual's length. The distance to the axis is held."""
-
-    def __init__(
-        self, start: PointTurntable, tracks: Tracks, loss_px: float, free: FreeParameters | None = None
-    ) -> None:
-        """Args:
-        start: a turntable that has the frames and points of the tracks.
-        tracks: observed points.
-        loss_px: residuals well above this count by their length, not its square.
-        free: parameters to adjust; by default camera, angles and landmarks.
-        """
-        free = free or FreeParameters()
-        frame, point = start.rows(tracks)
-        layout = ParameterLayout.of(free, len(start.frames), len(start.points), 4, 3)
-        super().__init__(layout, frame, point, free, loss_px)
-        self.tracks = tracks
-
-    def residuals(self, turntable: PointTurntable) -> Float[np.ndarray, "n 1 2"]:
-        """Reprojection errors, infinite for a point behind the camera."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
-        return np.where(behind, np.inf, projection.pixels - self.tracks.pixels)[:, None]
-
-    def jacobian(self, turntable: PointTurntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
-        """By the point's coordinates."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        jacobian = projection_jacobian(turntable, self.frame, projection)
-        return jacobian, jacobian.point
-
-    def with_landmark_step(self, turntable: PointTurntable, step: Float[np.ndarray, "p 3"]) -> PointTurntable:
-        """The turntable with its points shifted."""
-        return replace(turntable, points_3d=turntable.points_3d + step)
+def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
+    """The turntable with the markers that its rays determine, in its unit of length, all of one side."""
+    poses, marker_corners = turntable.camera_to_world(), {}
+    size = np.array(turntable.centre_px) * 2.0
+    camera = PinholeIntrinsics(*size.astype(int).tolist(), *[turntable.focal_px] * 2, *turntable.centre_px)
+    for marker in np.unique(seen.marker).tolist():
+        rows = np.flatnonzero((seen.marker == marker) & np.isin(seen.frame, turntable.frames))
+        frames = np.searchsorted(turntable.frames, seen.frame[rows])
+        rays = [pixel_rays(camera, poses[f], seen.corners_px[r]) for f, r in zip(frames, rows, strict=True)]
+        if len(rays) < 2:
+            continue
+        origins, directions = (np.stack(part) for part in zip(*rays, strict=True))
+        corner = np.tile(np.arange(4), (len(rows), 1))
+        corners, eigenvalue = closest_point_to_rays(np.repeat(origins[:, None], 4, axis=1), directions, corner)
+        if eigenvalue.min() > _LEAST_EIGENVALUE * len(rows):
+            marker_corners[marker] = corners
+    faces = np.array(list(marker_corners.values())).reshape(-1, 4, 3)
+    right, up = faces[:, 1] + faces[:, 2] - faces[:, 0] - faces[:, 3], faces[:, 0] - faces[:, 3]
+    normal = np.cross(right, up)
+    marker_poses = np.tile(np.eye(4), (len(faces), 1, 1))
+    axes = np.stack([right, np.cross(normal, right), normal], axis=-1)
+    marker_poses[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    marker_poses[:, :3, 3] = faces.mean(axis=1)
+    sides = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=-1)
+    side = float(np.median(sides)) if len(faces) else 1.0
+    return replace(turntable, side=side, markers=np.array(list(marker_corners), int), marker_poses=marker_poses)
 
 
-def _search_angle(turntable: PointTurntable, seen: Tracks) -> float | None:
+def _search_angle(turntable: Turntable, seen: Tracks) -> float | None:
     """The angle (rad) at which the points of one frame are nearest to their projections; None without agreement."""
     if len(seen) < _FEWEST_POINTS:
         return None

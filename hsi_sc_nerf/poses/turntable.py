@@ -10,7 +10,7 @@ where tilt_i and the shift s_i are small motions of a wobbling table; a perfect 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,8 +23,8 @@ FEWEST_FRAMES = 3
 """Fewer frames do not determine a turntable's axis."""
 
 
-class _Rows:
-    """Arrays with one row per observation."""
+class _Sightings:
+    """Arrays with one row for each sighting of a landmark in a frame: the frame, the landmark's number, the rest."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
@@ -35,8 +35,8 @@ class _Rows:
 
 
 @dataclass(frozen=True)
-class MarkerObservations(_Rows):
-    """Corners of markers in frames, one row per marker and frame. Pixel origin: the image's upper left corner."""
+class MarkerObservations(_Sightings):
+    """Corners of markers in frames. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
     marker: Int[np.ndarray, "n"]
@@ -54,19 +54,24 @@ class MarkerObservations(_Rows):
 
 
 @dataclass(frozen=True)
-class Tracks(_Rows):
-    """Points of the object seen in several frames, one row per point and frame. Pixel origin as above."""
+class Tracks(_Sightings):
+    """Points of the object in frames. Pixel origin as above."""
 
     frame: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
     pixels: Float[np.ndarray, "n 2"]
 
 
+def _no_numbers() -> Int[np.ndarray, "0"]:
+    return np.zeros(0, int)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Turntable:
-    """Camera and motion. Lengths are metres, or distances of the camera from the axis where no scale is known.
+    """Camera, motion, and landmarks that turn with the object: square markers and points.
 
-    ``frames``, ascending, are the session's frames that the rows of ``angles_rad`` (and of the motions) belong to.
+    Lengths are metres, or distances of the camera from the axis where no scale is known. ``frames``, ascending, are
+    the session's frames that the rows of ``angles_rad`` (and of the motions) belong to.
     """
 
     focal_px: float
@@ -84,6 +89,15 @@ class Turntable:
     tilts_rad: Float[np.ndarray, "f 2"] | None = None
     """Rotation vectors (x, y, 0) of a wobbling table; None for a table that does not wobble."""
     shifts: Float[np.ndarray, "f 3"] | None = None
+    side: float = 1.0
+    """Of the markers' black square."""
+    markers: Int[np.ndarray, "m"] = field(default_factory=_no_numbers)
+    """Ids, ascending."""
+    marker_poses: Float[np.ndarray, "m 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """Marker to object."""
+    points: Int[np.ndarray, "p"] = field(default_factory=_no_numbers)
+    """The tracks' numbers of the points, ascending."""
+    points_3d: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
         """Rotation T and shift s of the object in each frame."""
@@ -122,41 +136,36 @@ class Turntable:
         rows[self.frames] = values
         return rows
 
-    def _selected_frames(self, frame: Int[np.ndarray, "n"]) -> Self:
-        keep = np.isin(self.frames, frame)
+    def rows(self, seen: MarkerObservations | Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Rows of ``frames``, and of ``markers`` or ``points``, that the sightings belong to."""
+        known, landmark = self._landmarks(seen)
+        return np.searchsorted(self.frames, seen.frame), np.searchsorted(known, landmark)
+
+    def knows(self, seen: MarkerObservations | Tracks) -> np.ndarray:
+        """Mask of the sightings whose frame and landmark the turntable has."""
+        known, landmark = self._landmarks(seen)
+        return np.isin(seen.frame, self.frames) & np.isin(landmark, known)
+
+    def restricted(self, *seen: MarkerObservations | Tracks) -> Turntable:
+        """The turntable with only the frames and landmarks that are seen; angles keep their zero."""
+        keep = np.isin(self.frames, np.concatenate([sightings.frame for sightings in seen]))
+        of_kind = [
+            [self._landmarks(s)[1] for s in seen if isinstance(s, kind)] for kind in (MarkerObservations, Tracks)
+        ]
+        markers, points = (
+            np.isin(known, np.concatenate([_no_numbers(), *found]))
+            for known, found in zip((self.markers, self.points), of_kind, strict=True)
+        )
         return replace(
             self,
             frames=self.frames[keep],
             angles_rad=self.angles_rad[keep],
             tilts_rad=None if self.tilts_rad is None else self.tilts_rad[keep],
             shifts=None if self.shifts is None else self.shifts[keep],
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class MarkerTurntable(Turntable):
-    """A turntable with square markers, in metres."""
-
-    side_m: float
-    """Of the markers' black square."""
-    markers: Int[np.ndarray, "m"]
-    """Ids, ascending."""
-    marker_poses: Float[np.ndarray, "m 4 4"]
-    """Marker to object."""
-
-    def rows(self, seen: MarkerObservations) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of ``frames`` and of ``markers`` that the observations belong to."""
-        return np.searchsorted(self.frames, seen.frame), np.searchsorted(self.markers, seen.marker)
-
-    def knows(self, seen: MarkerObservations) -> np.ndarray:
-        """Mask of the observations whose frame and marker the turntable has."""
-        return np.isin(seen.frame, self.frames) & np.isin(seen.marker, self.markers)
-
-    def restricted(self, seen: MarkerObservations) -> MarkerTurntable:
-        """The turntable with only the frames and markers that are observed; angles keep their zero."""
-        keep = np.isin(self.markers, seen.marker)
-        return replace(
-            self._selected_frames(seen.frame), markers=self.markers[keep], marker_poses=self.marker_poses[keep]
+            markers=self.markers[markers],
+            marker_poses=self.marker_poses[markers],
+            points=self.points[points],
+            points_3d=self.points_3d[points],
         )
 
     def corners(self) -> Float[np.ndarray, "m 4 3"]:
@@ -165,51 +174,32 @@ class MarkerTurntable(Turntable):
 
     def corner_offsets(self) -> Float[np.ndarray, "m 4 3"]:
         """Corners relative to their marker's centre, in the object's axes."""
-        return np.einsum("mij,kj->mki", self.marker_poses[:, :3, :3], square_corners(self.side_m))
+        return np.einsum("mij,kj->mki", self.marker_poses[:, :3, :3], square_corners(self.side))
 
-    def reproject(self, seen: MarkerObservations) -> Float[np.ndarray, "n 4 2"]:
-        """Pixels of the corners of each observation."""
-        frame, marker = self.rows(seen)
-        return project(self, np.repeat(frame, 4), self.corners()[marker].reshape(-1, 3)).pixels.reshape(-1, 4, 2)
+    def reproject(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n *corners 2"]:
+        """Pixels of each sighting: of a marker's four corners, or of a point."""
+        frame, landmark = self.rows(seen)
+        if isinstance(seen, Tracks):
+            return project(self, frame, self.points_3d[landmark]).pixels
+        corners = self.corners()[landmark].reshape(-1, 3)
+        return project(self, np.repeat(frame, 4), corners).pixels.reshape(-1, 4, 2)
 
-    def resized(self, factor: float) -> MarkerTurntable:
+    def resized(self, factor: float) -> Turntable:
         """The turntable with all lengths times a factor: its images stay the same."""
         poses = self.marker_poses.copy()
         poses[:, :3, 3] *= factor
         return replace(
             self,
             distance=self.distance * factor,
-            side_m=self.side_m * factor,
+            side=self.side * factor,
             marker_poses=poses,
+            points_3d=self.points_3d * factor,
             shifts=None if self.shifts is None else self.shifts * factor,
         )
 
-
-@dataclass(frozen=True, kw_only=True)
-class PointTurntable(Turntable):
-    """A turntable with points of the object. Its unit of length is the distance of the camera from the axis."""
-
-    points: Int[np.ndarray, "p"]
-    """The tracks' numbers of the points, ascending."""
-    points_3d: Float[np.ndarray, "p 3"]
-
-    def rows(self, tracks: Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of ``frames`` and of ``points`` that the tracks' rows belong to."""
-        return np.searchsorted(self.frames, tracks.frame), np.searchsorted(self.points, tracks.point)
-
-    def knows(self, tracks: Tracks) -> np.ndarray:
-        """Mask of the tracks' rows whose frame and point the turntable has."""
-        return np.isin(tracks.frame, self.frames) & np.isin(tracks.point, self.points)
-
-    def restricted(self, tracks: Tracks) -> PointTurntable:
-        """The turntable with only the frames and points of the tracks; angles keep their zero."""
-        keep = np.isin(self.points, tracks.point)
-        return replace(self._selected_frames(tracks.frame), points=self.points[keep], points_3d=self.points_3d[keep])
-
-    def reproject(self, tracks: Tracks) -> Float[np.ndarray, "n 2"]:
-        """Pixels of each row of the tracks."""
-        frame, point = self.rows(tracks)
-        return project(self, frame, self.points_3d[point]).pixels
+    def _landmarks(self, seen):
+        """The turntable's landmarks of this kind, and those that are seen."""
+        return (self.points, seen.point) if isinstance(seen, Tracks) else (self.markers, seen.marker)
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,18 @@ the axis, so q is known well even where a frame's rotation and position are wron
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import (
-    Similarity,
     closest_point_to_rays,
     cross_matrix,
     rotation_about_z,
     rotation_angle_deg,
 )
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, PointTurntable
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
 _CONTRADICTS_DEG = 3.0
@@ -35,41 +32,12 @@ _LEAST_TURN_DEG = 2.0
 _ROUNDS = 10
 
 
-@dataclass(frozen=True)
-class TurntableFit:
-    """The turntable nearest to free poses. Angles are relative to the first fitted frame, unwrapped over the frames.
-
-    Attributes:
-        transform: from the poses' world to the turntable frame, with the camera's distance as the unit of length.
-        distance: of the camera from the axis, in the poses' unit of length.
-        camera_rotation: from the turntable frame to OpenCV's camera axes, at the angle 0.
-        angles_rad: counter-clockwise seen from above; nan for frames without a pose and for those that contradict.
-        contradicts: frames whose pose contradicts the others'.
-    """
-
-    transform: Similarity
-    distance: float
-    camera_rotation: Float[np.ndarray, "3 3"]
-    angles_rad: Float[np.ndarray, "n"]
-    contradicts: Bool[np.ndarray, "n"]
-
-    def turntable(
-        self, points_3d: Float[np.ndarray, "p 3"], focal_px: float, centre_px: tuple[float, float]
-    ) -> PointTurntable:
-        """The start for ``adjust_tracks``: the fitted frames, and points of the poses' world, numbered by row."""
-        frames = np.flatnonzero(np.isfinite(self.angles_rad))
-        return PointTurntable(
-            focal_px=focal_px,
-            centre_px=centre_px,
-            camera_rotation=self.camera_rotation,
-            frames=frames,
-            angles_rad=self.angles_rad[frames],
-            points=np.arange(len(points_3d)),
-            points_3d=self.transform(points_3d),
-        )
-
-
-def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> TurntableFit:
+def turntable_from_poses(
+    world_to_camera: Float[np.ndarray, "n 4 4"],
+    points_3d: Float[np.ndarray, "p 3"],
+    focal_px: float,
+    centre_px: tuple[float, float],
+) -> tuple[Turntable, Bool[np.ndarray, "n"]]:
     """The axis, the camera before it and one angle per frame that fit free poses best.
 
     The axis comes from the frames that most pairs of frames agree with; single wrong poses do no harm. Poses alone
@@ -77,6 +45,13 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
 
     Args:
         world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
+        points_3d: points of the poses' world.
+        focal_px: of the camera.
+        centre_px: its principal point.
+
+    Returns:
+        The turntable with the points, numbered by row, in distances of the camera from the axis; its first frame has
+        the angle 0. And the frames whose pose contradicts the others', which it lacks.
 
     Raises:
         InputError: fewer than three poses, or poses that do not turn about one axis.
@@ -112,18 +87,20 @@ def turntable_from_poses(world_to_camera: Float[np.ndarray, "n 4 4"]) -> Turntab
     first = int(np.flatnonzero(good)[0])
     # The frame's x belongs to the angle 0 of `base`; turn it to the first fitted frame.
     to_turntable = rotation_about_z(np.rad2deg(angles[first]))[:3, :3] @ at_zero
-    angles_rad, contradicts = np.full(len(posed), np.nan), np.zeros(len(posed), bool)
-    angles_rad[np.flatnonzero(posed)[good]] = np.unwrap(angles[good]) - angles[first]
+    contradicts = np.zeros(len(posed), bool)
     contradicts[posed] = ~good
     # The axis' point at the camera's height.
     origin = on_axis + (camera @ axis) * axis
-    return TurntableFit(
-        transform=Similarity(1.0 / distance, to_turntable, -to_turntable @ origin / distance),
-        distance=distance,
+    turntable = Turntable(
+        focal_px=focal_px,
+        centre_px=centre_px,
         camera_rotation=base @ at_zero.T,
-        angles_rad=angles_rad,
-        contradicts=contradicts,
+        frames=np.flatnonzero(posed)[good],
+        angles_rad=np.unwrap(angles[good]) - angles[first],
+        points=np.arange(len(points_3d)),
+        points_3d=(points_3d - origin) @ to_turntable.T / distance,
     )
+    return turntable, contradicts
 
 
 def _agreeing(rotations):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,14 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
+from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import KnownCamera, PoseMethod
 from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures, read_pictures
-from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
+from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
 from hsi_sc_nerf.processing.frames import FramePaths
 
 _log = logging.getLogger(__name__)
@@ -51,13 +52,13 @@ def pose_frames(
     info: SessionInfo,
     camera: KnownCamera | None,
     method: PoseMethod,
-    config: FeatureConfig,
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
     marker_range_nm: tuple[float, float] = (450.0, 700.0),
+    accepted: Collection[str] = (),
 ) -> TurntablePoses:
-    """Find the poses, write ``poses.json`` and its figure, and print what was found.
+    """Find and check the poses, write ``poses.json`` and its figure, and print what was found.
 
     Args:
         session: its frames are packed under ``output_dir``.
@@ -68,33 +69,40 @@ def pose_frames(
         output_dir: the dataset.
         console: prints.
         marker_range_nm: range in which the markers' ink is visible.
+        accepted: names of checks whose red findings the user accepts.
 
     Raises:
-        InputError: no method finds poses, or the operating system refused to write.
+        InputError: no method finds poses, a check of them is red, or the operating system refused to write.
     """
     names = [capture.name for capture in session.frames]
     # Known angles before a known camera need no images.
     pictures = None
     if method != "angles" or camera is None:
         paths = [FramePaths.of(output_dir, name) for name in names]
-        pictures = read_pictures(
-            [p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm, config.band_nm
-        )
+        pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm)
     try:
         poses = find_poses(
             pictures or images,
             names,
             info=info,
             method=method,
-            config=config,
             camera=camera,
             progress=not console.quiet,
         )
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
-    report = pose_report(poses) | {"pictures": None if pictures is None else _pictures_report(names, pictures, poses)}
+    findings = check_poses(poses, info)
+    report = pose_report(poses, info, findings)
+    if pictures is not None:
+        report["pictures"] = {
+            "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},
+            "edge_precision_per_px": {
+                name: {picture: round(score, 1) for picture, score in frame.scores.items()}
+                for name, frame in zip(names, pictures.frames, strict=True)
+            },
+        }
     write_json(output_dir / "poses.json", report)
-    draw_poses(poses, output_dir / "report" / "poses.png")
+    draw_poses(poses, report, output_dir / "report" / "poses.png")
     console.print(f"Poses {poses.chosen}: {', '.join(describe_poses(poses, report))}.", highlight=False)
     if pictures is not None and poses.method == "markers":
         best = Counter(frame.ranking[0] for frame in pictures.frames)
@@ -102,9 +110,10 @@ def pose_frames(
             seen_in = ", ".join(f"{name} ({count} frames)" for name, count in best.most_common())
             console.print(f"Markers stand out best in {seen_in}.", highlight=False)
     for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
-        console.print(f"Warning: {warning}.", highlight=False)
+        console.print(f"Warning: {warning}", highlight=False)
     for name in np.array(names)[~poses.used]:
         _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
+    refuse_red(findings, accepted)
     return poses
 
 
@@ -138,18 +147,6 @@ def container_under(session: Session, poses: TurntablePoses) -> Container | None
     return Container(diameter_m, height_m)
 
 
-def _pictures_report(names: Sequence[str], pictures: SessionPictures, poses: TurntablePoses) -> dict:
-    """The picture of the features, and the edge precision of each frame's pictures, best first."""
-    return {
-        "features": None if poses.method == "markers" else pictures.features,
-        "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},
-        "edge_precision_per_px": {
-            name: {picture: round(score, 1) for picture, score in frame.scores.items()}
-            for name, frame in zip(names, pictures.frames, strict=True)
-        },
-    }
-
-
 def known_camera(earlier: PackedDataset) -> KnownCamera:
     """The camera of a dataset that was made before with the same camera and turntable, at the angle 0."""
     first = earlier.frames[0]
@@ -171,6 +168,6 @@ def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[
         return []
     rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
     return [
-        f"the turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
-        f"{session.info_path} to have them upright"
+        f"The turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
+        f"{session.info_path} to have them upright."
     ]

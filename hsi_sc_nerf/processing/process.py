@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+import tyro
 from rich.console import Console
 
 from hsi_sc_nerf import paper
@@ -24,6 +25,9 @@ from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, Sessi
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.findings import refuse_red
+from hsi_sc_nerf.inspection.inspect import inspect_session
+from hsi_sc_nerf.inspection.session_json import suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
     Container,
@@ -36,13 +40,11 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
-    check_scale,
     container_under,
     known_camera,
     pose_frames,
@@ -68,8 +70,6 @@ class ProcessConfig:
     poses: PoseMethod = "auto"
     """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
     angles that session.json gives (angles); or by the first of these that works (auto)."""
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    """Poses from features."""
     camera: Path | None = None
     """An earlier dataset of the same camera and turntable: with known angles and its camera, poses need neither
     markers nor texture."""
@@ -79,6 +79,12 @@ class ProcessConfig:
     """Markers are detected in the mean image of these bands, nm: many inks are transparent beyond 700 nm."""
     workers: int = 2
     """Number of frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
+    exclude: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Name of a capture to leave out; may be given several times."""
+    skip_damaged: bool = False
+    """Leave out captures that are empty, short or unlike the others, and name them."""
+    accept: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Name of a check whose red finding is accepted; may be given several times."""
 
 
 def process_session(
@@ -121,14 +127,14 @@ def process_session(
     # Square brackets and colons in a folder's name are no markup.
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
 
-    session = open_session(session_dir)
+    session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
     fingerprint = session_fingerprint(session, config, _named_files(config))
     if _is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    check_scale(session, info, camera, config.poses)
+    session = _checked(session, config, console)
     _remove_transforms(output_dir)
 
     calibration = _calibrate(session, config, output_dir, console)
@@ -150,7 +156,6 @@ def process_session(
         info,
         camera,
         config.poses,
-        config.features,
         output_dir,
         console,
         estimate_poses,
@@ -191,6 +196,27 @@ def process_session(
     write_transforms(dataset)
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir
+
+
+def _checked(session: Session, config: ProcessConfig, console: Console) -> Session:
+    """The session, upright, after the checks of `inspect_session`.
+
+    Raises:
+        InputError: a finding is red and not accepted.
+    """
+    for name, reason in session.damaged.items():
+        console.print(f"Left out: {name} ({reason.split('; ')[0]}).", highlight=False)
+    with console.status("checking the session"):
+        scale_known = config.marker_side_m is not None or config.camera is not None
+        inspection = inspect_session(session, config.poses, scale_known)
+    findings = [finding for finding in inspection.findings if finding.name != "damaged"]
+    for finding in findings:
+        if finding.level == "amber" or finding.name in config.accept:
+            console.print(f"Warning ({finding.name}): {finding.sentence}", highlight=False)
+        if finding.name == "scale" and finding.level == "red" and not session.info_path.is_file():
+            console.print(suggestion(session, inspection.session_json), highlight=False)
+    refuse_red(findings, config.accept)
+    return inspection.session
 
 
 def _named_files(config: ProcessConfig) -> list[Path]:

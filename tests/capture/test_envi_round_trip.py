@@ -100,7 +100,7 @@ def test_every_variation_of_header_and_data(
     np.testing.assert_array_equal(read, cube)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     shape=shapes,
     envi_type=st.sampled_from(sorted(TYPES)),
@@ -118,12 +118,17 @@ def test_what_is_written_is_read(tmp_path_factory, shape, envi_type, interleave,
         wavelengths_nm=wavelengths_nm,
         interleave=interleave,
         data_suffix=suffix,
-        extra_header={"tint": 12.5, "data ignore value": 3, "bbl": [int(i > 0) for i in range(shape[2])]},
+        extra_header={
+            "tint": 12.5,
+            "data ignore value": 3,
+            "reflectance scale factor": 200,
+            "bbl": [int(i > 0) for i in range(shape[2])],
+        },
     )
     opened = open_cube(path)
     assert (opened.shape, opened.interleave) == (shape, interleave)
     assert opened.dtype == cube.dtype.newbyteorder("<")
-    assert (opened.integration_time_ms, opened.ignore_value, opened.reflectance_scale) == (12.5, 3.0, 1.0)
+    assert (opened.integration_time_ms, opened.ignore_value, opened.reflectance_scale) == (12.5, 3.0, 200.0)
     assert opened.good_bands.tolist() == [i > 0 for i in range(shape[2])]
     assert opened.fwhm_nm is None
     np.testing.assert_array_equal(opened.read(), cube)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_factory import BANDS, INFO, SIZE_PX, WAVELENGTHS_NM, write_capture, write_session
-from spectral.io import envi as spy
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import is_session, open_session
@@ -60,55 +59,104 @@ def test_is_session(tmp_path):
     assert is_session(tmp_path)
 
 
-def test_missing_and_empty_folders(tmp_path):
-    with pytest.raises(InputError, match="no such session folder"):
-        open_session(tmp_path / "absent")
-    with pytest.raises(InputError, match="holds no captures"):
-        open_session(tmp_path)
-
-
-def test_no_white_reference(tmp_path):
-    for name in ("a", "b"):
-        write_capture(tmp_path, name, COUNTS)
-    with pytest.raises(InputError, match="no capture called white_reference"):
-        open_session(tmp_path)
-
-
-@pytest.mark.parametrize(("frames", "words"), [(["a"], "a single frame"), ([], "no frames")])
-def test_too_few_frames(tmp_path, frames, words):
-    for name in (*frames, "white_reference"):
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["a", "white_reference"], "a single frame"),
+        (["white_reference"], "no frames"),
+        (["a", "b"], "no capture called white_reference"),
+        ([], "holds no captures"),
+    ],
+)
+def test_captures_that_make_no_session(tmp_path, names, words):
+    for name in names:
         write_capture(tmp_path, name, COUNTS)
     with pytest.raises(InputError, match=words):
         open_session(tmp_path)
+    with pytest.raises(InputError, match="no such session folder"):
+        open_session(tmp_path / "absent")
 
 
-def test_a_capture_folder_without_its_cube(tmp_path):
+def other_bands(session: Path, name: str) -> None:
+    write_capture(session, name, COUNTS, wavelengths_nm=WAVELENGTHS_NM + 0.5)
+
+
+def fewer_bands(session: Path, name: str) -> None:
+    write_capture(session, name, COUNTS[..., 1:], wavelengths_nm=WAVELENGTHS_NM[1:])
+
+
+def no_header(session: Path, name: str) -> None:
+    (session / name / "capture" / f"{name}.hdr").unlink()
+
+
+def no_bytes(session: Path, name: str) -> None:
+    (session / name / "capture" / f"{name}.raw").write_bytes(b"")
+
+
+def no_capture_folder(session: Path, name: str) -> None:
+    (session / name / "capture").rename(session / name / "cubes")
+
+
+DAMAGE = {
+    other_bands: r"2\.hdr: its bands differ.*ball_1\.hdr",
+    fewer_bands: r"2\.hdr: its bands differ",
+    lambda session, name: write_capture(session, name, COUNTS[1:]): r"2\.hdr: its \(47, 48\) lines and samples",
+    no_header: r"ball_2: has no capture/ball_2\.hdr",
+    no_bytes: r"ball_2\.raw: has 0 bytes, fewer",
+    no_capture_folder: r"ball_2: has no folder capture/",
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE.items())
+def test_a_damaged_capture_is_named_or_left_out(tmp_path, damage, message):
     write_session(tmp_path)
-    (tmp_path / "ball_3" / "capture" / "ball_3.hdr").unlink()
-    with pytest.raises(InputError, match=r"ball_3: has no capture/ball_3\.hdr"):
+    damage(tmp_path, "ball_2")
+    with pytest.raises(InputError, match=message + ".*--skip-damaged"):
         open_session(tmp_path)
+    session = open_session(tmp_path, skip_damaged=True)
+    assert [frame.name for frame in session.frames] == ["ball_1", "ball_3", "ball_4"]
+    assert list(session.damaged) == ["ball_2"]
+    assert not open_session(tmp_path, exclude=["ball_2"]).damaged
 
 
-@pytest.mark.parametrize("name", ["ball_2", "white_reference"])
-def test_other_wavelengths(tmp_path, name):
+def test_all_damaged_captures_are_named_at_once_and_the_first_frame_may_be_one(tmp_path):
+    write_session(tmp_path, angles_deg=(0, 60, 120, 180, 240))
+    no_bytes(tmp_path, "ball_1")
+    no_header(tmp_path, "ball_4")
+    fewer_bands(tmp_path, "ball_5")
+    with pytest.raises(InputError, match=r"3 captures.*ball_4 \(.*ball_1 \(.*0 bytes.*ball_5 \("):
+        open_session(tmp_path)
+    assert [frame.name for frame in open_session(tmp_path, skip_damaged=True).frames] == ["ball_2", "ball_3"]
+
+
+def test_a_damaged_white_is_not_left_out(tmp_path):
     write_session(tmp_path)
-    write_capture(tmp_path, name, COUNTS, wavelengths_nm=WAVELENGTHS_NM + 0.5)
-    with pytest.raises(InputError, match=rf"{name}\.hdr: its bands differ.*ball_1\.hdr"):
-        open_session(tmp_path)
+    no_bytes(tmp_path, "white_reference")
+    with pytest.raises(InputError, match=r"white_reference\.raw: has 0 bytes"):
+        open_session(tmp_path, skip_damaged=True)
 
 
-def test_other_band_count(tmp_path):
+@pytest.mark.parametrize("specim", [True, False])
+def test_everything_in_the_folder_is_accounted_for(tmp_path, specim):
+    write_session(tmp_path, specim=specim)
+    (tmp_path / "notes").mkdir()
+    session = open_session(tmp_path, exclude=["ball_3"])
+    assert [frame.name for frame in session.frames] == ["ball_1", "ball_2", "ball_4"]
+    assert (session.excluded, list(session.skipped)) == (("ball_3",), ["notes"])
+    with pytest.raises(InputError, match="has no capture ball_33"):
+        open_session(tmp_path, exclude=["ball_33"])
+
+
+def test_a_cube_without_header_is_named(tmp_path):
+    write_session(tmp_path, specim=False)
+    (tmp_path / "ball_3.hdr").unlink()
+    assert list(open_session(tmp_path, skip_damaged=True).damaged) == ["ball_3.raw"]
+
+
+def test_opening_reads_no_data(tmp_path, monkeypatch):
     write_session(tmp_path)
-    write_capture(tmp_path, "ball_4", COUNTS[..., 1:], wavelengths_nm=WAVELENGTHS_NM[1:])
-    with pytest.raises(InputError, match=r"ball_4\.hdr: its bands differ"):
-        open_session(tmp_path)
-
-
-def test_other_size(tmp_path):
-    write_session(tmp_path)
-    write_capture(tmp_path, "ball_2", COUNTS[1:])
-    with pytest.raises(InputError, match=r"ball_2\.hdr: its \(47, 48\) lines and samples differ"):
-        open_session(tmp_path)
+    monkeypatch.setattr(np, "memmap", None)
+    open_session(tmp_path)
 
 
 def test_two_shared_dark_cubes(tmp_path):
@@ -146,7 +194,7 @@ def test_wavelengths_of_a_list_beside_session_json(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("wavelength_nm\n400\n500\n", "the list of 2 band centres does not fit its 12 bands"),
+        ("wavelength_nm\n400\n500\n", "2 band centres do not fit"),
         ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
         ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
         ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
@@ -175,17 +223,6 @@ def test_no_wavelengths_anywhere(tmp_path):
         open_session(tmp_path)
 
 
-def test_opening_reads_each_header_once_and_no_data(tmp_path, monkeypatch):
-    write_session(tmp_path)
-    read = []
-    monkeypatch.setattr(
-        spy, "read_envi_header", lambda file, real=spy.read_envi_header: read.append(file) or real(file)
-    )
-    monkeypatch.setattr(np, "memmap", None)
-    open_session(tmp_path)
-    assert sorted(read) == sorted(str(path) for path in tmp_path.rglob("*.hdr"))
-
-
 def test_session_info_round_trip(tmp_path):
     path = tmp_path / "session.json"
     path.write_text(json.dumps({**INFO, "nominal_step_deg": 10, "direction": "cw", "marker_dictionary": None}))
@@ -197,7 +234,7 @@ def test_session_info_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "no JSON"),
+        ("{", "no JSON object"),
         ("[]", "no JSON object"),
         ('{"marker_size": 1}', "does not know the key marker_size"),
         ('{"marker_side_m": "2 cm"}', "marker_side_m is '2 cm'"),

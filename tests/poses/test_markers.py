@@ -25,7 +25,7 @@ def truth_and_images(**options):
 
 @pytest.fixture(scope="module")
 def small():
-    return truth_and_images(size_px=128, noise=0.005)
+    return truth_and_images(size_px=128, frames=2, noise=0.005)
 
 
 def fits(truth, images, blur_px=0.0):
@@ -50,7 +50,7 @@ def test_detected_corners_count_from_the_images_corner(width):
 @pytest.mark.slow
 def test_fitted_corners_are_good_to_hundredths_of_a_pixel(small):
     found = [(truth, start, fitted) for truth, start, fitted in fits(*small) if fitted is not None]
-    assert len(found) >= 12
+    assert len(found) >= 6
     before = np.sqrt(np.mean([(start - truth) ** 2 for truth, start, _ in found]))
     after = np.sqrt(np.mean([(fitted.corners_px - truth) ** 2 for truth, _, fitted in found]))
     assert after < 0.06

@@ -1,42 +1,50 @@
-"""The scale of poses from features, by the markers that are seen all the same."""
+"""What the disc, the container and the scale are by the markers."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
+from exact_turntable import SIDE_M, marker_turntable
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.poses.object_frame import scale_by_markers
+from hsi_sc_nerf.poses.object_frame import container_diameter, lie_on_disc, scale_of
 
-UNIT_M = 0.37
-"""Length of the unit that features leave lengths in."""
 WALL_M = 2 * 0.0455
 """Diameter of the circle that the scene's upright markers touch."""
+UNIT_M = 0.37
 
 
-def corners():
-    return {marker: places / UNIT_M for marker, places in MarkerScene(size_px=64, frames=2).corners_m.items()}
+@pytest.fixture(scope="module")
+def turntable():
+    return marker_turntable(MarkerScene(size_px=64, frames=2))
 
 
-def side_m():
-    first = next(iter(MarkerScene(size_px=64, frames=2).corners_m.values()))
-    return float(((first[0] - first[1]) ** 2).sum() ** 0.5)
+def test_disc_is_the_lowest_group_that_faces_up(turntable):
+    np.testing.assert_array_equal(lie_on_disc(turntable.corners()), turntable.markers >= 6)
 
 
-def test_the_markers_side_gives_the_scale_and_the_container_is_measured_against_it():
-    info = SessionInfo(marker_side_m=side_m(), container_diameter_m=1.02 * WALL_M, container_height_m=0.07)
-    scale, metres = scale_by_markers(corners(), 0.0, info)
-    assert metres == pytest.approx(UNIT_M)
-    assert scale.source == "markers"
-    assert scale.measured_container_diameter_m == pytest.approx(WALL_M)
-    assert scale.disagreement_percent == pytest.approx(100 * (1 / 1.02 - 1))
+@pytest.mark.parametrize("shift_m", [0.0, 0.01])
+def test_the_container_is_measured_by_its_markers(turntable, shift_m):
+    poses = turntable.marker_poses.copy()
+    poses[:, 0, 3] += shift_m
+    turntable = replace(turntable, marker_poses=poses)
+    assert container_diameter(turntable, 0.07) == pytest.approx(WALL_M, abs=1e-9)
+    assert container_diameter(turntable.resized(1.7), None) == pytest.approx(1.7 * WALL_M, abs=1e-9)
+    assert container_diameter(turntable, 0.02) is None
 
 
-def test_without_the_side_the_container_gives_the_scale():
-    scale, metres = scale_by_markers(corners(), 0.0, SessionInfo(container_diameter_m=WALL_M))
-    assert metres == pytest.approx(UNIT_M)
-    assert scale.source == "container"
-    assert scale.marker_side_m == pytest.approx(side_m())
-
-
-def test_with_neither_there_is_the_cameras_distance_or_nothing():
-    assert scale_by_markers(corners(), 0.0, SessionInfo(camera_distance_m=0.4)) == (None, 0.4)
-    assert scale_by_markers({}, 0.0, SessionInfo(marker_side_m=0.03)) == (None, 1.0)
+@pytest.mark.parametrize(
+    ("info", "source"),
+    [
+        (SessionInfo(marker_side_m=SIDE_M, container_diameter_m=1.02 * WALL_M, camera_distance_m=1.0), "markers"),
+        (SessionInfo(container_diameter_m=WALL_M, camera_distance_m=1.0), "container"),
+        (SessionInfo(camera_distance_m=UNIT_M), "distance"),
+    ],
+)
+def test_scale_comes_from_the_best_that_is_known(turntable, info, source):
+    unscaled = turntable.resized(UNIT_M / turntable.distance if source == "distance" else 1.0).resized(1.0 / UNIT_M)
+    assert scale_of(unscaled, info) == (source, pytest.approx(UNIT_M))
+    assert scale_of(unscaled, SessionInfo()) == (None, 1.0)
+    bare = replace(unscaled, markers=unscaled.markers[:0], marker_poses=unscaled.marker_poses[:0])
+    assert scale_of(bare, replace(info, camera_distance_m=None)) == (None, 1.0)

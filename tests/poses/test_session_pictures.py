@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -23,9 +22,9 @@ from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
-from hsi_sc_nerf.poses import session_pictures
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
@@ -39,7 +38,6 @@ from hsi_sc_nerf.poses.session_pictures import (
     frame_pictures,
     group_means,
 )
-from hsi_sc_nerf.poses.structure_from_motion import FeatureConfig
 from hsi_sc_nerf.processing.posed_frames import pose_frames
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -85,32 +83,13 @@ def test_scores_from_a_few_bands_are_those_of_all(many_bands, tmp_path):
     assert frame.ranking[0] == "near infrared"
 
 
-def test_pictures_are_made_of_all_bands_when_they_are_asked_for(many_bands, tmp_path, monkeypatch):
+def test_pictures_are_the_means_of_all_their_bands(many_bands, tmp_path):
     cube, wavelengths_nm = many_bands
-    made = []
-
-    def counted(packed, members):
-        made.append(members)
-        return group_means(packed, members)
-
-    monkeypatch.setattr(session_pictures, "group_means", counted)
     frame = pictures_of(cube, wavelengths_nm, tmp_path)
-    assert "red" in frame.pictures
-    assert "x-ray" not in frame.pictures
-    assert frame.pictures[GRAY].shape == cube.shape[:2]
-    assert set(frame.pictures) == {GRAY, *BAND_GROUPS_NM, "860 nm"}
-    assert len(frame.pictures) == 7
-    (few,) = made
-    assert few.sum(axis=1).tolist() == [8] * 6
     red = bands(wavelengths_nm, *BAND_GROUPS_NM["red"])
-    with ThreadPoolExecutor(4) as pool:
-        shown = list(pool.map(frame.pictures.__getitem__, ["red"] * 8))
-    assert len(made) == 2
-    np.testing.assert_array_equal(made[1], red[None])
-    assert all(picture is shown[0] for picture in shown)
-    np.testing.assert_allclose(shown[0], 255.0 * cube[..., red].mean(-1), atol=0.51)
-    with pytest.raises(KeyError):
-        frame.pictures["x-ray"]
+    np.testing.assert_allclose(frame.picture("red"), 255.0 * cube[..., red].mean(-1), atol=0.51)
+    assert frame.picture("red") is frame.picture("red")
+    assert set(frame.ranking) == {GRAY, *BAND_GROUPS_NM}
 
 
 def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anyway(many_bands, tmp_path):
@@ -118,12 +97,12 @@ def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anywa
     cube = cube.copy()
     cube[:10, :20] = np.nan
     frame = pictures_of(cube, wavelengths_nm, tmp_path)
-    assert (frame.pictures["red"][:10, :20] == 255).all()
+    assert (frame.picture("red")[:10, :20] == 255).all()
     np.testing.assert_array_equal(np.argwhere(frame.flagged), np.argwhere(np.isnan(cube[..., 0])))
     assert frame.ill_exposed[:10, :20].all()
     cv2.imwrite(str(tmp_path / "c.png"), np.zeros((80, 100), np.uint8))
-    frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.pictures[GRAY], GRAY_NM, {})
-    assert (frame.pictures["red"][:10, :20] == 0).all()
+    frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.picture(GRAY), GRAY_NM)
+    assert (frame.picture("red")[:10, :20] == 0).all()
     assert frame.ill_exposed[:10, :20].all()
 
 
@@ -192,24 +171,14 @@ def pictures_of(cube, wavelengths_nm, folder):
     cv2.imwrite(str(folder / "c.png"), flags)
     # As when the frame is packed: what is saturated has its clipped value.
     gray = np.nan_to_num(cube[..., bands(wavelengths_nm, *GRAY_NM)], nan=0.6).mean(axis=-1)
-    return frame_pictures(folder / "c.hdr", folder / "c.png", to_8_bit(gray), GRAY_NM, {"860 nm": 860.0})
-
-
-def test_the_broad_mean_is_best_where_nothing_is_wrong(pear, tmp_path):
-    reflectance, wavelengths_nm, _ = pear
-    pictures = pictures_of(spoilt(reflectance[0], wavelengths_nm, ()), wavelengths_nm, tmp_path)
-    assert pictures.ranking[0] == GRAY
-    assert set(pictures.ranking) == {GRAY, *BAND_GROUPS_NM}
-    nearest = np.abs(wavelengths_nm - 860.0).argmin()
-    np.testing.assert_array_equal(
-        pictures.pictures["860 nm"], to_8_bit(np.clip(reflectance[0][..., nearest].astype(np.float32), 0, 1))
-    )
+    return frame_pictures(folder / "c.hdr", folder / "c.png", to_8_bit(gray), GRAY_NM)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "best", "worse"),
     [
+        ((), {GRAY}, ()),
         (("blue is noisy",), {GRAY, "green", "red", "red edge", "near infrared"}, ("blue",)),
         (("near infrared is blurred",), {GRAY}, ("near infrared",)),
         (("the visible is saturated",), {"red edge", "near infrared"}, ("green", "blue", GRAY)),
@@ -245,7 +214,10 @@ def machine():
 def two_pictures(best, other):
     """Session pictures whose first picture is called red, and whose second is the broad mean."""
     return SessionPictures(
-        [FramePictures({"red": a, GRAY: b}, {"red": 2.0, GRAY: 1.0}) for a, b in zip(best, other, strict=True)]
+        [
+            FramePictures({"red": a, GRAY: b}.__getitem__, {"red": 2.0, GRAY: 1.0})
+            for a, b in zip(best, other, strict=True)
+        ]
     )
 
 
@@ -276,8 +248,8 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     )
 
 
-def test_ink_that_the_best_picture_does_not_show_is_found_in_the_broad_mean(machine):
-    images = machine[1][:2]
+def test_ink_that_the_best_picture_does_not_show_is_found_in_the_broad_mean():
+    images = MarkerScene(size_px=128, frames=1).render()
     blank = [np.full_like(image, 100) for image in images]
     assert find_dictionary(blank) is None
     assert find_dictionary(two_pictures(blank, images)) == DICTIONARY
@@ -318,30 +290,17 @@ def test_plain_images_are_sessions_of_one_picture_a_frame():
     assert SessionPictures.of(session) is session
     assert len(session) == 3
     assert [int(image[0, 0]) for image in session] == [0, 1, 2]
-    assert session.named(session.features)[2] is images[2]
+    assert session.named(GRAY)[2] is images[2]
 
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
 
 
-@pytest.fixture(scope="module")
-def packed(tmp_path_factory):
-    """A session of a ball, and its packed frames."""
-    folder = tmp_path_factory.mktemp("ball")
-    session = write_session(folder / "session", ANGLES_DEG)
-    return open_session(session), process_session(session, folder / "data", progress=False, estimate_poses=true_poses)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("features", "name"),
-    [
-        (FeatureConfig(), GRAY),
-        (FeatureConfig(band_nm=760.0), "760 nm"),
-    ],
-)
-def test_the_packed_frames_pictures_are_read_and_reported(packed, features, name):
-    session, data = packed
+def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
+    folder = write_session(tmp_path / "session", ANGLES_DEG)
+    session = open_session(folder)
+    data = process_session(folder, tmp_path / "data", progress=False, estimate_poses=true_poses)
     got = []
 
     def poses(images, names, **_):
@@ -351,22 +310,19 @@ def test_the_packed_frames_pictures_are_read_and_reported(packed, features, name
     grays = [
         to_8_bit(frame_reflectance(angle)[..., bands(WAVELENGTHS_NM, *GRAY_NM)].mean(-1)) for angle in ANGLES_DEG
     ]
-    pose_frames(session, grays, SessionInfo(), None, "colmap", features, data, Console(quiet=True), poses)
+    pose_frames(session, grays, SessionInfo(), None, "colmap", data, Console(quiet=True), poses)
     (pictures,) = got
     report = json.loads((data / "poses.json").read_text())["pictures"]
-    assert report["features"] == pictures.features
     assert list(report["best"].values()) == [frame.ranking[0] for frame in pictures.frames]
-    assert pictures.features == name
-    expected = {
-        GRAY: lambda cube: cube[..., bands(WAVELENGTHS_NM, *GRAY_NM)].mean(-1),
-        "760 nm": lambda cube: cube[..., np.abs(WAVELENGTHS_NM - 760.0).argmin()],
-    }
-    for image, angle in zip(pictures.named(name), ANGLES_DEG, strict=True):
-        np.testing.assert_allclose(image, 255.0 * expected[name](frame_reflectance(angle)), atol=1.5)
+    infrared = bands(WAVELENGTHS_NM, *BAND_GROUPS_NM["near infrared"])
+    for frame, gray, angle in zip(pictures.frames, grays, ANGLES_DEG, strict=True):
+        np.testing.assert_array_equal(frame.picture(GRAY), gray)
+        expected = 255.0 * frame_reflectance(angle)[..., infrared].mean(-1)
+        np.testing.assert_allclose(frame.picture("near infrared"), expected, atol=1.5)
 
 
-def test_pictures_are_not_read_where_nothing_is_measured(packed):
-    session, data = packed
+def test_pictures_are_not_read_where_nothing_is_measured(tmp_path):
+    session = open_session(write_session(tmp_path / "session", ANGLES_DEG))
     blank = [np.zeros((48, 48), np.uint8)] * 4
     camera = KnownCamera(INTRINSICS, (0.0, 0.0, 0.0, 0.0), true_pose(0.0))
     got = []
@@ -376,6 +332,11 @@ def test_pictures_are_not_read_where_nothing_is_measured(packed):
         return replace(true_poses(images, names), method="angles")
 
     info = SessionInfo(nominal_step_deg=90.0)
-    pose_frames(session, blank, info, camera, "angles", FeatureConfig(), data, Console(quiet=True), poses)
+    pose_frames(session, blank, info, camera, "angles", tmp_path, Console(quiet=True), poses)
     assert got == [blank]
-    assert json.loads((data / "poses.json").read_text())["pictures"] is None
+    assert "pictures" not in json.loads((tmp_path / "poses.json").read_text())
+    cw = replace(info, direction="cw")
+    with pytest.raises(InputError, match="--accept poses-direction"):
+        pose_frames(session, blank, cw, camera, "angles", tmp_path, Console(quiet=True), poses)
+    accepted = ["poses-direction"]
+    pose_frames(session, blank, cw, camera, "angles", tmp_path, Console(quiet=True), poses, accepted=accepted)

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exact_turntable import point_tracks, point_turntable
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.track_adjustment import PointProblem, adjust_tracks, split_half_error_deg, with_lost_frames
-from hsi_sc_nerf.poses.turntable import PointTurntable, Tracks, project
-from hsi_sc_nerf.poses.turntable_from_angles import turntable_from_angles
+from hsi_sc_nerf.poses.track_adjustment import adjust_tracks, split_half_error_deg, with_lost_frames
+from hsi_sc_nerf.poses.turntable import Turntable
 
 SIZE_PX = 256
 FOCAL_PX = 460.0
@@ -18,33 +17,18 @@ FOCAL_PX = 460.0
 
 def machine(angles_deg, points=150, seed=0, radial=(0.0, 0.0), elevation_deg=24.0):
     """A camera that looks down on patterns of an upright body, a little beside its axis and a little rolled."""
-    rng = np.random.default_rng(seed)
     c, s = np.cos(np.deg2rad(elevation_deg)), np.sin(np.deg2rad(elevation_deg))
     base = np.array([[0.0, 1.0, 0.0], [s, 0.0, -c], [-c, 0.0, -s]])
     rotation = Rotation.from_euler("xyz", [1.0, -2.0, 3.0], degrees=True).as_matrix() @ base
-    azimuth, height = rng.uniform(0, 2 * np.pi, points), rng.uniform(-0.6, -0.25, points)
-    radius = rng.uniform(0.1, 0.16, points)
-    points_3d = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1)
-    angles = np.deg2rad(np.asarray(angles_deg, float))
-    return PointTurntable(
+    turntable = Turntable(
         focal_px=FOCAL_PX,
         centre_px=(128.0, 128.0),
         radial=radial,
         camera_rotation=rotation,
-        frames=np.arange(len(angles)),
-        angles_rad=angles,
-        points=np.arange(points),
-        points_3d=points_3d,
+        frames=np.arange(len(angles_deg)),
+        angles_rad=np.deg2rad(np.asarray(angles_deg, float)),
     )
-
-
-def sightings(turntable, noise_px=0.0, seed=1):
-    """Tracks of the points in the frames where they face the camera."""
-    turn = Rotation.from_rotvec(np.outer(turntable.angles_rad, [0, 0, 1])).as_matrix()
-    in_room = np.einsum("fij,pj->fpi", turn, turntable.points_3d)
-    frame, point = np.nonzero(in_room[..., 0] > 0.03)
-    pixels = project(turntable, frame, turntable.points_3d[point]).pixels
-    return Tracks(frame, point, pixels + noise_px * np.random.default_rng(seed).normal(size=pixels.shape))
+    return point_turntable(turntable, points, seed)
 
 
 def disturbed(turntable, seed=2):
@@ -68,37 +52,16 @@ def pose_error_deg(found, true):
 @pytest.mark.parametrize("angles_deg", [np.arange(0, 360, 18.0), -np.arange(0, 200, 14.0)])
 def test_exact_tracks_give_the_exact_machine(angles_deg):
     true = machine(angles_deg)
-    found = adjust_tracks(disturbed(true), sightings(true))
-    assert not found.outliers[np.bincount(sightings(true).point)[sightings(true).point] >= 3].any()
+    found = adjust_tracks(disturbed(true), point_tracks(true))
+    assert not found.outliers[np.bincount(point_tracks(true).point)[point_tracks(true).point] >= 3].any()
     assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
     assert pose_error_deg(found.turntable, true) < 0.02
     assert found.overall_error_px < 0.01
 
 
-def test_derivatives_are_those_of_the_projection():
-    true = machine(np.arange(0, 100, 20.0), points=12, radial=(-0.1, 0.05))
-    tracks = sightings(true)
-    problem = PointProblem(true, tracks, 1.0, FreeParameters(radial_terms=2))
-    layout = problem.layout
-    jacobian, by_point = problem.jacobian(true)
-    columns, values = problem.motion_jacobian(jacobian)
-    for k in range(layout.size):
-        step = 1e-6 * np.eye(layout.size)[k]
-        there, back = (
-            problem.moved(true, sign * step[: layout.motion_size], sign * step[layout.landmark]).reproject(tracks)
-            for sign in (1.0, -1.0)
-        )
-        if k < layout.motion_size:
-            expected = (values * (columns == k)[:, None]).sum(-1)
-        else:
-            expected = (by_point * (layout.landmark[problem.landmark] == k)[:, None]).sum(-1)
-        numeric = (there - back) / 2e-6
-        np.testing.assert_allclose(numeric, expected, atol=1e-4 * np.abs(numeric).max())
-
-
 def test_wrong_sightings_are_thrown_out():
     true = machine(np.arange(0, 360, 18.0))
-    tracks = sightings(true, noise_px=0.1)
+    tracks = point_tracks(true, noise_px=0.1)
     rng = np.random.default_rng(5)
     wrong = rng.choice(len(tracks), len(tracks) // 10, replace=False)
     pixels = tracks.pixels.copy()
@@ -112,7 +75,7 @@ def test_wrong_sightings_are_thrown_out():
 
 def test_a_frame_with_too_few_points_is_left_out():
     true = machine(np.arange(0, 360, 20.0))
-    tracks = sightings(true)
+    tracks = point_tracks(true)
     rows = np.flatnonzero(tracks.frame == 4)
     keep = np.ones(len(tracks), bool)
     keep[rows[5:]] = False
@@ -125,30 +88,15 @@ def test_a_frame_with_too_few_points_is_left_out():
 def test_held_angles_stay():
     true = machine(np.arange(0, 360, 18.0))
     start = replace(disturbed(true), angles_rad=true.angles_rad)
-    found = adjust_tracks(start, sightings(true), free_angles=False)
+    found = adjust_tracks(start, point_tracks(true), free_angles=False)
     np.testing.assert_array_equal(found.turntable.angles_rad, true.angles_rad)
     assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
     assert pose_error_deg(found.turntable, true) < 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("sign", "elevation_deg"), [(1.0, 2.0), (-1.0, 55.0)])
-def test_known_angles_give_the_camera_from_scratch(sign, elevation_deg):
-    true = machine(sign * np.arange(0, 360, 18.0), elevation_deg=elevation_deg)
-    tracks = sightings(true, noise_px=0.2)
-    # The operator knows the steps, not which way round.
-    start = turntable_from_angles(
-        tracks, true.frames, np.abs(true.angles_rad), (SIZE_PX, SIZE_PX), direction_known=False
-    )
-    np.testing.assert_allclose(start.angles_rad, true.angles_rad)
-    found = adjust_tracks(start, tracks, free_angles=False)
-    assert pose_error_deg(found.turntable, true) < 0.3
-    assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=0.02)
-
-
 def test_tracks_of_something_else_are_refused():
     true = machine(np.arange(0, 360, 30.0))
-    few = sightings(true)
+    few = point_tracks(true)
     with pytest.raises(InputError, match="too few points"):
         adjust_tracks(true, few.select(few.point < 5))
 
@@ -158,7 +106,7 @@ def test_halves_of_the_points_tell_the_error():
     true = machine(np.arange(0, 360, 18.0), points=400)
     errors, told = [], []
     for noise_px in (0.05, 0.5):
-        found = adjust_tracks(true, sightings(true, noise_px=noise_px))
+        found = adjust_tracks(true, point_tracks(true, noise_px=noise_px))
         errors.append(pose_error_deg(found.turntable, true))
         told.append(split_half_error_deg(found))
     assert told[0] < 0.1 < told[1]
@@ -167,7 +115,7 @@ def test_halves_of_the_points_tell_the_error():
 
 def test_lost_frames_come_back_at_their_angle():
     true = machine(-np.arange(0, 360, 18.0))
-    tracks = sightings(true, noise_px=0.1)
+    tracks = point_tracks(true, noise_px=0.1)
     pixels = tracks.pixels.copy()
     pixels[np.flatnonzero(tracks.frame == 9)[::4]] += 20.0
     pixels[tracks.frame == 13] = np.random.default_rng(0).uniform(50, 200, ((tracks.frame == 13).sum(), 2))

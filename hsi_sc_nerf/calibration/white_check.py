@@ -1,0 +1,222 @@
+"""Is the white a white? It is flat, brighter than what the frames show in its place, and not one of the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.calibration.detector import dark_columns, no_data, unlit_bands
+from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
+from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, white_exposure_ratio, white_source
+from hsi_sc_nerf.capture.envi import Cube
+from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.morphology import largest_component
+
+LINES = 16
+"""Lines of each cube that are read, evenly spread."""
+CLIPPED_FROM = 1.05
+"""Reflectance that counts as clipped: noise and uneven light alone take a white wall's values just above 1."""
+CLIPPED_AMBER, CLIPPED_RED = 0.01, 0.05
+"""Fractions of clipped values."""
+OUTSHONE, OUTSHONE_FRACTION = 2.0, 0.05
+"""A white is too dark, or coloured, if this fraction of a band's values exceeds it by this factor; highlights cover
+less of the image."""
+ROUGHNESS = 0.1
+"""Largest median difference between neighbouring pixels of a white (relative)."""
+UNEVENNESS = 0.5
+"""Largest range (10th to 90th percentile, relative) along a column of a WHITEREF cube."""
+MOVING = 0.3
+"""Range of a pixel's brightness over the frames (relative) from which something moves in it."""
+MARGIN = 1.1
+"""Factor by which brightness may leave the range that it has in the frames, or exceed it."""
+MIN_MOVING_PX = 50
+"""With fewer moving pixels, all pixels are compared."""
+ALIKE, BRIGHTER = 0.5, 0.2
+"""A capture is one of the frames if at least this fraction of the moving pixels looks like the frames, and less than
+this fraction of its brightest region is brighter than the frames there."""
+WHITE_FRACTION = 0.25
+"""A capture that outshines the others in this fraction of the pixels looks like a white."""
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What is wrong with the white (None for nothing), and the figures behind it."""
+
+    fault: str | None
+    clipped_fraction: float
+    values: dict[str, object]
+
+
+def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+    """Check the white of a session on a few lines of each cube.
+
+    Args:
+        session: its captures.
+        source: where the white is. A target inside the frames is not checked, because its place is a setting.
+
+    Returns:
+        The findings ``white`` (red if the white is none) and ``white-clipped`` (values above the white's: amber from
+        1 %, red from 5 %).
+
+    Raises:
+        InputError: the session does not have that source of white.
+
+    Example:
+        >>> refuse_red(check_white(open_session(Path("captures"))))
+    """
+    source = "auto" if source == "target" else source
+    found = white_source(session, source, None)
+    if found == "product":
+        return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
+    verdict = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
+    white = "the white of each capture"
+    if session.white is not None and found == "tarp":
+        white = f"the capture {session.white.name}"
+    level: Level = "red"
+    if verdict.fault is None:
+        sentence, level = f"White: {white} looks like a white.", "green"
+    else:
+        sentence = f"{session.path}: {verdict.fault}."
+    clipped = verdict.clipped_fraction
+    of_clipped: Level = "red" if clipped > CLIPPED_RED else "amber" if clipped > CLIPPED_AMBER else "green"
+    told = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
+    if of_clipped != "green":
+        told = f"{session.path}: {told} and will be clipped; check that it is a white, in the frames' light."
+    return [
+        Finding("white", level, sentence, verdict.values),
+        Finding("white-clipped", of_clipped, told.rstrip(".") + ".", {"fraction": clipped}),
+    ]
+
+
+def _check_tarp(session: Session) -> _Verdict:
+    tarp, frames = session.white, session.frames
+    assert tarp is not None
+    light = _light(tarp.cube, tarp.dark)
+    image = light.mean(axis=-1)
+    brightest = np.percentile(image, 99.0)
+    region = largest_component(image >= TARP_BRIGHTNESS * brightest)
+    if not brightest > 0.0:
+        return _Verdict(f"the white {tarp.name} is dark; take it again", 0.0, {})
+    white = np.median(light[region], axis=0)
+    live = ~unlit_bands(white[None]) & tarp.cube.good_bands
+    compared = _Compared.of(frames, [white[None] / exposure_ratio(tarp, frame) for frame in frames], live)
+    images = compared.images * np.array([exposure_ratio(tarp, frame) for frame in frames])[:, None, None]
+    roughness = float(np.median(np.abs(np.diff(image, axis=1)[region[:, 1:]]) / image[:, 1:][region[:, 1:]]))
+    brighter, alike, looks_white = 1.0, 0.0, None
+    if images.shape[1:] == image.shape:
+        image = light[..., live].mean(axis=-1)
+        brighter, alike, best = _compare_with_frames(image, region, images)
+        looks_white = None if best is None else frames[best].name
+    fault = None
+    if brighter < BRIGHTER and alike >= ALIKE:
+        fault = f"the white {tarp.name} shows the same as the frames, and nothing in it is brighter than there"
+    elif compared.outshone > OUTSHONE_FRACTION:
+        fault = f"the white {tarp.name} is too dark or coloured: the frames are over twice as bright in some bands"
+    elif roughness > ROUGHNESS:
+        fault = f"the white {tarp.name} is not flat: neighbouring pixels differ by {100.0 * roughness:.0f} %"
+    if fault is not None:
+        fault += (
+            f"; {looks_white} looks most like a white, so name it as 'white_reference' in session.json"
+            if looks_white
+            else "; no other capture looks like a white, so take one"
+        )
+    return _Verdict(
+        fault,
+        compared.clipped,
+        {
+            "white": tarp.name,
+            "looks_most_like_a_white": looks_white if fault else tarp.name,
+            "area_fraction": float(region.mean()),
+            "roughness": roughness,
+            "brighter_than_frames_fraction": brighter,
+            "like_the_frames_fraction": alike,
+            "outshone_fraction": compared.outshone,
+        },
+    )
+
+
+def _compare_with_frames(
+    image: Float[np.ndarray, "lines samples"],
+    region: Bool[np.ndarray, "lines samples"],
+    frames: Float[np.ndarray, "frames lines samples"],
+) -> tuple[float, float, int | None]:
+    """Compare the white's brightness with that of the frames, pixel by pixel.
+
+    Returns:
+        The fraction of the white's region that is brighter than the frames there; the fraction of the moving pixels
+        that look like the frames; and the frame that looks like a white, if one does.
+    """
+    usual = np.median(np.concatenate([frames, image[None]]), axis=0)
+    outshines = (frames > MARGIN * usual).mean(axis=(1, 2))
+    best = int(outshines.argmax()) if len(frames) > 2 and outshines.max() >= WHITE_FRACTION else None
+    others = frames if best is None else np.delete(frames, best, axis=0)
+    low, high = others.min(axis=0), others.max(axis=0)
+    moving = high - low > MOVING * np.abs(usual)
+    if moving.sum() < MIN_MOVING_PX:
+        moving = np.ones_like(moving)
+    inside = (image >= low / MARGIN) & (image <= high * MARGIN)
+    return float((image > MARGIN * high)[region].mean()), float(inside[moving].mean()), best
+
+
+def _check_own_whites(session: Session) -> _Verdict:
+    frames, whites, faults = session.frames, [], []
+    unevenness = 0.0
+    for frame in frames:
+        assert frame.white is not None
+        light = _light(frame.white, frame.white_dark)
+        column = np.median(light, axis=0)
+        if len(column) != frame.cube.shape[1]:
+            column = np.median(column, axis=0, keepdims=True)
+        whites.append(column / white_exposure_ratio(session, "capture", frame))
+        brightness = light.mean(axis=-1)
+        low, middle, high = np.percentile(brightness, [10.0, 50.0, 90.0], axis=0)
+        uneven = float(np.median((high - low) / np.maximum(middle, 1e-9)))
+        unevenness = max(unevenness, uneven)
+        if uneven > UNEVENNESS:
+            faults.append(frame.name)
+    live = ~unlit_bands(np.concatenate([np.median(white, axis=0, keepdims=True) for white in whites]))
+    compared = _Compared.of(frames, whites, live & np.logical_and.reduce([frame.cube.good_bands for frame in frames]))
+    fault = None
+    if faults:
+        fault = f"the WHITEREF of {', '.join(faults)} is not flat; take a white that fills the image"
+    elif compared.outshone > OUTSHONE_FRACTION:
+        fault = "the WHITEREF cubes are too dark or coloured: the frames are over twice as bright in some bands"
+    return _Verdict(fault, compared.clipped, {"unevenness": unevenness, "outshone_fraction": compared.outshone})
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Frames against their white: brightness, fraction of clipped values, and of values far above the white's."""
+
+    images: Float[np.ndarray, "frames lines samples"]
+    clipped: float
+    outshone: float
+
+    @staticmethod
+    def of(
+        frames: Sequence[Capture],
+        whites: Sequence[Float[np.ndarray, "columns bands"]],
+        live: Bool[np.ndarray, "bands"],
+    ) -> _Compared:
+        """Compare each frame with its white, in the live bands and at the frame's exposure."""
+        images, clipped, outshone = [], [], []
+        for frame, white in zip(frames, whites, strict=True):
+            light = _light(frame.cube, frame.dark)[..., live]
+            images.append(light.mean(axis=-1))
+            clipped.append((light > CLIPPED_FROM * white[..., live]).mean())
+            outshone.append((light > OUTSHONE * white[..., live]).mean(axis=(0, 1)))
+        return _Compared(np.stack(images), float(np.mean(clipped)), float(np.mean(outshone, axis=0).max()))
+
+
+def _light(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "lines samples bands"]:
+    """Counts above dark of some lines; 0 for no data."""
+    rows = np.unique(np.linspace(0, cube.shape[0] - 1, min(LINES, cube.shape[0]) + 2).round().astype(int)[1:-1])
+    counts = np.asarray(cube.memmap()[rows])
+    missing = no_data(counts, cube.ignore_value)
+    light = counts.astype(np.float32) - dark_columns(None if dark is None else dark.memmap(), *cube.shape[1:])
+    return light if missing is None else np.where(missing, 0.0, light)

@@ -1,0 +1,153 @@
+"""Checks of what the frames show: exposure, focus, copies, and frames of another object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.inspection.file_checks import leave_out, names_in_short
+from hsi_sc_nerf.inspection.look import Look, saturation_level
+from hsi_sc_nerf.poses.marker_detection import Detections
+
+SATURATED_AMBER, SATURATED_RED = 0.005, 0.1
+"""Fractions of a frame's values: highlights are flagged value by value; from the red one the exposure is wrong."""
+DARK_AMBER, DARK_RED = 0.2, 0.7
+"""Fractions of a frame's values without light; the outermost bands of a good session have some."""
+BLURRED = 0.6
+"""A frame is less sharp than the others if its edges have this fraction of their slope."""
+COMPARED_PX = 40
+"""Side of the pictures in which frames are compared."""
+FEWEST_COMPARED = 8
+"""Fewest frames among which one can be told to be different."""
+LEAST_SPREAD, LARGEST_DEVIATION = 0.02, 8.0
+"""Deviations count in units of a pixel's spread over the frames, of this reflectance at least, up to this many."""
+DIFFERENT_AMBER, DIFFERENT_RED = 1.5, 2.7
+"""Deviation of a frame over the median of all. Frames of one object, also of a long or bruised one over half a turn,
+stay below 1.3; a camera moved by 2 of 128 pixels gives 2.3; another kind of fruit 3.5 to 8."""
+
+
+def check_frames(session: Session, looks: Sequence[Look], detections: Sequence[Detections]) -> list[Finding]:
+    """The findings ``exposure``, ``focus``, ``copies`` and ``other-object``.
+
+    Args:
+        session: the session.
+        looks: a look at each of its frames.
+        detections: markers of each frame.
+    """
+    return [
+        _exposure(session, looks),
+        _focus(session, looks),
+        _copies(session, looks),
+        _other_object(session, looks, detections),
+    ]
+
+
+def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[np.ndarray, "frames"]:
+    """How much each frame deviates from what most frames show, over the median of all frames.
+
+    Pictures are compared small and at one brightness. A pixel that changes as the object turns has a large spread
+    over the frames, and weighs little.
+    """
+    side = (COMPARED_PX, COMPARED_PX)
+    small = np.stack([cv2.resize(picture, side, interpolation=cv2.INTER_AREA) for picture in pictures])
+    small = np.clip(small, 0.0, 1.5)
+    small /= np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
+    away = np.abs(small - np.median(small, axis=0))
+    spread = np.maximum(1.4826 * np.median(away, axis=0), LEAST_SPREAD)
+    deviation = np.minimum(away / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
+    return deviation / max(float(np.median(deviation)), 1e-12)
+
+
+def _exposure(session: Session, looks: Sequence[Look]) -> Finding:
+    level = saturation_level(session, looks) if session.has_counts else None
+    saturated = np.array([look.at_top_fraction * (level is not None and look.top_counts >= level) for look in looks])
+    dark = np.array([look.dark_fraction for look in looks])
+    wavelengths_nm = session.wavelengths_nm
+    bright_frames, dark_frames = saturated.mean(axis=1), dark.mean(axis=1)
+    worst = int(saturated.mean(axis=0).argmax())
+    found: Level = "green"
+    if bright_frames.max() > SATURATED_AMBER or dark_frames.max() > DARK_AMBER:
+        found = "amber"
+    if bright_frames.max() > SATURATED_RED or dark_frames.max() > DARK_RED:
+        found = "red"
+    told = (
+        f"{100.0 * bright_frames.mean():.2g} % of the frames' values are saturated (most at "
+        f"{wavelengths_nm[worst]:.0f} nm: {100.0 * saturated.mean(axis=0)[worst]:.2g} %), "
+        f"{100.0 * dark_frames.mean():.2g} % are dark"
+    )
+    if bright_frames.max() > SATURATED_AMBER:
+        told += f"; the brightest frame is {looks[int(bright_frames.argmax())].name}, expose shorter"
+    elif dark_frames.max() > DARK_AMBER:
+        told += f"; the darkest frame is {looks[int(dark_frames.argmax())].name}, expose longer"
+    values = {
+        "saturation_counts": level,
+        "saturated_fraction_by_frame": _by_name(looks, bright_frames),
+        "dark_fraction_by_frame": _by_name(looks, dark_frames),
+        "saturated_fraction_by_band": saturated.mean(axis=0).round(5).tolist(),
+        "dark_fraction_by_band": dark.mean(axis=0).round(5).tolist(),
+    }
+    return Finding("exposure", found, f"{session.path}: {told}." if found == "red" else f"Exposure: {told}.", values)
+
+
+def _focus(session: Session, looks: Sequence[Look]) -> Finding:
+    sharpness = np.array([look.sharpness_per_px for look in looks])
+    relative = sharpness / max(float(np.median(sharpness)), 1e-12)
+    blurred = [look.name for look, ratio in zip(looks, relative, strict=True) if ratio < BLURRED]
+    values = {"sharpness_over_median": _by_name(looks, relative)}
+    if blurred:
+        sentence = (
+            f"Focus: {names_in_short(blurred)} are less sharp than the other frames; look at them, or leave them out."
+        )
+        return Finding("focus", "amber", sentence, values)
+    return Finding("focus", "green", "Focus: all frames are about equally sharp.", values)
+
+
+def _copies(session: Session, looks: Sequence[Look]) -> Finding:
+    first_of: dict[str, str] = {}
+    copies = [
+        (first, look.name) for look in looks if (first := first_of.setdefault(look.digest, look.name)) != look.name
+    ]
+    if not copies:
+        return Finding("copies", "green", "No frame is a copy of another.")
+    told = ", ".join(f"{copy} is a copy of {first}" for first, copy in copies[:4])
+    sentence = f"{session.path}: {told}; leave copies out with {leave_out([copy for _, copy in copies])}."
+    return Finding("copies", "red", sentence, {"copies": [list(pair) for pair in copies]})
+
+
+def _other_object(session: Session, looks: Sequence[Look], detections: Sequence[Detections]) -> Finding:
+    if len(looks) < FEWEST_COMPARED:
+        return Finding("other-object", "green", "There are too few frames to tell another object from a turn.")
+    ratios = deviations([look.picture for look in looks])
+    seen = [set(found) for found in detections]
+    strangers = [
+        look.name
+        for index, look in enumerate(looks)
+        if len(seen[index]) > 1
+        and not any(seen[index] & other for number, other in enumerate(seen) if number != index)
+    ]
+    different = [look.name for look, ratio in zip(looks, ratios, strict=True) if ratio > DIFFERENT_RED]
+    values = {"deviation_over_median": _by_name(looks, ratios), "unknown_markers": strangers}
+    wrong = [look.name for look in looks if look.name in {*different, *strangers}]
+    if wrong:
+        why = "look unlike all other frames" if different else "show other markers than all other frames"
+        sentence = (
+            f"{session.path}: {names_in_short(wrong)} {why} (another object, or a moved camera); leave them out with "
+            f"{leave_out(wrong)}."
+        )
+        return Finding("other-object", "red", sentence, values)
+    doubtful = [look.name for look, ratio in zip(looks, ratios, strict=True) if ratio > DIFFERENT_AMBER]
+    if doubtful:
+        sentence = (
+            f"{names_in_short(doubtful)} look somewhat unlike the frames beside them; compare them in the picture."
+        )
+        return Finding("other-object", "amber", sentence, values)
+    return Finding("other-object", "green", "All frames look like frames of one object.", values)
+
+
+def _by_name(looks: Sequence[Look], numbers: Float[np.ndarray, "frames"]) -> dict[str, float]:
+    return {look.name: round(float(number), 5) for look, number in zip(looks, numbers, strict=True)}

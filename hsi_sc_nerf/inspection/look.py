@@ -1,0 +1,145 @@
+"""A quick look at each frame: a few bands of all lines, and all bands of a few lines."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Num, UInt8
+
+from hsi_sc_nerf.calibration.detector import dark_columns, saturation_counts
+from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
+
+PICTURE_NM = (640.0, 550.0, 470.0)
+"""Red, green and blue of the pictures; markers' inks are dark in all of them."""
+NEIGHBOURS = 2
+"""So many neighbouring bands make one channel of a picture: they lie side by side in the file."""
+LINES = 16
+"""Lines that are read whole, evenly spread."""
+DARK_SIGMAS = 3.0
+"""A value is dark if it exceeds the dark cube by less than this many standard deviations."""
+EDGE_FRACTION = 0.02
+"""The strongest edges of a picture, as a fraction of its pixels."""
+WORKERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a quick look at a capture shows. Pictures lie as in the file.
+
+    Attributes:
+        name: of the capture.
+        picture: pseudo-RGB, about 1 on white.
+        spectrum: mean light of the lines read, relative to the session's white level.
+        top_counts: the largest reading of the lines read.
+        at_top_fraction: fraction of the readings with ``top_counts``, by band.
+        dark_fraction: fraction of the readings that are no light, by band.
+        sharpness_per_px: mean slope of the strongest edges over the picture's contrast.
+        digest: hash of the readings; equal for copies only.
+    """
+
+    name: str
+    picture: Float[np.ndarray, "lines samples 3"]
+    spectrum: Float[np.ndarray, "bands"]
+    top_counts: float
+    at_top_fraction: Float[np.ndarray, "bands"]
+    dark_fraction: Float[np.ndarray, "bands"]
+    sharpness_per_px: float
+    digest: str
+
+    @property
+    def gray(self) -> UInt8[np.ndarray, "lines samples"]:
+        """Mean of the picture's channels, in which markers are looked for."""
+        return to_8_bit(self.picture.mean(axis=-1))
+
+
+def look_at_frames(session: Session) -> list[Look]:
+    """A `Look` at each frame of a session, in its order."""
+    white = white_level(session)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(lambda capture: look_at(capture, white), session.frames))
+
+
+def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
+    """Look at one capture.
+
+    Args:
+        capture: the capture.
+        white: counts of a white above dark, of the same integration time.
+    """
+    cube = capture.cube
+    counts = cube.memmap()
+    read = _some_lines(counts)
+    light, noise = _light(capture, read)
+    channels = nearest_bands(cube.wavelengths_nm, PICTURE_NM)
+    dark = None if capture.dark is None else _some_lines(capture.dark.memmap())
+    level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
+    bands = [slice(max(0, band - NEIGHBOURS // 2), max(0, band - NEIGHBOURS // 2) + NEIGHBOURS) for band in channels]
+    picture = np.stack(
+        [
+            (np.asarray(counts[..., near], np.float32).mean(axis=-1) - level[near].mean()) / white[near].mean()
+            for near in bands
+        ],
+        axis=-1,
+    )
+    top = read.max()
+    return Look(
+        name=capture.name,
+        picture=picture,
+        spectrum=light.mean(axis=(0, 1)) / white,
+        top_counts=float(top),
+        at_top_fraction=(read == top).mean(axis=(0, 1)),
+        dark_fraction=(light <= DARK_SIGMAS * noise).mean(axis=(0, 1)),
+        sharpness_per_px=sharpness_per_px(picture.mean(axis=-1)),
+        digest=hashlib.sha256(np.ascontiguousarray(read).tobytes()).hexdigest(),
+    )
+
+
+def white_level(session: Session) -> Float[np.ndarray, "bands"]:
+    """Counts above dark of the session's white by band, or of what is brightest in the first frame without one."""
+    return white_counts(session.frames[0] if session.white is None else session.white)
+
+
+def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
+    """Counts above dark of what is brightest in a capture, by band."""
+    light, _ = _light(capture, _some_lines(capture.cube.memmap()))
+    level = np.percentile(light, 95.0, axis=(0, 1))
+    return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
+
+
+def saturation_level(session: Session, looks: Sequence[Look]) -> float | None:
+    """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
+    brightest = sorted(range(len(looks)), key=lambda index: -looks[index].top_counts)[:3]
+    cubes = [_some_lines(session.frames[index].cube.memmap()) for index in brightest]
+    return saturation_counts(cubes, np.ones(cubes[0].shape[1:], bool))
+
+
+def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
+    """Mean slope of a picture's strongest edges over its contrast (1st to 99th percentile); 0 without contrast."""
+    smooth = cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), 0.7)
+    low, high = np.percentile(smooth, [1.0, 99.0])
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
+    slope = np.sort(cv2.magnitude(across, down), axis=None)
+    strongest = slope[-max(1, round(EDGE_FRACTION * slope.size)) :]
+    return float(strongest.mean() / (high - low)) if high > low else 0.0
+
+
+def _some_lines(counts: Num[np.ndarray, "lines samples bands"]) -> Num[np.ndarray, "some samples bands"]:
+    lines = np.linspace(0, len(counts) - 1, min(LINES, len(counts)) + 2)[1:-1] if len(counts) > 2 else [0]
+    return np.asarray(counts[np.unique(np.rint(lines).astype(int))])
+
+
+def _light(
+    capture: Capture, read: Num[np.ndarray, "some samples bands"]
+) -> tuple[Float[np.ndarray, "some samples bands"], Float[np.ndarray, "bands"]]:
+    """Readings above dark, and the standard deviation of readings without light by band."""
+    if capture.dark is None:
+        return np.asarray(read, np.float32), np.zeros(read.shape[-1], np.float32)
+    dark = _some_lines(capture.dark.memmap())
+    light = np.asarray(read, np.float32) - np.asarray(dark_columns(dark, *read.shape[1:]), np.float32)
+    return light, np.asarray(dark, np.float32).std(axis=0).mean(axis=0)

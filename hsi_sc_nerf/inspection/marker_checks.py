@@ -1,0 +1,187 @@
+"""Checks of the markers: how many are seen, how far the table turned, and what poses to expect of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.inspection.file_checks import names_in_short
+from hsi_sc_nerf.inspection.look import WORKERS, Look
+from hsi_sc_nerf.inspection.turn import frame_angles_deg
+from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
+from hsi_sc_nerf.poses.marker_fit import fit_marker
+
+FITTED_MARKERS = 8
+"""Markers whose corners are fitted; they give their error."""
+EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
+"""Smallest side of a marker in px, and the largest error of poses in degrees and mm that simulated sessions with such
+markers have (docs/validation/poses.md). Smaller markers are refused."""
+STOOD_STILL = 0.2
+"""The table stood still where it turned by less than this fraction of the usual step."""
+LARGE_GAP = 1.7
+"""A step counts as a gap from this factor of the usual step, which unevenness does not reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """What is seen of markers.
+
+    Attributes:
+        dictionary: that they come from; None if no marker is seen.
+        detections: markers of each frame.
+        angles_deg: the table's angle by frame, counter-clockwise from above; nan where it is not known.
+        side_px: median side of a marker; nan without any.
+        corner_error_px: standard deviation of a fitted corner; nan where none could be fitted.
+    """
+
+    dictionary: str | None
+    detections: list[Detections]
+    angles_deg: Float[np.ndarray, "frames"]
+    side_px: float
+    corner_error_px: float
+
+    @property
+    def steps_deg(self) -> Float[np.ndarray, "steps"]:
+        """Turns from frame to frame, in (-180, 180]; nan where one is not known."""
+        return (np.diff(self.angles_deg) + 180.0) % 360.0 - 180.0
+
+    @property
+    def usual_step_deg(self) -> float | None:
+        """Usual turn from frame to frame, positive counter-clockwise; None if it is not known."""
+        steps = self.steps_deg[np.isfinite(self.steps_deg)]
+        if len(steps) < max(1, len(self.angles_deg) // 3):
+            return None
+        median = np.median(steps)
+        return float(steps[np.abs(steps - median) <= 0.5 * abs(median)].mean())
+
+
+def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
+    """Look for markers in all frames, of the stated dictionary or of the one that fits best."""
+    grays = [look.gray for look in looks]
+    dictionary = session.info.marker_dictionary
+    if dictionary is None:
+        dictionary = find_dictionary(grays)
+    else:
+        try:
+            dictionary_by_name(dictionary)
+        except InputError as error:
+            raise InputError(f"{session.info_path}: {error}.") from error
+    detections: list[Detections] = [{} for _ in grays]
+    if dictionary is not None:
+        with ThreadPoolExecutor(WORKERS) as pool:
+            detections = list(pool.map(partial(detect_markers, dictionary=dictionary), grays))
+    sides = [
+        float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+        for seen in detections
+        for corners in seen.values()
+    ]
+    errors = []
+    seen = [(index, marker) for index, found in enumerate(detections) for marker in found]
+    for number in np.unique(np.linspace(0, max(len(seen) - 1, 0), FITTED_MARKERS).astype(int))[: len(seen)].tolist():
+        index, marker = seen[number]
+        assert dictionary is not None
+        image = looks[index].picture.mean(axis=-1).astype(float)
+        fit = fit_marker(image, dictionary, marker, detections[index][marker])
+        if fit is not None:
+            errors.append(float(np.sqrt(np.diag(fit.covariance_px2).mean())))
+    return Markers(
+        dictionary if sides else None,
+        detections,
+        frame_angles_deg(detections),
+        float(np.median(sides)) if sides else float("nan"),
+        float(np.median(errors)) if errors else float("nan"),
+    )
+
+
+def check_markers(session: Session, markers: Markers) -> list[Finding]:
+    """The findings ``markers``, ``turn`` and ``expected-accuracy``."""
+    return [_seen(session, markers), _turn(session, markers), _expected(markers)]
+
+
+def _seen(session: Session, markers: Markers) -> Finding:
+    numbers = np.array([len(seen) for seen in markers.detections])
+    names = [frame.name for frame in session.frames]
+    values: dict[str, object] = {
+        "dictionary": markers.dictionary,
+        "markers_by_frame": dict(zip(names, numbers.tolist(), strict=True)),
+        "side_px": None if np.isnan(markers.side_px) else round(markers.side_px, 2),
+        "corner_error_px": None if np.isnan(markers.corner_error_px) else round(markers.corner_error_px, 4),
+    }
+    if markers.dictionary is None:
+        stated = session.info.marker_dictionary
+        of = f"of {stated}" if stated else "of the usual dictionaries"
+        sentence = f"No marker {of} is seen; without markers poses need texture or known angles, and a scale."
+        return Finding("markers", "amber", sentence, values)
+    told = f"{np.median(numbers):g} markers of {markers.dictionary} a frame, {markers.side_px:.0f} px wide"
+    if np.isfinite(markers.corner_error_px):
+        told += f", corners known to {markers.corner_error_px:.2g} px"
+    without = [name for name, number in zip(names, numbers, strict=True) if number == 0]
+    level: Level = "green"
+    if without:
+        level, told = "amber", f"{told}; none is seen in {names_in_short(without)}, which will be left out"
+    elif np.median(numbers) < 2 or markers.side_px < EXPECTED[-1][0]:
+        level, told = "amber", f"{told}; show more or larger ones"
+    return Finding("markers", level, f"Markers: {told}.", values)
+
+
+def _turn(session: Session, markers: Markers) -> Finding:
+    known = np.isfinite(markers.angles_deg)
+    step = markers.usual_step_deg
+    names = [frame.name for frame in session.frames]
+    if step is None or abs(step) < 0.1:
+        return Finding("turn", "amber", "The table's turn is not known before the poses: no marker lies on the disc.")
+    direction = "ccw" if step > 0.0 else "cw"
+    ordered = np.sort(markers.angles_deg[known] % 360.0)
+    gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
+    gap = int(gaps.argmax())
+    values: dict[str, object] = {
+        "usual_step_deg": round(abs(step), 2),
+        "direction": direction,
+        "largest_gap_deg": round(float(gaps[gap]), 1),
+        "angle_deg_by_frame": {
+            name: round(float(a), 1) if np.isfinite(a) else None
+            for name, a in zip(names, markers.angles_deg, strict=True)
+        },
+    }
+    told = f"steps of {abs(step):.3g} degrees {direction}"
+    stated = session.info.direction
+    if stated is not None and stated != direction:
+        sentence = (
+            f"{session.info_path}: states that the table turns {stated}, but by its markers it turns {direction}; "
+            "correct direction."
+        )
+        return Finding("turn", "red", sentence, values)
+    still = [
+        f"{names[i]} to {names[i + 1]}" for i in np.flatnonzero(np.abs(markers.steps_deg) < STOOD_STILL * abs(step))
+    ]
+    faults = []
+    if still:
+        faults.append(f"the table did not turn from {names_in_short(still, 3)}")
+    if gaps[gap] > LARGE_GAP * abs(step) + 2.0:
+        faults.append(f"{gaps[gap]:.0f} degrees of the turn are not shown, from {ordered[gap]:.0f} degrees on")
+    if faults:
+        return Finding("turn", "amber", f"Turn: {told}, but {' and '.join(faults)}.", values)
+    return Finding("turn", "green", f"Turn: {told}, a whole turn.", values)
+
+
+def _expected(markers: Markers) -> Finding:
+    spectra = "the uncertainty of spectra is not known before calibration"
+    if markers.dictionary is None:
+        poses = "what poses are worth is not known without markers"
+    elif np.median([len(seen) for seen in markers.detections]) == 0 or markers.side_px < EXPECTED[-1][0]:
+        poses = "markers of less than 8 px give no usable poses"
+    else:
+        _, rotation_deg, position_mm = next(row for row in EXPECTED if markers.side_px >= row[0])
+        poses = (
+            f"simulated sessions with such markers have poses within {rotation_deg:g} degrees and {position_mm:g} mm "
+            "(docs/validation/poses.md)"
+        )
+    return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.")

@@ -1,0 +1,108 @@
+"""One line for every new capture of a session that is being taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hsi_sc_nerf.capture.layout import CaptureFiles, list_captures
+from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
+from hsi_sc_nerf.capture.session_info import read_session_info
+from hsi_sc_nerf.inspection.file_checks import acquisition_day
+from hsi_sc_nerf.inspection.frame_checks import BLURRED, DARK_RED, SATURATED_RED
+from hsi_sc_nerf.inspection.look import Look, look_at, white_counts
+from hsi_sc_nerf.poses.marker_detection import detect_markers, find_dictionary
+
+FEWEST_TO_COMPARE = 3
+"""With fewer captures before it, sharpness and markers of a capture are not judged."""
+
+
+class Watch:
+    """A session's folder that is looked at again and again.
+
+    Args:
+        path: the session's folder; it may be empty.
+
+    Attributes:
+        captures: number of captures that a line was given for.
+        flagged: those of them with something wrong.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.captures = 0
+        self.flagged: list[str] = []
+        self._seen: set[str] = set()
+        self._looks: list[Look] = []
+        self._markers: list[int] = []
+        self._first: Capture | None = None
+        self._dictionary: str | None = None
+
+    def new_lines(self) -> list[str]:
+        """A line for each capture that is complete and was not before.
+
+        A capture whose data file is shorter than its header says is still being written, and is waited for.
+
+        Raises:
+            InputError: ``session.json`` cannot be used.
+        """
+        info = read_session_info(self.path / SESSION_INFO_NAME)
+        new = [files for files in list_captures(self.path).captures if files.name not in self._seen]
+        lines = []
+        for files in new:
+            opened = open_captures([files], info, self.path, {})
+            if opened and self._is_complete(files):
+                self._seen.add(files.name)
+                self.captures += 1
+                is_white = files.name.lower() == info.white_reference.lower()
+                lines.append(self._line(opened[0], info.marker_dictionary, is_white))
+        return lines
+
+    def _is_complete(self, files: CaptureFiles) -> bool:
+        """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""
+        return self._first is None or self._first.dark is None or "dark" in files.headers
+
+    def _line(self, capture: Capture, dictionary: str | None, is_white: bool) -> str:
+        look = look_at(capture, white_counts(capture))
+        saturated = float(look.at_top_fraction.mean()) if _is_full_scale(look.top_counts) else 0.0
+        dark = float(look.dark_fraction.mean())
+        parts = [f"saturated {100.0 * saturated:.1f} %", f"dark {100.0 * dark:.1f} %"]
+        faults = []
+        if saturated > SATURATED_RED:
+            faults.append("overexposed")
+        if dark > DARK_RED:
+            faults.append("too dark")
+        if self._first is not None:
+            if capture.cube.shape != self._first.cube.shape:
+                faults.append(f"size {capture.cube.shape} is not {self._first.cube.shape}")
+            if acquisition_day(capture) != acquisition_day(self._first):
+                faults.append(f"taken on {acquisition_day(capture)}, not {acquisition_day(self._first)}")
+        if not is_white:
+            self._first = self._first or capture
+            faults += self._compare(look, dictionary)
+            parts += [f"sharpness {look.sharpness_per_px:.3f}/px", f"markers {self._markers[-1]}"]
+        if faults:
+            self.flagged.append(capture.name)
+        return f"{capture.name}: {', '.join(parts)}; {', '.join(faults).upper() if faults else 'ok'}"
+
+    def _compare(self, look: Look, dictionary: str | None) -> list[str]:
+        """What is wrong with a frame beside those before it."""
+        faults = []
+        self._dictionary = dictionary or self._dictionary or find_dictionary([look.gray])
+        markers = 0 if self._dictionary is None else len(detect_markers(look.gray, self._dictionary))
+        if len(self._looks) >= FEWEST_TO_COMPARE:
+            if look.sharpness_per_px < BLURRED * np.median([other.sharpness_per_px for other in self._looks]):
+                faults.append("less sharp than before")
+            if markers == 0 and np.median(self._markers) >= 1.0:
+                faults.append("no markers")
+        if any(look.digest == other.digest for other in self._looks):
+            faults.append("a copy of an earlier capture")
+        self._looks.append(look)
+        self._markers.append(markers)
+        return faults
+
+
+def _is_full_scale(top_counts: float) -> bool:
+    """Whether the largest reading is the limit of a digitiser of 8 to 16 bits."""
+    return top_counts in {2.0**bits - 1.0 for bits in range(8, 17)}

@@ -1,0 +1,182 @@
+"""Residuals of a turntable's landmarks, markers or points, and their derivatives.
+
+Symbols: n sightings with g residuals of r numbers each, of l landmarks with d parameters.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.geometry.camera import cross_matrix
+from hsi_sc_nerf.poses.turntable import (
+    Jacobian,
+    MarkerObservations,
+    Tracks,
+    Turntable,
+    project,
+    projection_jacobian,
+)
+
+# Points nearer to the camera's plane than this, in distances of the camera, are behind it.
+_NEAREST_DEPTH = 1e-3
+
+
+class Residuals(ABC):
+    """Projections less sightings.
+
+    The loss of a residual of length r is soft L1, rho = 2 s^2 (sqrt(1 + r^2 / s^2) - 1) with the scale s: r^2 where
+    it is small, 2 s r where it is large.
+    """
+
+    numbers: int
+    """Of all residuals: n g r."""
+
+    def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
+        """Args:
+        turntable: one that has the frames and landmarks of the sightings.
+        seen: sightings.
+        loss_scale: residuals well above this count by their size, not its square.
+        d: number of parameters of a landmark; 0 where landmarks are held.
+        """
+        self.frame, self.landmark = turntable.rows(seen)
+        self.loss_scale, self.d = loss_scale, d
+        self.size = len(turntable.points if isinstance(seen, Tracks) else turntable.markers)
+
+    @abstractmethod
+    def values(self, turntable: Turntable) -> Float[np.ndarray, "n g r"]:
+        """In pixels or in standard deviations."""
+
+    @abstractmethod
+    def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n g*r d"]]:
+        """Derivatives by camera and motion, and by the parameters of the row's own landmark."""
+
+    @abstractmethod
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "l d"]) -> Turntable:
+        """The turntable with its landmarks moved."""
+
+    def losses(self, turntable: Turntable) -> Float[np.ndarray, "n"]:
+        """The loss of each sighting."""
+        r = np.linalg.norm(self.values(turntable), axis=-1)
+        return (2.0 * self.loss_scale**2 * (np.sqrt(1.0 + (r / self.loss_scale) ** 2) - 1.0)).sum(axis=-1)
+
+    def weights(self, residual: Float[np.ndarray, "n g r"]) -> Float[np.ndarray, "n g r"]:
+        """Of each number, by the loss of its residual: 1 / sqrt(1 + r^2 / s^2)."""
+        r = np.linalg.norm(residual, axis=-1, keepdims=True)
+        return np.broadcast_to(1.0 / np.sqrt(1.0 + (r / self.loss_scale) ** 2), residual.shape)
+
+
+class MarkerResiduals(Residuals):
+    """Corners of markers, whitened. Each number has its own loss."""
+
+    def __init__(
+        self,
+        turntable: Turntable,
+        observations: MarkerObservations,
+        loss_scale: float,
+        weights: Float[np.ndarray, "n 8 8"] | None = None,
+        *,
+        free: bool = True,
+        free_sides: bool = False,
+    ) -> None:
+        """Args:
+        turntable: as ``Residuals``.
+        observations: marker corners.
+        loss_scale: as ``Residuals``.
+        weights: multiply the residuals (x0, y0, x1, ...) of an observation; by default they whiten its covariance.
+        free: whether the markers' poses are adjusted.
+        free_sides: whether the log of each marker's side is adjusted.
+        """
+        super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
+        self.free, self.free_sides = free, free_sides
+        self.numbers = 8 * len(observations)
+        self.corners_px = observations.corners_px.reshape(-1, 8, 1)
+        self.whitening = whitening(observations.covariance_px2) if weights is None else weights
+
+    def values(self, turntable: Turntable) -> Float[np.ndarray, "n 8 1"]:
+        """Whitened reprojection errors."""
+        return self.whitening @ (self._project(turntable).pixels.reshape(-1, 8, 1) - self.corners_px)
+
+    def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 8 d"]]:
+        """By a marker's parameters: a small rotation in the object's axes, a shift, and the log of its side."""
+        pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
+        whitened = {name: None if by is None else self._whiten(by) for name, by in vars(pixel).items()}
+        offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
+        parts = [np.zeros((len(offset), 2, 0))]
+        if self.free:
+            parts += [pixel.point @ -cross_matrix(offset), pixel.point]
+        if self.free_sides:
+            parts.append(pixel.point @ offset[:, :, None])
+        return Jacobian(**whitened), self._whiten(np.concatenate(parts, axis=-1))
+
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "m d"]) -> Turntable:
+        """The turntable with its markers turned and shifted."""
+        poses = turntable.marker_poses.copy()
+        poses[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :3, :3]
+        poses[:, :3, 3] += step[:, 3:6]
+        return replace(turntable, marker_poses=poses)
+
+    def _project(self, turntable):
+        return project(turntable, np.repeat(self.frame, 4), turntable.corners()[self.landmark].reshape(-1, 3))
+
+    def _whiten(self, values: Float[np.ndarray, "4*n 2 k"]) -> Float[np.ndarray, "n 8 k"]:
+        return self.whitening @ values.reshape(len(self.frame), 8, values.shape[-1])
+
+
+class PointResiduals(Residuals):
+    """Points of the object, over their standard deviation. The loss is that of a residual's length."""
+
+    def __init__(self, turntable: Turntable, tracks: Tracks, loss_scale: float, sigma_px: float = 1.0) -> None:
+        super().__init__(turntable, tracks, loss_scale, 3)
+        self.numbers = 2 * len(tracks)
+        self.pixels, self.sigma_px = tracks.pixels, sigma_px
+
+    def values(self, turntable: Turntable) -> Float[np.ndarray, "n 1 2"]:
+        """Reprojection errors, infinite for a point behind the camera."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
+        return np.where(behind, np.inf, (projection.pixels - self.pixels) / self.sigma_px)[:, None]
+
+    def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
+        """By the point's coordinates."""
+        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
+        pixel = projection_jacobian(turntable, self.frame, projection)
+        scaled = {name: None if by is None else by / self.sigma_px for name, by in vars(pixel).items()}
+        return Jacobian(**scaled), scaled["point"]
+
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:
+        """The turntable with its points shifted."""
+        return replace(turntable, points_3d=turntable.points_3d + step)
+
+
+def whitening(covariance: Float[np.ndarray, "n 8 8"]) -> Float[np.ndarray, "n 8 8"]:
+    """Matrices that turn residuals of these covariances into independent ones of unit variance."""
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+
+
+def loop_closure_deg(residuals: Residuals, turntable: Turntable) -> float | None:
+    """Sum of the steps between neighbouring frames, and from the last to the first, less those of the turntable.
+
+    Each step is measured by the landmarks that its two frames share alone, so that errors add up as in any chain; the
+    adjusted angles close by construction. None where two neighbours share no landmark.
+    """
+    jacobian, _ = residuals.jacobian(turntable)
+    residual = residuals.values(turntable).reshape(len(residuals.frame), -1)
+    # The turn that each observation alone suggests, and the inverse of that angle's variance.
+    information = np.maximum((jacobian.angle**2).sum((1, 2)), 1e-12)
+    own_rad = -(jacobian.angle[..., 0] * residual).sum(-1) / information
+    total = 0.0
+    rows = [np.flatnonzero(residuals.frame == f) for f in range(len(turntable.frames))]
+    for here, there in zip(rows, [*rows[1:], rows[0]], strict=True):
+        _, i, j = np.intersect1d(residuals.landmark[here], residuals.landmark[there], return_indices=True)
+        before, after = here[i], there[j]
+        if len(before) == 0:
+            return None
+        # Variances of the two ends add.
+        weight = 1.0 / (1.0 / information[before] + 1.0 / information[after])
+        total += float(np.average(own_rad[after] - own_rad[before], weights=weight))
+    return float(np.rad2deg(total))

@@ -1,0 +1,266 @@
+"""Whole sessions of known truth through the calibration: what is not saturated is right, and what is, is flagged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
+from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
+from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.processing.frames import FramePaths, pack_frames
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import Truth, load_truth
+
+LARGEST_COUNT = 4095
+ODDITIES = [
+    "{illumination_falloff: {edge_loss: 0.2}}",
+    "{lamp_drift: {percent: -6, temperature_change_k: -80}}",
+    "{bad_pixels: {dead_fraction: 0.001, hot_fraction: 0.001, dead_bands: 2}}",
+    "gloss",
+    "{saturation: {exposure_factor: 1.6}}",
+    "{tarp_exposure: {exposure_factor: 0.6}}",
+    "image_rotation",
+]
+NOISE = ["photon_noise", "read_noise", "dark_pattern"]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A simulated session, its calibration and what was packed; images as the files hold them."""
+
+    session: Session
+    truth: Truth
+    calibration: SessionCalibration
+    root: Path
+
+    def frame(self, number):
+        """Reflectance, which of it is measured, and the clipped truth, in the kept bands."""
+        capture = self.session.frames[number].name
+        reflectance, valid = unpack(open_cube(FramePaths.of(self.root, capture).cube).memmap())
+        turns = -self.session.quarter_turns
+        even = replace(self.truth.light(capture), illumination=()).radiance()
+        expected = np.clip(even[..., self.calibration.bands], *paper.REFLECTANCE_BOUNDS)
+        return np.rot90(reflectance, turns), np.rot90(valid, turns), expected
+
+
+def calibrated(folder: Path, effects: list[str], config: CalibrationConfig) -> Calibrated:
+    scene = override(load_scene("pear"), size_px=72, bands=40, frames=6, effects=effects)
+    session = open_session(simulate_session(scene, folder / "session", progress=False))
+    calibration = calibrate_session(session, config)
+    pack_frames(session, calibration, folder / "data")
+    return Calibrated(session, load_truth(session.path), calibration, folder / "data")
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory) -> Calibrated:
+    return calibrated(tmp_path_factory.mktemp("odd"), ODDITIES, CalibrationConfig(flat_field=True))
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory) -> Calibrated:
+    return calibrated(tmp_path_factory.mktemp("noisy"), [*ODDITIES, *NOISE], CalibrationConfig(flat_field=True))
+
+
+@pytest.mark.slow
+def test_reflectance_is_within_one_percent(odd):
+    errors = []
+    for number in range(len(odd.session.frames)):
+        reflectance, valid, expected = odd.frame(number)
+        errors.append((reflectance - expected)[valid])
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.01
+
+
+def middle_of_illumination(truth: Truth, capture: str):
+    product = np.ones(len(truth.wavelengths_nm))
+    for factor in truth.light(capture).illumination:
+        product = product * factor[factor.shape[0] // 2, factor.shape[1] // 2]
+    return product
+
+
+@pytest.mark.slow
+def test_drift_is_recovered(odd, noisy):
+    for session in (odd, noisy):
+        drift = session.calibration.drift
+        assert isinstance(drift, LampDriftEstimate)
+        assert session.calibration.drift_corrected
+        # The falloff is the same in all frames: what is left of the illumination's middle is the lamps'.
+        middle = np.stack([middle_of_illumination(session.truth, c.name) for c in session.session.frames])
+        error = drift.factor / (middle / middle[0]) - 1.0
+        assert np.sqrt(np.mean(error**2)) < 0.003
+
+
+def test_saturated_and_dead_values_are_flagged_and_no_others(odd, noisy):
+    for session in (odd, noisy):
+        maps = session.truth.detector_maps()
+        bands = session.calibration.bands
+        dead_bands = (maps["dead"] | maps["hot"]).mean(axis=0) > 0.5
+        np.testing.assert_array_equal(np.delete(np.arange(40), bands), np.flatnonzero(dead_bands))
+        dead = (maps["dead"] | maps["hot"])[:, bands]
+        saturated = 0
+        for number, capture in enumerate(session.session.frames):
+            _, valid, _ = session.frame(number)
+            at_top = (capture.cube.memmap()[..., bands] >= LARGEST_COUNT) & ~dead
+            saturated += at_top.sum()
+            np.testing.assert_array_equal(~valid, at_top | dead)
+        assert saturated > 100
+
+
+def test_errors_are_as_large_as_the_uncertainty_says(noisy):
+    scores = []
+    for number in range(len(noisy.session.frames)):
+        reflectance, valid, expected = noisy.frame(number)
+        # Nothing that is clipped.
+        inside = valid & (expected > 0.1) & (expected < 0.9)
+        deviation = noisy.calibration.uncertainty.standard_deviation(expected)
+        scores.append(((reflectance - expected) / deviation)[inside])
+    spread = np.sqrt(np.mean(np.concatenate(scores) ** 2))
+    assert 0.9 < spread < 1.15
+
+
+def leave_gaps(cube: Cube, gap: float, dtype: str) -> None:
+    """Write a cube again with no data in two whole pixels and in one reading of two thousand."""
+    counts = cube.read().astype(dtype)
+    missing = np.random.default_rng(counts.sum().astype(int)).random(counts.shape) < 5e-4
+    missing[len(counts) // 2, 36] = missing[0, 3] = True
+    counts[missing] = gap
+    ignored = {} if np.isnan(gap) else {"data ignore value": int(gap)}
+    write_cube(
+        cube.header_path,
+        counts,
+        wavelengths_nm=cube.wavelengths_nm,
+        interleave=cube.interleave,
+        data_suffix=cube.data_path.suffix,
+        extra_header={"tint": cube.integration_time_ms, **ignored},
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("gap", "dtype", "saturation"),
+    [(65_535, "uint16", []), (np.nan, "float32", ["{saturation: {exposure_factor: 1.6}}"])],
+)
+def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtype, saturation):
+    effects = ["{lamp_drift: {percent: -6}}", *saturation, *NOISE]
+    scene = override(load_scene("pear"), size_px=72, bands=24, frames=6, effects=effects)
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    whole = calibrate_session(session, CalibrationConfig())
+    for capture in session.captures:
+        leave_gaps(capture.cube, gap, dtype)
+    gappy = calibrate_session(open_session(session.path), CalibrationConfig())
+    limit = LARGEST_COUNT if saturation else None
+    assert gappy.defects.saturation_counts == whole.defects.saturation_counts == limit
+    np.testing.assert_array_equal(gappy.defects.dead, whole.defects.dead)
+    np.testing.assert_array_equal(gappy.bands, whole.bands)
+    np.testing.assert_allclose(gappy.white.spectrum, whole.white.spectrum, rtol=2e-3)
+    assert gappy.white.roi == whole.white.roi
+    assert gappy.noise.counts_per_electron == pytest.approx(whole.noise.counts_per_electron, rel=0.05)
+    assert gappy.drift_corrected
+    assert gappy.drift.static_fraction == pytest.approx(whole.drift.static_fraction, abs=0.01)
+    np.testing.assert_allclose(gappy.drift.factor, whole.drift.factor, atol=1e-3)
+
+
+def test_hot_elements_do_not_move_the_tarp(tmp_path):
+    session = write_session(tmp_path)
+    tarp = np.full((SIZE_PX, SIZE_PX, BANDS), 0.05)
+    tarp[8:40, 8:40] = 1.0
+    write_capture(session, "white_reference", expose(tarp))
+    for capture in open_session(session).captures:
+        counts = capture.cube.read()
+        counts[:, 24, : BANDS // 4] = 60_000
+        write_capture(session, capture.name, counts)
+    assert calibrate_session(open_session(session), CalibrationConfig()).white.roi == (8, 8, 40, 40)
+
+
+def own_white(session: Session, capture, lines=3):
+    """A WHITEREF cube of a capture, of the session's tarp: a few of its lines."""
+    tarp = session.white.cube
+    middle = tarp.shape[0] // 2
+    header = capture.cube.header_path
+    write_cube(
+        header.with_name(f"WHITEREF_{header.name}"),
+        np.ascontiguousarray(tarp.memmap()[middle : middle + lines]),
+        wavelengths_nm=tarp.wavelengths_nm,
+        extra_header={"tint": tarp.integration_time_ms},
+    )
+
+
+def test_other_sources_of_white(tmp_path):
+    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=[])
+    folder = simulate_session(scene, tmp_path / "session", progress=False)
+    session = open_session(folder)
+    by_tarp = calibrate_session(session, CalibrationConfig())
+    for capture in session.frames:
+        own_white(session, capture)
+    session = open_session(folder)
+    by_capture = calibrate_session(session, CalibrationConfig(white_source="capture"))
+    assert by_capture.source == "capture"
+    inside = slice(8, -8)  # where the tarp is
+    np.testing.assert_allclose(by_capture.frames[0].gain[inside], by_tarp.frames[0].gain[[0] * 32], rtol=0.01)
+
+    # The chamber's wall as a target inside the frames.
+    by_target = calibrate_session(session, CalibrationConfig(white_source="target", roi=(0, 0, 8, 8)))
+    wall = load_truth(folder).light(session.frames[0].name).radiance()[0, 0]
+    np.testing.assert_allclose(by_target.frames[0].gain[0] * wall, by_tarp.frames[0].gain[0], rtol=0.01)
+    assert not by_target.drift_corrected
+
+
+@pytest.mark.slow
+def test_finished_reflectance_as_input(tmp_path):
+    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["image_rotation"])
+    folder = simulate_session(scene, tmp_path / "session", progress=False)
+    truth = load_truth(folder)
+    session = open_session(folder)
+    for capture in session.frames:
+        finished = truth.light(capture.name).radiance()
+        results = folder / capture.name / "results"
+        write_cube(
+            results / f"REFLECTANCE_{capture.name}.hdr",
+            finished.astype(np.float32),
+            wavelengths_nm=truth.wavelengths_nm,
+            data_suffix=".dat",
+        )
+    session = open_session(folder)
+    calibration = calibrate_session(session, CalibrationConfig(white_source="product"))
+    assert calibration.uncertainty is None
+    pack_frames(session, calibration, tmp_path / "data")
+    name = session.frames[0].name
+    reflectance, _ = unpack(open_cube(FramePaths.of(tmp_path / "data", name).cube).memmap())
+    np.testing.assert_allclose(reflectance, np.clip(truth.reflectance(name), 0.0, 1.0), atol=2e-4)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Session:
+    scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=[])
+    return open_session(simulate_session(scene, tmp_path_factory.mktemp("tiny") / "session", progress=False))
+
+
+@pytest.mark.parametrize(
+    ("config", "option"),
+    [
+        (CalibrationConfig(white_source="capture"), "white-source"),
+        (CalibrationConfig(white_source="product"), "white-source"),
+        (CalibrationConfig(white_source="target"), "roi"),
+        (CalibrationConfig(bounds=(0.0, 2.0)), "bounds"),
+    ],
+)
+def test_settings_that_do_not_fit(tiny, config, option):
+    with pytest.raises(InputError, match=f"--calibration.{option}"):
+        calibrate_session(tiny, config)
+
+
+def test_a_panel_that_is_no_perfect_white(tiny, tmp_path):
+    (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n350,0.9\n1050,0.8\n")
+    perfect = calibrate_session(tiny, CalibrationConfig())
+    panel = calibrate_session(tiny, CalibrationConfig(panel=tmp_path / "panel.csv"))
+    expected = np.interp(tiny.wavelengths_nm, [350.0, 1050.0], [0.9, 0.8])
+    np.testing.assert_allclose(panel.frames[0].gain / perfect.frames[0].gain, expected[None], rtol=1e-12)

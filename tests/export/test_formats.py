@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_cloud import BAND_NAMES, WAVELENGTHS_NM, random_cloud
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import CloudStream, stream
+from hsi_sc_nerf.export.formats import require_format, write_cloud
+
+COUNT = 50
+
+
+def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    written = random_cloud(COUNT)
+    path = write_cloud(tmp_path / "cloud", stream(written, 7), "las")
+    read = laspy.read(path)
+    assert path.name == "cloud.las"
+    np.testing.assert_allclose(read.xyz, written.points, atol=1e-6)
+    np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], 1) // 257, written.colours)
+    for band, name in enumerate(BAND_NAMES):
+        np.testing.assert_array_equal(read[name], written.spectra[:, band])
+    np.testing.assert_array_equal(read["NormalY"], written.normals[:, 1])
+    np.testing.assert_array_equal(read["views"], np.arange(COUNT))
+    assert [file.name for file in tmp_path.iterdir()] == ["cloud.las"]
+
+
+def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
+    pytest.importorskip("laspy")
+    write_cloud(tmp_path / "fits", stream(random_cloud(2, np.linspace(400.0, 1000.0, 336))), "las")
+    with pytest.raises(InputError, match=r"cloud\.las: LAS has room for 336 bands and the cloud has 337.*--bands"):
+        require_format(tmp_path / "cloud", "las", 337, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("file_format", "name"), [("netcdf", "cloud.nc"), ("zarr", "cloud.zarr")])
+def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, file_format, name: str) -> None:
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip({"netcdf": "h5netcdf", "zarr": "zarr"}[file_format])
+    written = random_cloud(COUNT)
+    for _ in range(2):  # the second replaces the first
+        path = write_cloud(tmp_path / "cloud", stream(written, 7), file_format)
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    options = {"engine": "h5netcdf"} if file_format == "netcdf" else {"engine": "zarr", "consolidated": False}
+    with xarray.open_dataset(path, **options) as table:
+        assert dict(table.sizes) == {"point": COUNT, "wavelength": 4}
+        np.testing.assert_array_equal(table.wavelength, WAVELENGTHS_NM)
+        assert table.wavelength.attrs["units"] == "nm"
+        assert {"x", "y", "z", "wavelength"} <= set(table.coords)
+        nearest = table.reflectance.sel(wavelength=640.0, method="nearest")
+        np.testing.assert_array_equal(nearest, written.spectra[:, 2])
+        np.testing.assert_array_equal(np.stack([table[axis] for axis in "xyz"], 1), written.points)
+        np.testing.assert_array_equal(np.stack([table[f"n{axis}"] for axis in "xyz"], 1), written.normals)
+        np.testing.assert_array_equal(table.green, written.colours[:, 1])
+        np.testing.assert_array_equal(table.opacity, written.extra["opacity"])
+
+
+@pytest.mark.parametrize(("file_format", "package"), [("las", "laspy"), ("netcdf", "h5netcdf"), ("zarr", "zarr")])
+def test_a_missing_package_is_one_sentence(tmp_path: Path, monkeypatch, file_format, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"needs the package {package}.*pip install 'hsi-sc-nerf\[formats\]'"):
+        write_cloud(tmp_path / "cloud", stream(random_cloud()), file_format)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file_format", ["ply", "las", "netcdf", "zarr"])
+def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> None:
+    before = write_cloud(tmp_path / "cloud", stream(random_cloud(COUNT)), file_format)
+    size = sum(file.stat().st_size for file in tmp_path.rglob("*"))
+
+    def breaking_off():
+        yield random_cloud(20)
+        raise RuntimeError("broken off")
+
+    with pytest.raises(RuntimeError, match="broken off"):
+        write_cloud(
+            tmp_path / "cloud", CloudStream(40, WAVELENGTHS_NM, ("opacity", "views"), breaking_off()), file_format
+        )
+    assert list(tmp_path.iterdir()) == [before]
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
+
+
+def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    (tmp_path / "cloud.zarr").mkdir()
+    (tmp_path / "cloud.zarr" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"cloud\.zarr: is no Zarr folder"):
+        write_cloud(tmp_path / "cloud", stream(random_cloud()), "zarr")
+    assert (tmp_path / "cloud.zarr" / "notes.txt").read_text() == "mine"

@@ -1,0 +1,108 @@
+"""Steps that are not finite; what TensorBoard is given, read back with its own reader."""
+
+import pytest
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from small_trainer import STEPS, trainer
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.amp.grad_scaler import GradScaler
+
+from hsi_sc_nerf.models.training_watch import (
+    MAX_SKIPPED_IN_A_ROW,
+    GuardedOptimizers,
+    NonFiniteGuard,
+    TrainingDivergedError,
+    non_finite_names,
+    stage_summary,
+)
+
+
+def optimizers():
+    groups = {name: [torch.nn.Parameter(torch.ones(3))] for name in ("fields", "camera_opt")}
+    config = {name: {"optimizer": AdamOptimizerConfig(lr=0.1), "scheduler": None} for name in groups}
+    return GuardedOptimizers(config, groups), groups
+
+
+def step(optimizers, groups):
+    optimizers.optimizer_scaler_step_some(GradScaler("cpu", enabled=False), list(groups))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_non_finite_gradient_changes_no_group(bad):
+    guarded, groups = optimizers()
+    groups["fields"][0].grad = torch.ones(3)
+    groups["camera_opt"][0].grad = torch.tensor([0.0, bad, 0.0])
+    step(guarded, groups)
+    assert guarded.skipped_groups == ("camera_opt",)
+    assert all((parameters[0] == 1.0).all() for parameters in groups.values())
+
+
+def test_finite_gradients_step():
+    guarded, groups = optimizers()
+    groups["fields"][0].grad = torch.ones(3)
+    step(guarded, groups)
+    assert guarded.skipped_groups == ()
+    assert (groups["fields"][0] < 1.0).all()
+    assert (groups["camera_opt"][0] == 1.0).all()
+
+
+def test_names_of_non_finite_terms():
+    losses = {"hsi_loss": torch.tensor(1.0), "angular_loss": torch.tensor(float("nan"))}
+    assert non_finite_names(losses) == ["angular_loss"]
+    assert non_finite_names({}) == []
+
+
+def test_guard_names_the_step_and_stops_after_the_limit_in_a_row():
+    guard = NonFiniteGuard()
+    assert guard.record(0, [], []) is None
+    assert "step 1 skipped: loss hsi_loss" in guard.record(1, ["hsi_loss"], ["fields"])
+    assert "gradient of fields" in guard.record(2, [], ["fields"])
+    assert guard.record(3, [], []) is None
+    for number in range(1, MAX_SKIPPED_IN_A_ROW):
+        guard.record(number, ["hsi_loss"], [])
+    with pytest.raises(TrainingDivergedError, match="step 99"):
+        guard.record(99, ["hsi_loss"], [])
+
+
+@pytest.fixture
+def events(tiny_dataset, tmp_path, monkeypatch):
+    """Everything that a small run logs."""
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
+    made = trainer(tiny_dataset, tmp_path, evaluate_stages=True, steps_per_eval_batch=4, steps_per_eval_image=4)
+    made.config.logging.steps_per_log = 1
+    made.config.full_frame.learn_after = {}
+    made.train()
+    accumulator = EventAccumulator(str(made.base_dir), size_guidance={"scalars": 0, "images": 0})
+    accumulator.Reload()
+    return accumulator
+
+
+@pytest.mark.slow
+def test_events_of_a_run(events):
+    tags = events.Tags()
+    losses = ["hsi_loss", "angular_loss", "interlevel_loss", "distortion_loss"]
+    metrics = ["sam", "rmse", "psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
+    expected = {
+        *(f"Train Loss Dict/{name}" for name in [*losses, "camera_opt_regularizer"]),
+        *(f"Train Metrics Dict/{name}" for name in metrics),
+        *(f"learning_rate/{group}" for group in ("fields", "proposal_networks", "camera_opt")),
+        *(f"Eval Images Metrics/{name}" for name in ("sam", "rmse", "psnr", "full_sam", "full_rmse", "full_psnr")),
+        *("Eval Images Metrics Dict (all images)/sam", "Eval Metrics Dict/psnr", "Train Rays / Sec"),
+    }
+    assert expected <= set(tags["scalars"])
+    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error")} <= set(tags["images"])
+
+    rates = [event.value for event in events.Scalars("learning_rate/fields")]
+    assert rates == pytest.approx([1e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
+    assert [event.step for event in events.Scalars("Train Loss")] == list(range(STEPS))
+    ends = [event.step for event in events.Scalars("Eval Images Metrics Dict (all images)/sam")]
+    assert ends == [STEPS // 2 - 1, STEPS - 1]
+
+
+def test_summary_names_both_readings():
+    values = {"sam": 0.0292, "rmse": 0.0305, "ssim": 0.888, "psnr": 29.14}
+    metrics = values | {f"full_{name}": 2 * value for name, value in values.items()}
+    assert stage_summary("masked", metrics) == (
+        "masked stage, held-out views: object SAM 0.0292 rad, RMSE 0.0305, SSIM 0.888, PSNR 29.1 dB; "
+        "whole frame SAM 0.0584 rad, RMSE 0.0610, SSIM 1.776, PSNR 58.3 dB"
+    )

@@ -1,0 +1,73 @@
+"""The normal equations against numerical derivatives, for markers and points alone and together."""
+
+import numpy as np
+import pytest
+from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
+from turntable_scene import MarkerScene
+
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, Problem
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
+
+NO_LOSS = 1e9
+"""So large a loss scale leaves the squares."""
+
+
+def markers(turntable, rng, **free):
+    observations = marker_observations(turntable, noise_px=0.5)
+    weights = rng.normal(size=(len(observations), 8, 8))
+    return MarkerResiduals(turntable, observations, NO_LOSS, weights, **free)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "free"),
+    [
+        ("m", FreeParameters(radial_terms=2)),
+        ("m", FreeParameters(radial_terms=1, motion_sigmas=(0.02, 0.003))),
+        ("held", FreeParameters(camera=False, motion_sigmas=(0.02, 0.003))),
+        ("sides", FreeParameters(camera=False, angles=False)),
+        ("p", FreeParameters(distance=False, radial_terms=2)),
+        ("mp", FreeParameters()),
+    ],
+)
+def test_a_step_is_that_of_numerical_derivatives(kinds, free):
+    rng = np.random.default_rng(0)
+    start = marker_turntable(
+        MarkerScene(frames=3, turn_deg=40.0, side_markers=2, disc_markers=2), radial=(-0.1, 0.05)
+    )
+    residuals = []
+    if kinds != "p":
+        options = {"held": {"free": False}, "sides": {"free_sides": True}}
+        residuals.append(markers(start, rng, **options.get(kinds, {})))
+    if "p" in kinds:
+        start = point_turntable(start, 12)
+        residuals.append(PointResiduals(start, point_tracks(start, noise_px=0.5), NO_LOSS, sigma_px=0.7))
+    problem = Problem(start, *residuals, free=free)
+    layout = problem.layout
+
+    def moved(turntable, step):
+        return problem.moved(turntable, step[: layout.motion_size], [step[columns] for columns in layout.landmarks])
+
+    def numbers(turntable):
+        prior = problem.scaled_motions(turntable).ravel()
+        return np.concatenate([*(part.values(turntable).ravel() for part in residuals), prior])
+
+    here = start if kinds == "sides" else moved(start, 0.03 * rng.normal(size=layout.size))
+    steps = 1e-6 * np.eye(layout.size)
+    if kinds == "sides":  # the turntable holds one side for all markers
+        steps = steps[np.setdiff1d(np.arange(layout.size), layout.landmarks[0][:, 6])]
+    jacobian = np.stack([(numbers(moved(here, d)) - numbers(moved(here, -d))) / 2e-6 for d in steps], axis=-1)
+    normal, gradient = jacobian.T @ jacobian, jacobian.T @ numbers(here)
+    equations = problem.normal_equations(here)
+    if kinds == "sides":
+        found = [(part.normal[:, :6, :6], part.gradient[:, :6]) for part in equations.landmarks]
+        ((blocks, right),) = found
+        np.testing.assert_allclose(right.ravel(), gradient, atol=1e-5 * np.abs(gradient).max())
+        np.testing.assert_allclose(blocks[1], normal[6:12, 6:12], atol=1e-5 * np.abs(normal).max())
+        return
+    step, landmark_steps = equations.solve(1.0)
+    whole = -np.linalg.lstsq(normal + np.diag(np.diag(normal)), gradient)[0]
+    found = np.concatenate([step, *(part.ravel() for part in landmark_steps)])
+    np.testing.assert_allclose(found, whole, atol=2e-5 * np.abs(whole).max())
+    m = layout.motion_size
+    schur = normal[:m, :m] - normal[:m, m:] @ np.linalg.pinv(normal[m:, m:], hermitian=True) @ normal[m:, :m]
+    np.testing.assert_allclose(equations.information(), schur, atol=1e-4 * np.abs(schur).max())

@@ -1,0 +1,54 @@
+"""What the checks of poses find, by name and level."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from capture_factory import true_poses
+
+from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.poses.pose_checks import check_poses
+from hsi_sc_nerf.poses.result import Scale
+
+GOOD = true_poses([None] * 4, list("abcd"))
+SCALE = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.0905)
+ODD = replace(SCALE, marker_sides={3: 1.02, 4: 0.98}, marker_side_sigmas={3: 0.002, 4: 0.02})
+STEPS = SessionInfo(nominal_step_deg=90.0, direction="ccw")
+
+
+def levels(poses, info=STEPS):
+    return {finding.name: finding.level for finding in check_poses(poses, info)}
+
+
+@pytest.mark.parametrize(
+    ("poses", "info", "expected"),
+    [
+        (GOOD, STEPS, {}),
+        (GOOD, SessionInfo(), {}),
+        (replace(GOOD, overall_error_px=1.2), STEPS, {"poses-error": "amber"}),
+        (replace(GOOD, dropped={"a": "hidden"}), STEPS, {"poses-frames": "amber"}),
+        (GOOD, replace(STEPS, direction="cw"), {"poses-direction": "red"}),
+        (GOOD, replace(STEPS, nominal_step_deg=80.0), {"poses-angles": "red"}),
+        (replace(GOOD, angles_deg=np.array([0.0, 90, 210, 270])), STEPS, {"poses-angles": "amber"}),
+        (replace(GOOD, used=np.array([True, False, True, True])), STEPS, {}),
+        (replace(GOOD, scale=SCALE), STEPS, {"poses-scale": "green"}),
+        (replace(GOOD, scale=replace(SCALE, measured_container_diameter_m=0.0958)), STEPS, {"poses-scale": "red"}),
+        (replace(GOOD, scale=replace(SCALE, measured_container_diameter_m=0.0865)), STEPS, {"poses-scale": "red"}),
+        (
+            replace(GOOD, scale=replace(SCALE, measured_container_diameter_m=0.0958, uncertainty=0.03)),
+            STEPS,
+            {"poses-scale": "green"},
+        ),
+        (
+            replace(
+                GOOD, scale=replace(SCALE, marker_sides={3: 1.02, 4: 0.98}, marker_side_sigmas={3: 0.002, 4: 0.02})
+            ),
+            STEPS,
+            {"poses-scale": "green", "poses-markers": "amber"},
+        ),
+    ],
+)
+def test_contradictions_are_found(poses, info, expected):
+    assert levels(poses, info) == expected
