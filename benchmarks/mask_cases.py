@@ -18,7 +18,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import tyro
-from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
+from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from jaxtyping import Float
 from results_table import RESULTS, write_results
 from rich.progress import track
@@ -67,7 +67,7 @@ class PatternedWall(TexturedBackground):
 
 @dataclass(frozen=True)
 class Poster(TexturedBackground):
-    """A white wall with a poster of leaves behind the object only: nothing tells it from a plant but that it stands."""
+    """A white wall with a poster of leaves behind the object only: only that it stands tells it from a plant."""
 
     name: ClassVar[str] = "poster"
     materials: ClassVar[tuple[str, ...]] = ("husk",)
