@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
 import tyro
+from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
