@@ -25,15 +25,14 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
 from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
-from hsi_sc_nerf.evaluation.comparison import CompareConfig
+from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
-from hsi_sc_nerf.evaluation.surface_files import read_surface
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.scores.processing import score_processing
-from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
+from hsi_sc_nerf.simulate.scores.surface import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")

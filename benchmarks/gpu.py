@@ -3,8 +3,8 @@
     python benchmarks/gpu.py --output-dir /tmp/gpu
 
 Parts run one after the other, each in processes of its own, and a part that fails loses only its own rows. The
-session (60 noisy views of the simulated pear, 512 x 512 x 204) is made by all cores while the tests run. Rows are
-added to benchmarks/results/gpu.csv as they come. Where Open3D is missing, `gpu_stand_ins` takes its place.
+session is 60 noisy views of the simulated pear, 512 x 512 x 204. Rows are added to benchmarks/results/gpu.csv as they
+come. Where Open3D is missing, `gpu_stand_ins` takes its place.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,6 +48,8 @@ COLUMNS = {
 METRICS = {"SAM, rad": "sam", "RMSE": "rmse", "SSIM": "ssim", "PSNR, dB": "psnr"}
 STEPS = {"graph": "", "eager": "--capture-steps False"}
 """How a step is launched, and the words that say so."""
+EFFECTS = ("photon_noise", "read_noise", "chamber_shading")
+"""Those of benchmarks/beyond_the_paper.py."""
 PLUGIN = {
     "NERFSTUDIO_METHOD_CONFIGS": "hsi-sc-nerf=hsi_sc_nerf.config:hsi_sc_nerf,"
     "hsi-sc-nerf-paper=hsi_sc_nerf.config:hsi_sc_nerf_paper",
@@ -84,7 +85,7 @@ class GpuBenchmark:
     """Folder of the CSV file to which rows are added."""
     commit: str = ""
     """Of the code; where it is not given, git is asked."""
-    parts: tuple[str, ...] = ("tests", "demo", "session", "profile", "train")
+    parts: tuple[str, ...] = ("tests", "demo", "session", "train")
     """Which parts."""
     scene: str = "pear"
     """Of the session."""
@@ -94,8 +95,6 @@ class GpuBenchmark:
     """Width and height of its frames, pixels."""
     bands: int = 204
     """Of its frames."""
-    demo_size: int = 128
-    """Of the demo, which has 36 frames."""
     demo_iterations: int = 500
     """Of the demo."""
     runs: tuple[str, ...] = (
@@ -124,14 +123,8 @@ class GpuBenchmark:
         self.output_dir.mkdir(parents=True, exist_ok=True)
         self.output_dir, self.commit = self.output_dir.resolve(), self.commit or current_commit()
         self._say(f"{_machine()}, commit {self.commit}")
-        session: subprocess.Popen | None = None
-        if "session" in self.parts:
-            session = self._start_session()
-        if "tests" in self.parts:
-            self._guarded("tests", self._tests)
-        if session is not None:
-            self._guarded("session", lambda: self._wait_for(session))
-        for name, work in (("demo", self._demo), ("profile", self._profile), ("train", self._train)):
+        parts = {"tests": self._tests, "session": self._session, "demo": self._demo, "train": self._train}
+        for name, work in parts.items():
             if name in self.parts:
                 self._guarded(name, work)
         self._say("done")
@@ -212,7 +205,7 @@ class GpuBenchmark:
         """The demo's steps; its iterations and scene are the command's own where nothing else is asked for."""
         folder = self.output_dir / "demo"
         words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "demo", "--output-dir", str(folder)]
-        words += ["--scene", str(self._demo_scene()), "--iterations", str(self.demo_iterations)]
+        words += ["--scene", self.scene, "--iterations", str(self.demo_iterations)]
         try:
             self._command("demo", words, 240.0)
         except RuntimeError:
@@ -221,7 +214,7 @@ class GpuBenchmark:
             raise
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         metrics = summary["metrics"]
-        size = f"36 views of {self.demo_size} x {self.demo_size}"
+        size = "36 views of 128 x 128"
         common = {"part": "demo", "configuration": "ours", "step": "graph"}
         for cost in summary["steps"]:
             measured = {"train, s": cost["seconds"], "process, MiB": cost["peak_memory_mib"]}
@@ -230,60 +223,31 @@ class GpuBenchmark:
         note = f"{size}; F-score at 2 mm {metrics['f_score']:.2f} %"
         self._row(**common, stage="all", iterations=self.demo_iterations, note=note, **measured)
 
-    def _demo_scene(self) -> Path | str:
-        if self.demo_size == 128:
-            return "pear"
-        shipped = (ROOT / "hsi_sc_nerf/simulate/scenes/pear.yaml").read_text(encoding="utf-8")
-        path = self.output_dir / "pear.yaml"
-        path.write_text(shipped.replace("size_px: 128", f"size_px: {self.demo_size}"), encoding="utf-8")
-        return path
-
-    def _start_session(self) -> subprocess.Popen:
-        words = [sys.executable, str(ROOT / "benchmarks" / "gpu_session.py"), str(self._data.parent)]
-        words += ["--scene", self.scene, "--frames", str(self.frames), "--size", str(self.size)]
-        words += ["--bands", str(self.bands)]
-        with (self.output_dir / "session.log").open("wb") as log:
-            return subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, env=self._environment(), cwd=ROOT)
-
-    def _wait_for(self, session: subprocess.Popen) -> None:
-        try:
-            status = session.wait(timeout=300.0)
-        except subprocess.TimeoutExpired:
-            session.kill()
-            raise
-        log = (self.output_dir / "session.log").read_text(encoding="utf-8", errors="replace")
-        print(log[-1500:], flush=True)
-        if status != 0:
-            raise RuntimeError("the session could not be made")
-        told = "; ".join(line for line in log.splitlines() if line.startswith(("simulated", "processed")))
-        self._row(part="session", note=told)
+    def _session(self) -> None:
+        """Simulate and process the session, each with all cores."""
+        session = self._data.parent / "session"
+        size = ["--frames", str(self.frames), "--size", str(self.size), "--bands", str(self.bands)]
+        command = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
+        self._data.parent.mkdir(parents=True, exist_ok=True)
+        simulated = self._command(
+            "simulate", [*command, "simulate", self.scene, str(session), *size, "--effects", *EFFECTS], 300.0
+        )
+        workers = str(max(2, min(12, (os.cpu_count() or 2) // 2)))
+        words = ["process", str(session), "--output-dir", str(self._data), "--workers", workers]
+        processed = self._command("process", [*command, *words], 300.0)
+        self._row(part="session", note=f"simulated in {simulated:.1f} s; processed in {processed:.1f} s")
 
     @property
     def _data(self) -> Path:
         return self.output_dir / f"{self.scene}-{self.size}-{self.frames}" / "data"
 
-    def _profile(self) -> None:
-        script = str(ROOT / "benchmarks" / "gpu_profile.py")
-        folder = str(self.output_dir / "profile")
-        self._command("profile", [sys.executable, script, str(self._data), folder, "hsi-sc-nerf"], 150.0)
-        log = (self.output_dir / "profile.log").read_text(encoding="utf-8", errors="replace")
-        for line in log.splitlines():
-            if line.startswith("ROW "):
-                self._row(part="profile", configuration="ours", **json.loads(line[4:]))
-        print(log[-6000:], flush=True)
-
     def _train(self) -> None:
         for number, text in enumerate(self.runs):
-            with self._going_on(text):
+            try:
                 self._train_one(number, Run.parse(text))
-
-    @contextmanager
-    def _going_on(self, text: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            self._say(f"{text} FAILED: {error!r}")
-            self._row(part="train", note=f"{text} failed: {error}"[:300])
+            except Exception as error:
+                self._say(f"{text} FAILED: {error!r}")
+                self._row(part="train", note=f"{text} failed: {error}"[:300])
 
     def _train_one(self, number: int, run: Run) -> None:
         """One training in a process of its own, as `hsi-sc-nerf benchmark` does it."""

@@ -23,9 +23,9 @@ from rich.console import Console
 from rich.progress import track
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.simulate.effects.detector import band_centres_nm
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
-from hsi_sc_nerf.simulate.sensor import band_centres_nm
 from hsi_sc_nerf.tables import screen_table
 
 matplotlib.use("agg")

@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate import assemble, sensor
+from hsi_sc_nerf.simulate import assemble
+from hsi_sc_nerf.simulate.effects.detector import band_centres_nm
 from hsi_sc_nerf.simulate.effects.motion import MotionEffect
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.render import Part
@@ -119,7 +120,7 @@ def _band_edges_nm(scene: Scene) -> Float[np.ndarray, "bands+1"]:
     The simulator evaluates spectra at the band centres. Here each value is constant over its band, so the widths of
     the bands do not matter.
     """
-    centres_nm = sensor.band_centres_nm(scene.sensor.bands)
+    centres_nm = band_centres_nm(scene.sensor.bands)
     return np.linspace(centres_nm[0], centres_nm[-1], scene.sensor.bands + 1)
 
 
@@ -162,7 +163,7 @@ def _spectrum(scene: Scene, values: Float[np.ndarray, "bands"] | None = None) ->
 
 
 def _material(scene: Scene, name: str, factor: float = 1.0) -> dict[str, Any]:
-    values = endmembers([name], sensor.band_centres_nm(scene.sensor.bands), scene.materials)[0]
+    values = endmembers([name], band_centres_nm(scene.sensor.bands), scene.materials)[0]
     return _spectrum(scene, factor * values)
 
 

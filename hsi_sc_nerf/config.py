@@ -19,7 +19,7 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
-from hsi_sc_nerf.models.stages import StageConfig, exponential_decay, full_frame_stage, masked_stage
+from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.viewer.panel import attach_spectral_panel
 
 allow_nerfstudio_checkpoints()
@@ -39,8 +39,8 @@ def _adam(lr: float) -> dict:
 
 
 def _published_lr(step: int) -> float:
-    """Factor on the learning rates in the paper's released schedule."""
-    return exponential_decay(paper.LEARNING_RATE_DECAY, paper.LEARNING_RATE_DECAY_STEPS, step)
+    """Factor on the learning rates in the paper's released schedule, which is longer than the run."""
+    return paper.LEARNING_RATE_DECAY ** (step / paper.LEARNING_RATE_DECAY_STEPS)
 
 
 def _method(

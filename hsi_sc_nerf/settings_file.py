@@ -121,7 +121,7 @@ def _outside_range(values: Any, prefix: str) -> Iterator[tuple[str, float, str]]
     """Name, value and description of the range of each field outside its range."""
     for f in dataclasses.fields(values):
         value = getattr(values, f.name)
-        if dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
             yield from _outside_range(value, f"{prefix}{f.name}.")
         elif "range" in f.metadata and value is not None:
             low, high = f.metadata["range"]

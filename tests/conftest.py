@@ -1,3 +1,4 @@
+import fcntl
 import os
 
 import pytest
@@ -22,15 +23,25 @@ def one_blas_thread():
 
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory):
-    """A processed session of ten small frames with few bands, and the session that it was made from."""
+    """A processed session of ten small frames with few bands, and the session that it was made from.
+
+    All test processes share it: the first makes it, the others wait. It must not be written to.
+    """
     from hsi_sc_nerf.processing.process import process_session
     from hsi_sc_nerf.simulate.scene import load_scene, override
     from hsi_sc_nerf.simulate.session import simulate_session
 
-    folder = tmp_path_factory.mktemp("tiny")
-    scene = override(load_scene("pear"), frames=10, size_px=112, bands=12, seed=None)
-    session = simulate_session(scene, folder / "session", progress=False)
-    return process_session(session, folder / "data", progress=False), session
+    root = tmp_path_factory.getbasetemp()
+    folder = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "tiny"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "data" / "transforms.json").exists():
+            scene = override(load_scene("pear"), frames=10, size_px=112, bands=12, seed=None)
+            process_session(
+                simulate_session(scene, folder / "session", progress=False), folder / "data", progress=False
+            )
+    return folder / "data", folder / "session"
 
 
 @pytest.fixture(scope="session")

@@ -13,9 +13,8 @@ from plyfile import PlyData, PlyElement
 from scipy.interpolate import CubicSpline
 
 from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate.materials import over, smooth_noise, smoothstep
 from hsi_sc_nerf.simulate.mesh import revolve
-from hsi_sc_nerf.simulate.plants import smoothstep
-from hsi_sc_nerf.simulate.texture import over, smooth_noise
 
 MATERIALS = ("pepper_red", "pepper_green", "pepper_stem")
 HEIGHT_M = 0.105

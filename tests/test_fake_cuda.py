@@ -82,8 +82,6 @@ def small(method, data, **changes):
 
 METHODS = {
     "ours": (hsi_sc_nerf, {}),
-    "learned background": (hsi_sc_nerf, {"background": "learned-image", "hsi_loss": "charbonnier"}),
-    "groups": (hsi_sc_nerf, {"head": "direct", "density_groups": 3, "background": "spectrum"}),
     # Normals of the density are gradients, which need a GPU.
     "paper": (hsi_sc_nerf_paper, {"predict_normals": False}),
 }

@@ -125,7 +125,7 @@ def lowest_edge_m(points_m: Float[np.ndarray, "n 3"]) -> float:
 
 def _centre(points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2"]:
     """x and y of the centre of the lowest strip."""
-    low = points_m[points_m[:, 2] < _edge(points_m[:, 2]) + _STRIP_M, :2]
+    low = points_m[points_m[:, 2] < np.quantile(points_m[:, 2], _OUTLIERS) + _STRIP_M, :2]
     return (low.min(axis=0) + low.max(axis=0)) / 2.0
 
 
@@ -134,16 +134,11 @@ def _sectors(offset_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     return (azimuth * (SECTORS / (2.0 * np.pi))).astype(int) % SECTORS
 
 
-def _edge(z_m: Float[np.ndarray, "n"]) -> float:
-    """Height of the lowest points, without outliers."""
-    return float(np.quantile(z_m, _OUTLIERS))
-
-
 def _edges(z_m: Float[np.ndarray, "n"], sector: Int[np.ndarray, "n"]) -> Float[np.ndarray, "sectors"]:
-    """`_edge` of each sector; NaN where it has no points."""
+    """Height of the lowest points of each sector, without outliers; NaN where it has no points."""
     edges = np.full(SECTORS, np.nan)
     for index in np.unique(sector):
-        edges[index] = _edge(z_m[sector == index])
+        edges[index] = np.quantile(z_m[sector == index], _OUTLIERS)
     return edges
 
 

@@ -52,13 +52,7 @@ def classify(
 
     The angle does not depend on brightness, so shade does not change a class.
 
-    Args:
-        spectra: reflectance.
-        references: reflectance of each class.
-        threshold_rad: largest angle of a class's spectra to its reference.
-
-    Returns:
-        Index of each spectrum's reference; -1 where every angle exceeds the threshold.
+    -1 is returned where every angle exceeds ``threshold_rad``.
 
     Example:
         >>> references = np.array([[0.1, 0.5], [0.5, 0.1]])
@@ -68,12 +62,6 @@ def classify(
     angles = spectral_angles(spectra, references)
     nearest = angles.argmin(axis=1)
     return np.where(angles.min(axis=1) <= threshold_rad, nearest, UNCLASSIFIED)
-
-
-def vertex_areas_m2(mesh: Mesh) -> Float[np.ndarray, "v"]:
-    """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
-    thirds = np.repeat(mesh.triangle_areas_m2() / 3.0, 3)
-    return np.bincount(mesh.triangles.ravel(), thirds, minlength=len(mesh.vertices))
 
 
 def class_areas_m2(
@@ -107,12 +95,8 @@ def unmix(
 ) -> tuple[Float[np.ndarray, "n endmembers"], Float[np.ndarray, "n"]]:
     """Linear spectral unmixing: the fraction of each endmember in each spectrum.
 
-    Non-negative least squares (Heinz and Chang, "Fully constrained least squares linear spectral mixture analysis",
-    2001). The fractions are scaled to add up to 1 afterwards, so that they do not depend on brightness.
-
-    Args:
-        spectra: reflectance.
-        endmembers: reflectance of the pure materials.
+    Non-negative least squares (Heinz and Chang 2001, "Fully constrained least squares linear spectral mixture
+    analysis"). The fractions are scaled to add up to 1 afterwards, so that they do not depend on brightness.
 
     Returns:
         Fractions in [0, 1], which add up to 1 (all 0 where a spectrum holds no endmember), and the spectral angle

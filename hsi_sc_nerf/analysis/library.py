@@ -54,21 +54,15 @@ class SpectralLibrary:
                 f"to {wavelengths_nm.max():g} nm; give a library that covers the cloud."
             )
         order = np.argsort(self.wavelengths_nm)
-        spectra = np.stack(
-            [np.interp(wavelengths_nm, self.wavelengths_nm[order], row[order]) for row in self.spectra]
-        )
-        missing = np.isnan(spectra)
-        if missing.any():
-            where = [
-                f"{name} at {wavelengths_nm[row.argmax()]:g} nm"
-                for name, row in zip(self.names, missing, strict=True)
-                if row.any()
-            ]
+        rows = [np.interp(wavelengths_nm, self.wavelengths_nm[order], row[order]) for row in self.spectra]
+        missing = {name: np.isnan(row) for name, row in zip(self.names, rows, strict=True) if np.isnan(row).any()}
+        if missing:
+            where = [f"{name} at {wavelengths_nm[row.argmax()]:g} nm" for name, row in missing.items()]
             raise InputError(
                 f"the spectral library has no reflectance of {', '.join(where)}; leave such spectra out (--classes), "
                 "or export the cloud without these bands (--bands)."
             )
-        return SpectralLibrary(self.names, wavelengths_nm, spectra)
+        return SpectralLibrary(self.names, wavelengths_nm, np.stack(rows))
 
     def only(self, names: tuple[str, ...]) -> SpectralLibrary:
         """The spectra of these names, in the library's order.
@@ -113,8 +107,8 @@ def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
             raise ValueError("it holds numbers that are not finite")
     except (ValueError, OSError) as error:
         raise InputError(
-            f"{path}: is no table of spectra ({error}); its first line names the columns, its first column is the "
-            "wavelength in nm, and each other column is a spectrum."
+            f"{path}: is no table of spectra ({error}); give names in the first line, wavelengths in nm in the first "
+            "column, and a spectrum in each other column."
         ) from error
     wavelengths = table[:, 0]
     nm_per_unit = 1000.0 if wavelengths.max() < _SMALLEST_NM else 1.0
@@ -153,19 +147,11 @@ def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 def _envi_pair(path: Path) -> tuple[Path, Path]:
     """Header and data file of a library, either of which is given."""
-    if path.suffix.lower() == ".hdr":
-        base = path.with_suffix("")
-        data = next((one for one in (base, *_ending(base, ".sli")) if one.is_file()), None)
-        if data is None:
-            raise InputError(f"{path}: its library {base.name}.sli is missing; put it beside the header.")
-        return path, data
-    candidates = [*_ending(path.with_suffix(""), ".hdr"), *_ending(path, ".hdr")]
-    header = next((one for one in candidates if one.is_file()), None)
-    if header is None:
-        raise InputError(f"{path}: its header {candidates[0].name} is missing; put it beside the library.")
-    return header, path
-
-
-def _ending(base: Path, ending: str) -> list[Path]:
-    """``base`` with the ending in lower and upper case."""
-    return [base.with_name(base.name + one) for one in (ending, ending.upper())]
+    given_header, base = path.suffix.lower() == ".hdr", path.with_suffix("")
+    stems, endings = ([base], ("", ".sli", ".SLI")) if given_header else ([base, path], (".hdr", ".HDR"))
+    candidates = [stem.with_name(stem.name + ending) for stem in stems for ending in endings]
+    other = next((one for one in candidates if one.is_file()), None)
+    if other is None:
+        missing = f"library {base.name}.sli" if given_header else f"header {base.name}.hdr"
+        raise InputError(f"{path}: its {missing} is missing; put it there.")
+    return (path, other) if given_header else (other, path)

@@ -14,12 +14,12 @@ from matplotlib.patches import Patch
 
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
-from hsi_sc_nerf.analysis.traits import WHOLE, Traits
+from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
 from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
 from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
-from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.spectra.composites import available_composites, composite
+from hsi_sc_nerf.spectra.indices import available_indices, index_values
 
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
@@ -56,54 +56,44 @@ class SideViews:
             triangle = np.where(hit, hits["primitive_ids"].numpy(), 0).astype(np.int64)
             self.sides.append((hit, triangle, np.stack([1.0 - u - v, u, v], axis=-1)))
 
-    def of(self, values: Float[np.ndarray, "v *channels"]) -> list[Float[np.ndarray, "h w *channels"]]:
-        """Pictures of vertex values, one a side, interpolated within triangles; NaN beside the object."""
+    def on_white(self, colours: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "h w 3"]]:
+        """Pictures of the vertices' colours, one a side, interpolated within triangles; white beside the object."""
         pictures = []
         for hit, triangle, barycentric in self.sides:
-            corners = values[self._mesh.triangles[triangle]]
-            mixed = np.einsum("hwc,hwc...->hw...", barycentric, corners)
-            mixed[~hit] = np.nan
+            mixed = np.einsum("hwc,hwcj->hwj", barycentric, colours[self._mesh.triangles[triangle]])
+            mixed[~hit] = 1.0
             pictures.append(mixed)
         return pictures
 
 
 @rc_context(STYLE)
-def draw_composites(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
-    """The named composites in rows, the sides in columns; unseen surface is grey.
-
-    Args:
-        path: the PNG file.
-        surface: the mesh.
-        views: of the mesh.
-        traits: say which composites the bands can show.
-    """
+def draw_composites(path: Path, surface: SpectralMesh, views: SideViews) -> None:
+    """The named composites in rows, the sides in columns; unseen surface is grey."""
     rows = {}
-    for name in traits.composites[WHOLE]:
-        one = COMPOSITES[name]
-        values = composite(surface.spectra, surface.wavelengths_nm, one.wavelengths_nm, name).astype(float)
+    for one in available_composites(surface.wavelengths_nm):
+        values = composite(surface.spectra, surface.wavelengths_nm, one.wavelengths_nm, one.name).astype(float)
         # Brightened, so that dark tissue can be seen; the brightest percent is clipped.
         values = np.clip(values / np.percentile(values[surface.seen], 99.0), 0.0, 1.0)
         values[~surface.seen] = _GREY
-        label = f"{name}\n{', '.join(f'{nm:g}' for nm in one.wavelengths_nm)} nm"
-        rows[label] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(values)]
+        rows[f"{one.name}\n{', '.join(f'{nm:g}' for nm in one.wavelengths_nm)} nm"] = views.on_white(values)
     _draw_rows(path, rows)
 
 
 @rc_context(STYLE)
-def draw_indices(path: Path, surface: SpectralMesh, views: SideViews, traits: Traits) -> None:
+def draw_indices(path: Path, surface: SpectralMesh, views: SideViews) -> None:
     """The named indices as colour maps in rows, the sides in columns; unseen surface is grey.
 
     The scale of each goes from its 1st to its 99th percentile on this surface.
     """
     rows, scales = {}, []
-    for name in traits.indices[WHOLE]:
-        values = index_values(INDICES[name], surface.spectra, surface.wavelengths_nm).astype(float)
-        known = values[surface.seen & np.isfinite(values)]
-        low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
+    for index in available_indices(surface.wavelengths_nm):
+        values = index_values(index, surface.spectra, surface.wavelengths_nm).astype(float)
+        known = surface.seen & np.isfinite(values)
+        low, high = np.percentile(values[known], (1, 99)) if known.any() else (0.0, 1.0)
         coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
-        coloured[~surface.seen | ~np.isfinite(values)] = _GREY
-        expression = INDICES[name].expression.replace(" / (", " /\n(")
-        rows[f"{name}\n{expression}"] = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(coloured)]
+        coloured[~known] = _GREY
+        expression = index.expression.replace(" / (", " /\n(")
+        rows[f"{index.name}\n{expression}"] = views.on_white(coloured)
         scales.append((low, high))
     _draw_rows(path, rows, scales)
 
@@ -136,7 +126,7 @@ def draw_classes(
     colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = _GREY
-    pictures = [np.where(np.isnan(picture), 1.0, picture) for picture in views.of(painted)]
+    pictures = views.on_white(painted)
     height, width = pictures[0].shape[:2]
     figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
@@ -148,9 +138,8 @@ def draw_classes(
         for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
         if area > 0
     ]
-    rest = f"in no class: {areas_cm2[-1]:.2f} cm²"
     patches += [
-        Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest),
+        Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=f"in no class: {areas_cm2[-1]:.2f} cm²"),
         Patch(color=str(_GREY), label="not seen"),
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
@@ -164,9 +153,9 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
     axes = figure.subplots()
     order = np.argsort(wavelengths_nm)
     nm = wavelengths_nm[order]
-    for index, region in enumerate(traits.spectra):
+    for index, region in enumerate(traits.regions):
         colour = "0.35" if index == 0 else COLOURS[(index - 1) % len(COLOURS)]
-        mean, sd = region.mean[order], region.sd[order]
+        mean, sd = region.spectrum.mean[order], region.spectrum.sd[order]
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
         label = f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)"
         axes.plot(nm, mean, color=colour, linewidth=1.5, marker="o" if len(nm) == 1 else None, label=label)

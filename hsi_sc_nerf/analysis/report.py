@@ -1,95 +1,59 @@
-"""Traits as a page, as JSON and as a table of spectra."""
+"""Traits as JSON, as tables with units, as a page, and the regions' spectra as CSV."""
 
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.size import Size
-from hsi_sc_nerf.analysis.traits import WHOLE, Traits
-from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, Traits
+from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.spectra.composites import COMPOSITES
 from hsi_sc_nerf.tables import markdown_table
 
+# Name, unit, and the unit's factor on metres, square metres or litres.
 _SIZES = {
-    "area_m2": ("surface area", "m²", 1.0),
-    "volume_l": ("volume", "L", 1.0),
-    "height_m": ("height", "mm", 1000.0),
-    "largest_diameter_m": ("largest diameter", "mm", 1000.0),
-    "smallest_diameter_m": ("smallest diameter", "mm", 1000.0),
-    "equivalent_diameter_m": ("diameter of the sphere of equal volume", "mm", 1000.0),
+    "area_m2": ("surface area", "cm²", 1e4),
+    "volume_l": ("volume", "mL", 1e3),
+    "height_m": ("height", "mm", 1e3),
+    "largest_diameter_m": ("largest diameter", "mm", 1e3),
+    "smallest_diameter_m": ("smallest diameter", "mm", 1e3),
+    "equivalent_diameter_m": ("diameter of the sphere of equal volume", "mm", 1e3),
 }
 _CM2_PER_M2 = 1e4
 _LISTED_REGIONS = 20
 
 
-def write_page(
-    path: Path,
-    title: str,
-    size: Size,
-    spread: Size | None,
-    watertight: bool,
-    traits: Traits,
-    pictures: Mapping[str, str],
-) -> None:
-    """The page ``traits.md``: sizes, classes, indices, composites and pictures.
+class TraitTable(NamedTuple):
+    """A table with its heading, and what a reader must know of it."""
+
+    heading: str
+    note: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+def trait_content(
+    size: Size, spread: Size | None, watertight: bool, traits: Traits, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """``traits.json``: everything but spectra, in metres, square metres and litres; NaN is null.
 
     Args:
-        path: the file.
-        title: name of the cloud.
         size: of the object.
         spread: standard deviation of each size; None if it was not determined.
         watertight: whether the mesh encloses a volume.
         traits: from the spectra.
-        pictures: file names by caption.
+        settings: of the command.
     """
-    closed_cm2 = (size.area_m2 - traits.seen_m2) * _CM2_PER_M2
-    parts = [f"# Traits of {title}", "## Size", _size_table(size, spread)]
-    state = "watertight" if watertight else "NOT watertight, so its volume cannot be trusted"
-    uncertain = (
-        " ± is the standard deviation from random halves of the cloud. It does not include errors that points have "
-        "in common, such as those of scale, poses or training."
-        if spread
-        else ""
-    )
-    parts.append(
-        f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
-        f"{uncertain}"
-    )
-    if traits.classes is not None:
-        parts += _class_tables(traits)
-    for heading, table, digits in (("Indices", traits.indices, 3), ("Composites", traits.composites, 3)):
-        names = list(table[WHOLE])
-        if names:
-            titles = [f"{name}, {_nm(name)}" if name in COMPOSITES else name for name in names]
-            rows = [
-                [region, *(_plus_minus(values[name].mean, values[name].sd, digits) for name in names)]
-                for region, values in table.items()
-            ]
-            parts += [f"## {heading}", markdown_table(["region", *titles], rows)]
-    if traits.composites[WHOLE]:
-        parts.append(
-            "Mean ± standard deviation over the surface, weighted by area; of composites the reflectance shown as "
-            "red, green and blue. Area and volume are the same for each composite: all bands share one geometry."
-        )
-    parts += [f"## Pictures\n\n{_picture(caption, name)}" for caption, name in list(pictures.items())[:1]]
-    parts += [_picture(caption, name) for caption, name in list(pictures.items())[1:]]
-    with atomic_write(path) as (temporary,):
-        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-
-
-def write_traits_json(
-    path: Path, size: Size, spread: Size | None, watertight: bool, traits: Traits, settings: Mapping[str, Any]
-) -> None:
-    """Everything but spectra, in metres, square metres and litres; NaN is null."""
     classes = traits.classes
-    content: dict[str, Any] = {
+    return {
         "settings": dict(settings),
         "size": asdict(size),
         "size_sd": asdict(spread) if spread else None,
@@ -105,87 +69,124 @@ def write_traits_json(
             "mixture_unclassified_m2": classes.mixture_unclassified_m2,
             "regions": [{**asdict(region), "label": classes.names[region.label]} for region in classes.regions],
         },
-        "regions": {region.name: {"area_m2": region.area_m2} for region in traits.spectra},
-    }
-    for key, table in (("indices", traits.indices), ("composites", traits.composites)):
-        for region, values in table.items():
-            content["regions"][region][key] = {
-                name: {"mean": _plain(value.mean), "sd": _plain(value.sd)} for name, value in values.items()
+        "regions": {
+            region.name: {
+                "area_m2": region.area_m2,
+                "indices": {name: _plain(value) for name, value in region.indices.items()},
+                "composites": {name: _plain(value) for name, value in region.composites.items()},
             }
-    write_json(path, content)
+            for region in traits.regions
+        },
+    }
+
+
+def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
+    """Sizes, classes, indices and composites in mm, cm² and mL, from the content of ``traits.json``.
+
+    Raises:
+        AttributeError, KeyError, TypeError, ValueError: it is no such content.
+    """
+    size, spread, seen_m2 = content["size"], content["size_sd"], content["seen_area_m2"]
+    state = "watertight" if content["watertight"] else "NOT watertight, so its volume cannot be trusted"
+    closed_cm2 = _CM2_PER_M2 * (size["area_m2"] - seen_m2)
+    note = f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
+    if spread:
+        note += (
+            " ± is the standard deviation from random halves of the cloud. It does not include errors that points "
+            "have in common, such as those of scale, poses or training."
+        )
+    rows = [
+        [name, with_spread(factor * size[key], factor * spread[key] if spread else None), unit]
+        for key, (name, unit, factor) in _SIZES.items()
+    ]
+    tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
+    if content["classes"]:
+        tables += _class_tables(content["classes"], seen_m2)
+    for heading, note in (
+        ("Indices", "Mean ± standard deviation over the surface, weighted by area."),
+        ("Composites", "Mean ± standard deviation of the reflectance shown as red, green and blue."),
+    ):
+        regions = {name: region[heading.lower()] for name, region in content["regions"].items()}
+        names = list(regions[WHOLE])
+        if names:
+            header = ["region", *(f"{name}, {_nm(name)}" if name in COMPOSITES else name for name in names)]
+            rows = [[region, *(_mean_and_sd(values[name]) for name in names)] for region, values in regions.items()]
+            tables.append(TraitTable(heading, note, header, rows))
+    return tables
+
+
+def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable]:
+    areas = classes["areas_m2"] | {"in no class": classes["unclassified_m2"]}
+    mixtures = classes["mixture_areas_m2"] | {"in no class": classes["mixture_unclassified_m2"]}
+    labels = [region["label"] for region in classes["regions"]]
+    rows = [
+        [
+            *(name, f"{_CM2_PER_M2 * area:.2f}", f"{area / seen_m2:.1%}", str(labels.count(name))),
+            *(f"{_CM2_PER_M2 * mixtures[name]:.2f}", f"{mixtures[name] / seen_m2:.1%}"),
+        ]
+        for name, area in areas.items()
+    ]
+    listed = [
+        [region["label"], f"{_CM2_PER_M2 * region['area_m2']:.2f}", *(f"{1e3 * x:.1f}" for x in region["centre_m"])]
+        for region in classes["regions"][:_LISTED_REGIONS]
+    ]
+    note = (
+        "By angle: surface whose spectral angle to the class is the smallest, and at most "
+        f"{classes['threshold_rad']:g} rad. By mixture: surface where the class's fraction exceeds one half, by "
+        "linear unmixing with the library. If the library holds all materials of the surface, areas by mixture are "
+        "better for spots with soft edges."
+    )
+    header = ["class", "by angle, cm²", "of seen area", "regions", "by mixture, cm²", "of seen area"]
+    note_of_regions = f"The largest {len(listed)} of {len(labels)} connected regions, with their centres."
+    return [
+        TraitTable("Classes", note, header, rows),
+        TraitTable("Connected regions", note_of_regions, ["class", "area, cm²", "x, mm", "y, mm", "z, mm"], listed),
+    ]
+
+
+def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
+    """Write ``traits.md``: the tables of ``content``, and pictures (file names by caption)."""
+    parts = [f"# Traits of {title}"]
+    for table in trait_tables(content):
+        parts += [f"## {table.heading}", markdown_table(table.header, table.rows), table.note]
+    parts += ["## Pictures", *(f"{caption}:\n\n![{caption}]({name})" for caption, name in pictures.items())]
+    with atomic_write(path) as (temporary,):
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
     """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface."""
-    titles = [title for region in traits.spectra for title in (f"{region.name} mean", f"{region.name} SD")]
-    columns = [column for region in traits.spectra for column in (region.mean, region.sd)]
+    titles = [title for region in traits.regions for title in (f"{region.name} mean", f"{region.name} SD")]
+    columns = [column for region in traits.regions for column in (region.spectrum.mean, region.spectrum.sd)]
     with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["wavelength_nm", *titles])
-        for band, wavelength in enumerate(wavelengths_nm):
-            writer.writerow([f"{wavelength:.6g}", *(f"{column[band]:.6g}" for column in columns)])
+        writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
 
 
-def _size_table(size: Size, spread: Size | None) -> str:
-    rows = []
-    for key, (name, unit, factor) in _SIZES.items():
-        value = getattr(size, key) * factor
-        sd = getattr(spread, key) * factor if spread else None
-        rows.append([name, f"{value:.4g} ± {sd:.1g}" if sd is not None else f"{value:.4g}", unit])
-    return markdown_table(["trait", "value", "unit"], rows)
+def with_spread(value: float, sd: float | None) -> str:
+    """A number with its standard deviation, to two digits of the deviation; with four digits if there is none.
 
-
-def _class_tables(traits: Traits) -> list[str]:
-    classes = traits.classes
-    assert classes is not None
-    known = zip(classes.names, classes.areas_m2, classes.mixture_areas_m2, strict=True)
-    areas = [*known, ("in no class", classes.unclassified_m2, classes.mixture_unclassified_m2)]
-    counts = [sum(region.label == index for region in classes.regions) for index in range(len(classes.names))]
-    rows = [
-        [
-            name,
-            f"{area * _CM2_PER_M2:.2f}",
-            f"{area / traits.seen_m2:.1%}",
-            str(count),
-            f"{mixture * _CM2_PER_M2:.2f}",
-            f"{mixture / traits.seen_m2:.1%}",
-        ]
-        for (name, area, mixture), count in zip(areas, [*counts, ""], strict=True)
-    ]
-    listed = [
-        [classes.names[region.label], f"{region.area_m2 * _CM2_PER_M2:.2f}"]
-        + [f"{1000.0 * x:.1f}" for x in region.centre_m]
-        for region in classes.regions[:_LISTED_REGIONS]
-    ]
-    return [
-        "## Classes",
-        "By angle: surface whose spectral angle to the class is the smallest, and at most "
-        f"{classes.threshold_rad:g} rad. By mixture: surface where the class's fraction exceeds one half, by linear "
-        "unmixing with the library. If the library holds all materials of the surface, areas by mixture are better "
-        "for spots with soft edges.",
-        markdown_table(
-            ["class", "by angle, cm²", "of seen area", "regions", "by mixture, cm²", "of seen area"], rows
-        ),
-        f"The largest {len(listed)} of {len(classes.regions)} connected regions, with their centres:",
-        markdown_table(["class", "area, cm²", "x, mm", "y, mm", "z, mm"], listed),
-    ]
+    Example:
+        >>> with_spread(251.23, 1.87)
+        '251.2 ± 1.9'
+    """
+    if not sd:
+        return f"{value:.4g}"
+    decimals = max(0, 1 - math.floor(math.log10(sd)))
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def _nm(name: str) -> str:
     return ", ".join(f"{wavelength:g}" for wavelength in COMPOSITES[name].wavelengths_nm) + " nm"
 
 
-def _plus_minus(mean: np.ndarray, sd: np.ndarray, digits: int) -> str:
-    return ", ".join(
-        f"{a:.{digits}f} ± {b:.{digits}f}" for a, b in zip(np.atleast_1d(mean), np.atleast_1d(sd), strict=True)
-    )
+def _plain(value: MeanAndSd) -> dict[str, Any]:
+    """Ready for JSON."""
+    numbers = {"mean": np.asarray(value.mean, float), "sd": np.asarray(value.sd, float)}
+    return {key: np.where(np.isfinite(array), array, None).tolist() for key, array in numbers.items()}
 
 
-def _plain(value: np.ndarray) -> Any:
-    if np.ndim(value):
-        return [_plain(one) for one in value]
-    return float(value) if np.isfinite(value) else None
-
-
-def _picture(caption: str, name: str) -> str:
-    return f"{caption}:\n\n![{caption}]({name})"
+def _mean_and_sd(value: Mapping[str, Any]) -> str:
+    pairs = zip(*(np.atleast_1d(np.array(value[key], float)) for key in ("mean", "sd")), strict=True)
+    return ", ".join(f"{mean:.3f} ± {sd:.3f}" for mean, sd in pairs)

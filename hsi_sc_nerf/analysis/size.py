@@ -76,7 +76,6 @@ def size_spread(
     normals: Float[np.ndarray, "n 3"],
     config: MeshConfig,
     splits: int,
-    seed: int = 0,
     done: Callable[[int], None] | None = None,
 ) -> Size:
     """Standard deviation of each size, from random halves of the points (half-samples, McCarthy 1969).
@@ -86,15 +85,9 @@ def size_spread(
     thinning merges repeated points.) Errors that points have in common, such as those of the scale, the poses or the
     surface's depth, are not included.
 
-    Args:
-        points_m: the seen surface.
-        normals: mostly outward.
-        config: of the mesh.
-        splits: number of random splits, at least 1.
-        seed: of the splits.
-        done: called with the number of finished splits, for a progress bar.
+    ``done`` is called with the number of finished splits, for a progress bar.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     config = replace(config, octree_depth=min(config.octree_depth, SPREAD_DEPTH))
     differences = []
     for number in range(splits):

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.analysis.classes import vertex_areas_m2
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
@@ -40,8 +39,9 @@ class SpectralMesh:
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
-        """Surface area of each vertex."""
-        return vertex_areas_m2(self.mesh)
+        """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
+        thirds = np.repeat(self.mesh.triangle_areas_m2() / 3.0, 3)
+        return np.bincount(self.mesh.triangles.ravel(), thirds, minlength=len(self.mesh.vertices))
 
 
 def with_spectra(
@@ -93,12 +93,7 @@ def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndar
     """
     mesh = surface.mesh
     colours = to_8_bit(surface.spectra[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
-    cloud = SpectralCloud(
-        mesh.vertices.astype(np.float32),
-        mesh.vertex_normals().astype(np.float32),
-        colours,
-        surface.spectra,
-        surface.wavelengths_nm,
-        {"seen": surface.seen.astype(np.float32), **extra},
-    )
+    points, normals = mesh.vertices.astype(np.float32), mesh.vertex_normals().astype(np.float32)
+    columns = {"seen": surface.seen.astype(np.float32), **extra}
+    cloud = SpectralCloud(points, normals, colours, surface.spectra, surface.wavelengths_nm, columns)
     write_spectral_ply(path, cloud, mesh.triangles)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import yaml
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.analysis.classes import (
@@ -21,12 +19,45 @@ from hsi_sc_nerf.analysis.classes import (
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.bands import covered
-from hsi_sc_nerf.spectra.composites import COMPOSITES, Composite
-from hsi_sc_nerf.spectra.composites import composite as composite_of
-from hsi_sc_nerf.spectra.indices import INDICES, SpectralIndex, index_values
+from hsi_sc_nerf.spectra.composites import available_composites, composite
+from hsi_sc_nerf.spectra.indices import available_indices, index_values
 
 WHOLE = "whole surface"
+
+
+@dataclass(frozen=True)
+class RegionOfInterest:
+    """The surface within ``radius_m`` of ``centre_m`` (object frame).
+
+    Raises:
+        InputError: the radius is not more than 0, or a number is not finite.
+    """
+
+    name: str
+    centre_m: tuple[float, float, float]
+    radius_m: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.centre_m).all() and 0.0 < self.radius_m < np.inf):
+            raise InputError(
+                f"region {self.name}: needs x y z and a radius above 0, in metres, not "
+                f"{' '.join(map(str, (*self.centre_m, self.radius_m)))}."
+            )
+
+    def of(self, surface: SpectralMesh) -> Bool[np.ndarray, "v"]:
+        """The seen vertices in the region.
+
+        Raises:
+            InputError: there are none.
+        """
+        distance_m = np.linalg.norm(surface.mesh.vertices - np.array(self.centre_m), axis=1)
+        chosen = surface.seen & (distance_m <= self.radius_m)
+        if not chosen.any():
+            raise InputError(
+                f"region {self.name}: no seen surface within {self.radius_m:g} m of {self.centre_m}; the nearest is "
+                f"{distance_m[surface.seen].min():.4f} m away: correct the point (metres) or enlarge the radius."
+            )
+        return chosen
 
 
 @dataclass(frozen=True)
@@ -66,22 +97,96 @@ class MeanAndSd:
 
 
 @dataclass(frozen=True)
-class Traits:
-    """Traits of a surface from its spectra.
+class RegionTraits:
+    """Traits of a part of the surface: all that was seen, a class, or a region of interest.
 
     Attributes:
-        seen_m2: seen area; the rest is the closed base.
-        spectra: of the whole seen surface, each class and each region of interest.
-        indices: by the names of region and index.
-        composites: reflectance in three bands, by the names of region and composite.
-        classes: None without a library.
+        name: of the part.
+        area_m2: on the surface.
+        spectrum: reflectance of each band.
+        indices: spectral indices by name.
+        composites: reflectance shown as red, green and blue, by name.
     """
 
-    seen_m2: float
-    spectra: list[RegionSpectrum]
-    indices: dict[str, dict[str, MeanAndSd]]
-    composites: dict[str, dict[str, MeanAndSd]]
-    classes: Classes | None = field(default=None)
+    name: str
+    area_m2: float
+    spectrum: MeanAndSd
+    indices: Mapping[str, MeanAndSd]
+    composites: Mapping[str, MeanAndSd]
+
+
+@dataclass(frozen=True)
+class Traits:
+    """Traits of a surface from its spectra: of its regions, the whole seen surface first, and of its classes."""
+
+    regions: list[RegionTraits]
+    classes: Classes | None = None
+
+    @property
+    def seen_m2(self) -> float:
+        """Seen area; the rest is the closed base."""
+        return self.regions[0].area_m2
+
+
+def analyse(
+    surface: SpectralMesh, regions: Sequence[RegionOfInterest] = (), classes: Classes | None = None
+) -> Traits:
+    """Spectra, indices and composites of the whole seen surface, its classes and the regions of interest.
+
+    Raises:
+        InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
+    """
+    chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
+    if not surface.seen.any():
+        raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
+    if classes is not None:
+        chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
+    for region in regions:
+        if region.name in chosen:
+            raise InputError(f"two regions are named {region.name}; give each picked region a name of its own.")
+        chosen[region.name] = region.of(surface)
+
+    nm = surface.wavelengths_nm
+    indices = {one.name: index_values(one, surface.spectra, nm) for one in available_indices(nm)}
+    composites = {
+        one.name: composite(surface.spectra, nm, one.wavelengths_nm, one.name) for one in available_composites(nm)
+    }
+
+    def over(maps: Mapping[str, np.ndarray], where: Bool[np.ndarray, "v"]) -> dict[str, MeanAndSd]:
+        return {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in maps.items()}
+
+    return Traits(
+        [
+            RegionTraits(
+                name,
+                float(surface.areas_m2[where].sum()),
+                region_spectrum(surface, where),
+                over(indices, where),
+                over(composites, where),
+            )
+            for name, where in chosen.items()
+        ],
+        classes,
+    )
+
+
+def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
+    """Mean and standard deviation of the chosen vertices' spectra, weighted by their area."""
+    return mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
+
+
+def mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray, "n"]) -> MeanAndSd:
+    """Weighted mean and standard deviation over the first axis.
+
+    Values that are not finite do not count; both are NaN where no value counts.
+    """
+    defined = np.isfinite(values)
+    weight = np.where(defined, weights.reshape(-1, *[1] * (values.ndim - 1)), 0.0)
+    with np.errstate(invalid="ignore"):
+        weight = weight / weight.sum(axis=0)
+        known = np.where(defined, values, 0.0)
+        mean = (weight * known).sum(axis=0)
+        return MeanAndSd(mean, np.sqrt((weight * np.square(known - mean)).sum(axis=0)))
 
 
 def classified(
@@ -122,156 +227,3 @@ def classified(
         mixture_unclassified_m2=float(mixture_areas_m2[-1]),
         regions=connected_regions(surface.mesh, labels, surface.areas_m2, smallest_region_m2),
     )
-
-
-def known_composites(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Composite]:
-    """The named composites whose bands are available."""
-    return [one for one in COMPOSITES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
-
-
-def known_indices(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[SpectralIndex]:
-    """The named indices whose bands are available."""
-    return [one for one in INDICES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
-
-
-def analyse(
-    surface: SpectralMesh, regions: Sequence[RegionOfInterest] = (), classes: Classes | None = None
-) -> Traits:
-    """Spectra, indices and composites of the whole seen surface, its classes and the regions of interest.
-
-    Raises:
-        InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
-    """
-    chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
-    if not surface.seen.any():
-        raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
-    if classes is not None:
-        chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
-    for region in regions:
-        if region.name in chosen:
-            raise InputError(f"two regions are named {region.name}; give each picked region a name of its own.")
-        chosen[region.name] = region.of(surface)
-
-    nm = surface.wavelengths_nm
-    index_maps = {index.name: index_values(index, surface.spectra, nm) for index in known_indices(nm)}
-    composite_maps = {
-        one.name: composite_of(surface.spectra, nm, one.wavelengths_nm, one.name) for one in known_composites(nm)
-    }
-
-    def over(maps: dict[str, np.ndarray], where: Bool[np.ndarray, "v"]) -> dict[str, MeanAndSd]:
-        return {
-            name: MeanAndSd(*weighted_mean_and_sd(values[where], surface.areas_m2[where]))
-            for name, values in maps.items()
-        }
-
-    return Traits(
-        seen_m2=float(surface.areas_m2[surface.seen].sum()),
-        spectra=[region_spectrum(name, surface, where) for name, where in chosen.items()],
-        indices={name: over(index_maps, where) for name, where in chosen.items()},
-        composites={name: over(composite_maps, where) for name, where in chosen.items()},
-        classes=classes,
-    )
-
-
-@dataclass(frozen=True)
-class RegionOfInterest:
-    """The surface within a radius of a point.
-
-    Attributes:
-        name: of the region.
-        centre_m: centre, object frame.
-        radius_m: of the sphere.
-    """
-
-    name: str
-    centre_m: tuple[float, float, float]
-    radius_m: float
-
-    def of(self, surface: SpectralMesh) -> Bool[np.ndarray, "v"]:
-        """The seen vertices in the region.
-
-        Raises:
-            InputError: none does.
-        """
-        distance_m = np.linalg.norm(surface.mesh.vertices - np.array(self.centre_m), axis=1)
-        chosen = surface.seen & (distance_m <= self.radius_m)
-        if not chosen.any():
-            raise InputError(
-                f"region {self.name}: no seen surface within {self.radius_m:g} m of {self.centre_m}; the nearest is "
-                f"{distance_m[surface.seen].min():.4f} m away: correct the point (metres) or enlarge the radius."
-            )
-        return chosen
-
-
-@dataclass(frozen=True)
-class RegionSpectrum:
-    """Spectrum of a region, weighted by area.
-
-    Attributes:
-        name: of the region.
-        area_m2: on the surface.
-        mean: reflectance.
-        sd: standard deviation over the region's surface.
-    """
-
-    name: str
-    area_m2: float
-    mean: Float[np.ndarray, "bands"]
-    sd: Float[np.ndarray, "bands"]
-
-
-def region_spectrum(name: str, surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionSpectrum:
-    """Mean and standard deviation of the spectra of the chosen vertices, weighted by their area."""
-    mean, sd = weighted_mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
-    return RegionSpectrum(name, float(surface.areas_m2[chosen].sum()), mean, sd)
-
-
-def weighted_mean_and_sd(
-    values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray, "n"]
-) -> tuple[Float[np.ndarray, "*rest"], Float[np.ndarray, "*rest"]]:
-    """Mean and standard deviation over the first axis; NaN, where a value is not defined, does not count.
-
-    Both are NaN where no value counts.
-    """
-    defined = np.isfinite(values)
-    weight = np.where(defined, weights.reshape(-1, *[1] * (values.ndim - 1)), 0.0)
-    with np.errstate(invalid="ignore"):
-        weight = weight / weight.sum(axis=0)
-        known = np.where(defined, values, 0.0)
-        mean = (weight * known).sum(axis=0)
-        return mean, np.sqrt((weight * np.square(known - mean)).sum(axis=0))
-
-
-def read_regions(path: Path) -> list[RegionOfInterest]:
-    """Read regions from YAML: ``NAME: {centre_m: [x, y, z], radius_m: r}`` each.
-
-    Raises:
-        InputError: the file is missing or does not say that.
-    """
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        regions = []
-        for name, entry in content.items():
-            x_m, y_m, z_m = map(float, entry["centre_m"])
-            regions.append(region_of_interest(str(name), x_m, y_m, z_m, float(entry["radius_m"])))
-        return regions
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; give a YAML file of regions.") from error
-    except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: is no list of regions ({error}); write a line like 'bruise: {{centre_m: [0.03, 0, 0.1], "
-            "radius_m: 0.004}' for each."
-        ) from error
-
-
-def region_of_interest(name: str, x_m: float, y_m: float, z_m: float, radius_m: float) -> RegionOfInterest:
-    """A region from its name, centre and radius.
-
-    Raises:
-        InputError: the radius is not more than 0, or a number is not finite.
-    """
-    if not (np.isfinite([x_m, y_m, z_m]).all() and 0.0 < radius_m < np.inf):
-        raise InputError(
-            f"region {name}: needs x y z and a radius above 0, in metres, not {x_m} {y_m} {z_m} {radius_m}."
-        )
-    return RegionOfInterest(name, (x_m, y_m, z_m), radius_m)

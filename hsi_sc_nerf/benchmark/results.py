@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from rich.table import Table
 
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock
-from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
+from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.tables import markdown_table, screen_table
 
@@ -63,48 +62,24 @@ def results_table(runs: Sequence[BenchmarkRun]) -> Table:
     return screen_table(*table(runs), title="Held-out views, masked to the object, at the end of each stage")
 
 
-def describe_in_words(machine: dict[str, str]) -> str:
-    """One line that says what the figures were measured on."""
-    return ", ".join(f"{key} {value}" for key, value in machine.items())
-
-
 def write_csv(path: Path, runs: Sequence[BenchmarkRun]) -> None:
     """A line for each checkpoint of each run.
 
     Raises:
         InputError: the operating system refused to write.
     """
-    lines = [_csv_line(run, checkpoint) for run in runs for checkpoint in run.checkpoints]
+    lines = []
+    for run in runs:
+        about = {"configuration": run.name, "method": run.method, "words": " ".join(run.words)}
+        for checkpoint in run.checkpoints:
+            measured = asdict(checkpoint)
+            metrics = measured.pop("metrics")
+            lines.append({**about, "setup_seconds": run.setup_seconds, **measured, **metrics})
     columns = list(dict.fromkeys(key for line in lines for key in line))
     with atomic_write(path) as (temporary,), temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(lines)
-
-
-def _csv_line(run: BenchmarkRun, checkpoint: Checkpoint) -> dict[str, Any]:
-    measured = asdict(checkpoint)
-    metrics = measured.pop("metrics")
-    words = " ".join(run.words)
-    return {
-        "configuration": run.name,
-        "method": run.method,
-        "words": words,
-        "setup_seconds": run.setup_seconds,
-        **measured,
-        **metrics,
-    }
-
-
-def write_results(
-    path: Path, runs: Sequence[BenchmarkRun], settings: dict[str, Any], machine: dict[str, str]
-) -> None:
-    """Everything as JSON.
-
-    Raises:
-        InputError: the operating system refused to write.
-    """
-    write_json(path, {"machine": machine, "settings": settings, "runs": [asdict(run) for run in runs]})
 
 
 def write_page(path: Path, runs: Sequence[BenchmarkRun], settings: dict[str, Any], machine: dict[str, str]) -> None:
@@ -125,7 +100,7 @@ Held-out views at the end of each stage: mean over the views, masked to the obje
 column says so. Seconds are of training alone: setting up and evaluating do not count. Memory is the most that the
 process held until then, earlier evaluations included.
 
-Measured on: {describe_in_words(machine)}.
+Measured on: {", ".join(f"{key} {value}" for key, value in machine.items())}.
 
 {told}
 
@@ -137,22 +112,19 @@ Measured on: {describe_in_words(machine)}.
 
 @rc_context(STYLE)
 def draw_accuracy_and_time(path: Path, runs: Sequence[BenchmarkRun], clock: Clock = "wall") -> None:
-    """A panel for each metric, a curve for each run, rings where a stage ends; peak memory as bars.
-
-    Args:
-        path: The PNG file.
-        runs: One or more.
-        clock: What the seconds are of.
-    """
+    """A panel for each metric, a curve for each run over the clock's seconds, rings where a stage ends."""
     figure = new_figure(11.0, 5.2 + 0.12 * len(runs))
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(2.6, 1))[0]
-    panels = left.subplots(2, 2, sharex=True)
+    panels = figure.subplots(2, 2, sharex=True)
     colours = list(islice(cycle(COLOURS), len(runs)))
     # Where there are more runs than colours, the line tells them apart.
     lines = [("-", "--", ":", "-.")[(i // len(COLOURS)) % 4] for i in range(len(runs))]
     for axes, (metric, title) in zip(panels.ravel(), _PANELS.items(), strict=True):
         for run, colour, line in zip(runs, colours, lines, strict=True):
-            _draw_run(axes, run, metric, _SECONDS[clock], colour, line)
+            ends = [point.ends_stage for point in run.checkpoints]
+            seconds = [getattr(point, _SECONDS[clock]) for point in run.checkpoints]
+            curve = np.array([seconds, [point.metrics[metric] for point in run.checkpoints]])
+            axes.plot(*curve, color=colour, linestyle=line, label=run.name, marker="o", markersize=2.5)
+            axes.plot(*curve[:, ends], "o", color=colour, markersize=7, fillstyle="none")
         if metric in _LOGARITHMIC:
             axes.set_yscale("log")
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
@@ -162,31 +134,6 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[BenchmarkRun], clock: Cloc
     for axes in panels[1]:
         axes.set_xlabel(f"training ({'wall' if clock == 'wall' else 'processor'} seconds)")
     panels[0, 0].set_xlim(left=0)
-    left.suptitle("Held-out views, masked to the object; rings: ends of stages", fontsize=9)
-
-    # The bars' names are the curves' legend.
-    axes = right.subplots()
-    memory = [run.checkpoints[-1].gpu_memory_mib or run.checkpoints[-1].peak_memory_mib for run in runs]
-    on_gpu = any(run.checkpoints[-1].gpu_memory_mib for run in runs)
-    places = np.arange(len(runs))
-    axes.barh(places, memory, color=colours, height=0.36)
-    for place, run, amount in zip(places, runs, memory, strict=True):
-        axes.annotate(f"{run.name}: {amount:.0f}", (0, place - 0.2), va="bottom", fontsize=8)
-    axes.set(yticks=[], ylim=(len(runs) - 0.5, -0.8), xlabel="MiB", title=f"Peak {'GPU ' if on_gpu else ''}memory")
-    axes.grid(axis="y", visible=False)
+    figure.suptitle("Held-out views, masked to the object; rings: ends of stages", fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     save_figure(figure, path)
-
-
-def _draw_run(axes: Axes, run: BenchmarkRun, metric: str, time: str, colour: str, line: str) -> None:
-    seconds = [getattr(checkpoint, time) for checkpoint in run.checkpoints]
-    values = [checkpoint.metrics[metric] for checkpoint in run.checkpoints]
-    axes.plot(seconds, values, color=colour, linestyle=line, linewidth=1.2, marker="o", markersize=2.5)
-    axes.plot(
-        [getattr(end, time) for end in run.stage_ends],
-        [end.metrics[metric] for end in run.stage_ends],
-        linestyle="",
-        marker="o",
-        markersize=7,
-        markerfacecolor="none",
-        markeredgecolor=colour,
-    )

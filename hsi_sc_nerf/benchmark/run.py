@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hsi_sc_nerf.benchmark.configurations import training_config
 from hsi_sc_nerf.benchmark.machine import peak_memory_mib
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, write_json
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -42,7 +44,7 @@ class Job:
         words: as after ``ns-train METHOD``.
         data: the packed dataset.
         output_dir: where the training run is kept.
-        iterations: length of the run; None: only determine how many fit into ``train_seconds``.
+        iterations: length of the run; None: as many as fit into ``train_seconds``, by a rehearsal.
         train_seconds: time to fill; None if ``iterations`` is given.
         clock: that ``train_seconds`` refer to.
         checkpoints: fractions of the run at which it is evaluated, beside the stages' ends.
@@ -116,7 +118,9 @@ class BenchmarkRun:
 def build_trainer(config: Any, job: Job, iterations: int, output_dir: Path) -> StagedTrainer:
     """The trainer that ``ns-train`` would make of ``config``, without evaluations of its own on the way."""
     import torch
+    from nerfstudio.utils import writer
 
+    writer.EVENT_WRITERS.clear()  # of an earlier trainer in this process
     config.pipeline.datamanager.data = Path(job.data)
     config.max_num_iterations = iterations
     config.output_dir, config.experiment_name, config.timestamp = output_dir, "benchmark", "run"
@@ -203,26 +207,26 @@ def train(job: Job) -> dict[str, Any]:
     return {"setup_seconds": setup_seconds, "checkpoints": [asdict(checkpoint) for checkpoint in found]}
 
 
-def rehearse(job: Job) -> dict[str, Any]:
-    """Determine how many iterations fill ``train_seconds``; returns ``iterations`` and ``iteration_seconds``.
+def rehearse(job: Job) -> int:
+    """How many iterations fill ``train_seconds``.
 
     A run of 20 iterations estimates how many fit into a twentieth of the time; a run of that length, with all stages,
     gives the mean time of an iteration.
     """
     assert job.train_seconds is not None
-    seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS)
-    longer = int(_REHEARSAL_FRACTION * job.train_seconds / seconds)
-    if longer > _REHEARSAL_ITERATIONS:
-        seconds = _rehearsed_seconds(job, longer)
-    return {"iterations": max(1, round(job.train_seconds / seconds)), "iteration_seconds": seconds}
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX) as folder:
+        seconds = _rehearsed_seconds(job, _REHEARSAL_ITERATIONS, Path(folder))
+        longer = int(_REHEARSAL_FRACTION * job.train_seconds / seconds)
+        if longer > _REHEARSAL_ITERATIONS:
+            seconds = _rehearsed_seconds(job, longer, Path(folder))
+    return max(1, round(job.train_seconds / seconds))
 
 
-def _rehearsed_seconds(job: Job, iterations: int) -> float:
+def _rehearsed_seconds(job: Job, iterations: int, folder: Path) -> float:
     import torch
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    config = training_config(job.method, job.words)
-    trainer = build_trainer(config, job, iterations, Path(job.output_dir))
+    trainer = build_trainer(training_config(job.method, job.words), job, iterations, folder)
 
     def record(step: int) -> None:
         if trainer.pipeline.device.type == "cuda":
@@ -302,7 +306,12 @@ def main(job_path: Path, result_path: Path) -> None:
     job = Job(**json.loads(job_path.read_text(encoding="utf-8")))
     torch.set_num_threads(job.threads)
     with threadpool_limits(job.threads):
-        write_json(result_path, rehearse(job) if job.iterations is None else train(job))
+        if job.iterations is None:
+            job = replace(job, iterations=rehearse(job))
+            gc.collect()
+            if torch.cuda.is_available():
+                torch.cuda.reset_peak_memory_stats()
+        write_json(result_path, train(job))
 
 
 if __name__ == "__main__":

@@ -51,14 +51,11 @@ class Defects:
 
     def summary(self) -> str:
         """One line for people."""
-        samples, bands = self.dead.shape
-        saturation = "nothing is saturated"
-        if self.saturation_counts is not None:
-            saturation = f"readings saturate at {self.saturation_counts:g} counts"
-        dead = np.count_nonzero(self.dead[:, ~self.bad_bands])
+        level = self.saturation_counts
+        saturation = "nothing is saturated" if level is None else f"readings saturate at {level:g} counts"
         return (
-            f"{saturation}; {dead} of {samples * bands} detector elements are dead; "
-            f"{np.count_nonzero(self.bad_bands)} of {bands} bands are bad"
+            f"{saturation}; {np.count_nonzero(self.dead)} of {self.dead.size} detector elements are dead; "
+            f"{np.count_nonzero(self.bad_bands)} of {len(self.bad_bands)} bands are bad"
         )
 
 
@@ -75,7 +72,7 @@ class Readings:
 
     def resolution(self) -> float:
         """Step between counts: 1 for integers, 0 for other numbers."""
-        return 1.0 if np.issubdtype(self.counts.dtype, np.integer) else 0.0
+        return 1.0 if self.counts.dtype.kind in "iu" else 0.0
 
 
 def find_defects(
@@ -200,54 +197,35 @@ def saturation_counts(
     if not live.any():
         return None
     top = max(float(cube.max(axis=0)[live].max()) for cube in cubes)
-    at_top = sum(int(np.count_nonzero(line[live] == top)) for cube in cubes for line in cube)
-    if top in _digital_limits(cubes[0].dtype):
-        return top if at_top >= MIN_AT_LIMIT and at_top > _count_of_next_lower(cubes, live, top) else None
-    return top if at_top >= MIN_TOP_PAIRS and _piles_up(cubes, live, top, at_top) else None
+    readings = [cube[:, live] for cube in cubes]
+    at_top = sum(np.count_nonzero(of_cube == top) for of_cube in readings)
+    dtype = cubes[0].dtype
+    limits = {2**bits - 1 for bits in range(8, 33)} | {(2**bits - 1) << (16 - bits) for bits in (10, 12, 14)}
+    if top in limits or (dtype.kind in "iu" and top == np.iinfo(dtype).max):
+        lower = [of_cube[of_cube < top] for of_cube in readings]
+        next_lower = max((of_cube.max() for of_cube in lower if len(of_cube)), default=top)
+        at_next = sum(np.count_nonzero(of_cube == next_lower) for of_cube in lower)
+        return top if at_top >= MIN_AT_LIMIT and at_top > at_next else None
+    just_below = sum(np.count_nonzero((of_cube < top) & (of_cube >= top - BELOW_TOP)) for of_cube in readings)
+    piles_up = at_top >= MIN_TOP_PAIRS and at_top > just_below and _neighbours_share(cubes, live, top)
+    return top if piles_up else None
 
 
-def _digital_limits(dtype: np.dtype) -> set[float]:
-    """Largest counts of digitisers."""
-    limits = {float(2**bits - 1) for bits in range(8, 33)}
-    limits |= {float((2**bits - 1) << (16 - bits)) for bits in (10, 12, 14)}
-    return limits | ({float(np.iinfo(dtype).max)} if np.issubdtype(dtype, np.integer) else set())
-
-
-def _count_of_next_lower(
+def _neighbours_share(
     cubes: Sequence[Num[np.ndarray, "lines samples bands"]], live: Bool[np.ndarray, "samples bands"], top: float
-) -> int:
-    """How many readings have the largest value below ``top``."""
-    largest, number = -np.inf, 0
-    for cube in cubes:
-        for line in cube:
-            below = line[live]
-            below = below[below < top]
-            if len(below) and below.max() >= largest:
-                number = int(np.count_nonzero(below == below.max())) + (number if below.max() == largest else 0)
-                largest = float(below.max())
-    return number
-
-
-def _piles_up(
-    cubes: Sequence[Num[np.ndarray, "lines samples bands"]],
-    live: Bool[np.ndarray, "samples bands"],
-    top: float,
-    at_top: int,
 ) -> bool:
-    """Case 2 of `saturation_counts`."""
+    """Whether neighbours share the largest count more often than other bright counts."""
     live_pairs = live[1:] & live[:-1]
-    just_below = top_pairs = both_at_top = bright_pairs = equal_pairs = 0
+    top_pairs = both_at_top = bright_pairs = equal_pairs = 0
     for cube in cubes:
-        for line in cube:
-            just_below += int(np.count_nonzero(live & (line < top) & (line >= top - BELOW_TOP)))
-            one, other = line[1:][live_pairs], line[:-1][live_pairs]
-            either = (one == top) | (other == top)
-            top_pairs += int(np.count_nonzero(either))
-            both_at_top += int(np.count_nonzero((one == top) & (other == top)))
-            bright = ~either & (np.minimum(one, other) > BRIGHT * top)
-            bright_pairs += int(np.count_nonzero(bright))
-            equal_pairs += int(np.count_nonzero(bright & (one == other)))
-    if at_top <= just_below or both_at_top < MIN_TOP_PAIRS or 4 * bright_pairs < top_pairs:
+        one, other = cube[:, 1:][:, live_pairs], cube[:, :-1][:, live_pairs]
+        either = (one == top) | (other == top)
+        top_pairs += np.count_nonzero(either)
+        both_at_top += np.count_nonzero(either & (one == other))
+        bright = ~either & (np.minimum(one, other) > BRIGHT * top)
+        bright_pairs += np.count_nonzero(bright)
+        equal_pairs += np.count_nonzero(bright & (one == other))
+    if both_at_top < MIN_TOP_PAIRS or 4 * bright_pairs < top_pairs:
         return False
     fraction_both, fraction_equal = both_at_top / top_pairs, equal_pairs / bright_pairs
     return fraction_both > 0.5 and fraction_both > 3.0 * fraction_equal

@@ -92,31 +92,24 @@ def fit_surface(
     then Tukey's biweight, which gives them no weight (Huber & Ronchetti, "Robust Statistics", 2nd ed., section 7).
     Outside the region the surface is limited by ``REACH`` and ``VALUE_REACH``.
     """
+    at = np.argwhere(region)
+    middle = (at.min(axis=0) + at.max(axis=0)) / 2.0
+    half = np.maximum((at.max(axis=0) - at.min(axis=0)) / 2.0, 1.0)
+    at = np.random.default_rng(0).permutation(at)[:MAX_PIXELS]
+    powers = np.add.outer(np.arange(order + 1), np.arange(order + 1)) <= order
+
+    def terms(yx: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n terms"]:
+        scaled = np.clip((yx - middle) / half, -REACH, REACH)
+        return np.polynomial.legendre.legvander2d(scaled[:, 0], scaled[:, 1], [order, order])[:, powers.ravel()]
+
+    on_tarp = terms(at)
+    coefficients = _robust_fit(on_tarp, brightness[tuple(at.T)])
+    fitted = on_tarp @ coefficients
+    beyond, darkest = VALUE_REACH * np.ptp(fitted), fitted.min()
     lines, samples = brightness.shape
-    y, x = np.nonzero(region)
-    middle, half = [], []
-    for positions in (y, x):
-        middle.append((positions.min() + positions.max()) / 2.0)
-        half.append(max((positions.max() - positions.min()) / 2.0, 1.0))
-    every = -(-len(y) // MAX_PIXELS)
-    chosen = np.random.default_rng(0).permutation(len(y))[:: max(every, 1)]
-    y, x = y[chosen], x[chosen]
-    terms = _terms((y - middle[0]) / half[0], (x - middle[1]) / half[1], order)
-    coefficients = _robust_fit(terms, brightness[y, x])
-    on_region = terms @ coefficients
-    beyond = VALUE_REACH * np.ptp(on_region)
-    rows = np.clip((np.arange(lines) - middle[0]) / half[0], -REACH, REACH)
-    columns = np.clip((np.arange(samples) - middle[1]) / half[1], -REACH, REACH)
-    surface = np.stack([_terms(np.full(samples, row), columns, order) @ coefficients for row in rows])
-    darkest = on_region.min()
-    return np.clip(surface, max(darkest - beyond, 0.5 * darkest), on_region.max() + beyond)
-
-
-def _terms(y: Float[np.ndarray, "n"], x: Float[np.ndarray, "n"], order: int) -> Float[np.ndarray, "n terms"]:
-    """Products of Legendre polynomials of y and x up to a total order."""
-    in_y, in_x = np.polynomial.legendre.legvander(y, order), np.polynomial.legendre.legvander(x, order)
-    pairs = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
-    return np.stack([in_y[:, i] * in_x[:, j] for i, j in pairs], axis=-1)
+    across = np.arange(samples)
+    surface = [terms(np.stack([np.full(samples, y), across], axis=1)) @ coefficients for y in range(lines)]
+    return np.clip(np.stack(surface), max(darkest - beyond, 0.5 * darkest), fitted.max() + beyond)
 
 
 def _robust_fit(terms: Float[np.ndarray, "n terms"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "terms"]:

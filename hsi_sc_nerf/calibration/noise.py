@@ -109,10 +109,12 @@ def reflectance_uncertainty(
         of_sample += read_variance / frame_dark_readings
     if white_dark_readings:
         of_white += read_variance / white_dark_readings
+    # Variance of a moving average of independent bands; the window of each band lies within the spectrum.
+    cumulative, band = np.concatenate([[0.0], np.cumsum(of_white)]), np.arange(len(of_white))
+    reach = smoothing_bands // 2
+    of_average = (cumulative[band + reach + 1] - cumulative[band - reach]) / smoothing_bands**2
     return ReflectanceUncertainty(
-        constant=gain**2 * of_sample,
-        linear=gain * noise.counts_per_electron,
-        quadratic=_moving_average_variance(of_white, smoothing_bands) / white**2,
+        constant=gain**2 * of_sample, linear=gain * noise.counts_per_electron, quadratic=of_average / white**2
     )
 
 
@@ -167,12 +169,18 @@ def photon_transfer_slope(
     inside = inside_all[centres - 1]
     if inside.sum() < MIN_PIXELS:
         return None
-    difference, total, saturated = _second_differences(white, centres, inside, saturation_counts)
-    columns = inside.any(axis=0)
-    alive = np.broadcast_to(columns[:, None], saturated.shape) & (True if dead is None else ~dead)
-    saturated &= alive
+    # Counts outside may be nan, which a product with 0 would keep.
+    before, centre, after = (
+        np.where(inside[..., None], white[centres + step], 0).astype(np.float32) for step in (-1, 0, 1)
+    )
+    difference = before - 2.0 * centre + after
+    alive = np.broadcast_to(inside.any(axis=0)[:, None], white.shape[1:]) & (True if dead is None else ~dead)
+    saturated = np.zeros_like(alive)
+    if saturation_counts is not None:
+        saturated = alive & (np.maximum(np.maximum(before, centre), after) >= saturation_counts).any(axis=0)
     readable = alive & ~saturated & (saturated.sum(axis=0) <= MAX_SATURATED * alive.sum(axis=0))
-    signal = np.where(readable, total / np.maximum(inside.sum(axis=0), 1)[:, None] - dark, 0.0).clip(min=0.0)
+    mean = centre.sum(axis=0, dtype=np.float64) / np.maximum(inside.sum(axis=0), 1)[:, None]
+    signal = np.where(readable, mean - dark, 0.0).clip(min=0.0)
     pixel_signal = signal.sum(axis=1, keepdims=True)
     if not pixel_signal.any():
         return None
@@ -201,28 +209,6 @@ def photon_transfer_slope(
     return slope
 
 
-def _second_differences(
-    white: Num[np.ndarray, "lines samples bands"],
-    centres: Int[np.ndarray, "triples"],
-    inside: Bool[np.ndarray, "triples samples"],
-    saturation_counts: float | None,
-) -> tuple[
-    Float[np.ndarray, "triples samples bands"], Float[np.ndarray, "samples bands"], Bool[np.ndarray, "samples bands"]
-]:
-    """Second differences about each centre, sum of the centres' counts, and saturated elements, inside the region."""
-    difference = np.zeros((len(centres), *white.shape[1:]), np.float32)
-    total = np.zeros(white.shape[1:])
-    saturated = np.zeros(white.shape[1:], bool)
-    for n, centre in enumerate(centres):
-        # Counts outside may be nan, which a product with 0 would keep.
-        three = np.where(inside[n][:, None], white[centre - 1 : centre + 2], 0).astype(np.float32)
-        difference[n] = three[0] - 2.0 * three[1] + three[2]
-        total += three[1]
-        if saturation_counts is not None:
-            saturated |= three.max(axis=0) >= saturation_counts
-    return difference, total, saturated
-
-
 def _inliers(
     squared: Float[np.ndarray, "triples samples bands"],
     inside: Bool[np.ndarray, "triples samples"],
@@ -238,12 +224,3 @@ def _inliers(
     usual_pixel = np.zeros(inside.shape, bool)
     usual_pixel[inside] = score <= np.median(score) * limit
     return usual_pixel
-
-
-def _moving_average_variance(
-    variance: Float[np.ndarray, "bands"], width: Int[np.ndarray, "bands"]
-) -> Float[np.ndarray, "bands"]:
-    """Variance of a moving average of independent bands; the window of each band lies within the spectrum."""
-    cumulative = np.concatenate([[0.0], np.cumsum(variance)])
-    centre, reach = np.arange(len(variance)), width // 2
-    return (cumulative[centre + reach + 1] - cumulative[centre - reach]) / width**2

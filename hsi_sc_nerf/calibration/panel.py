@@ -55,45 +55,35 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "li
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise InputError(f"{path}: the panel's reflectance cannot be read ({reason}); check the path.") from error
-    rows = []
-    may_be_header = True
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        values = _numbers(line)
-        if values is None and not may_be_header:
-            raise InputError(f"{path}: line {number} ({line.strip()!r}) is not two numbers; write {_FORMAT}.")
-        may_be_header = False
-        if values is not None:
-            rows.append(values)
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    rows = [_numbers(line) for _, line in lines]
+    if rows and rows[0] is None:  # titles of the columns
+        rows, lines = rows[1:], lines[1:]
     if not rows:
         raise InputError(f"{path}: holds no reflectance; write {_FORMAT}.")
-    panel_nm, reflectance = np.array(rows).T
-    if not panel_nm.min() >= SHORTEST_NM:
+    if None in rows:
+        number, line = lines[rows.index(None)]
+        raise InputError(f"{path}: line {number} ({line!r}) is not two numbers; write {_FORMAT}.")
+    panel_nm, reflectance = np.array(rows, dtype=float).T
+    if panel_nm.min() < SHORTEST_NM:
         raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")
-    if not reflectance.min() > 0.0:
+    fractions = reflectance / 100.0 if reflectance.max() > LARGEST_FRACTION else reflectance
+    if not (fractions.min() > 0.0 and fractions.max() <= LARGEST_FRACTION):
+        wrong = reflectance.argmin() if fractions.min() <= 0.0 else reflectance.argmax()
         raise InputError(
-            f"{path}: gives a reflectance of {reflectance.min():g} at {panel_nm[reflectance.argmin()]:g} nm, but a "
-            "white reflects something in every band; correct it."
+            f"{path}: gives a reflectance of {reflectance[wrong]:g} at {panel_nm[wrong]:g} nm, but a white reflects "
+            "more than nothing and at most about 1, or 100 percent; correct it."
         )
-    if reflectance.max() > LARGEST_FRACTION:
-        reflectance = reflectance / 100.0
-    if reflectance.max() > LARGEST_FRACTION:
-        raise InputError(
-            f"{path}: gives a reflectance of {100.0 * reflectance.max():g} at {panel_nm[reflectance.argmax()]:g} nm, "
-            "which is neither a fraction nor percent; correct it."
-        )
-    return panel_nm, reflectance
+    return panel_nm, fractions
 
 
 def _numbers(line: str) -> tuple[float, float] | None:
     """The two finite numbers of a line, or None."""
     separator = next((mark for mark in ";\t" if mark in line), ",")
-    parts = line.strip().split(separator)
-    if separator != ",":
-        parts = [part.replace(",", ".") for part in parts]
+    parts = line.split(separator)
     try:
-        wavelength, reflectance = (float(part) for part in parts)
+        wavelength, reflectance = (float(part if separator == "," else part.replace(",", ".")) for part in parts)
     except ValueError:
         return None
     return (wavelength, reflectance) if np.isfinite([wavelength, reflectance]).all() else None

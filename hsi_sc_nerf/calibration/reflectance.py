@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 
-# Lines that are stored at a time: rotating single lines would write 400 bytes to each of many places.
 _BLOCK_LINES = 8
-# Data types that `cv2.transpose` knows, by their size.
+"""Lines that are stored at a time: rotating single lines would write 400 bytes to each of many places."""
 _TRANSPOSED_AS = {1: np.uint8, 2: np.uint16, 4: np.int32, 8: np.float64}
+"""Data types that `cv2.transpose` knows, by their size."""
 _HALF = np.float32(0.5)
-# Added to the lines' values, so that truncation rounds them.
-_HALF_UNIT = np.float32(0.5 / REFLECTANCE_SCALE)
+"""Added to the lines' values, so that truncation rounds them."""
+_UNIT, _HALF_UNIT = np.float32(1.0 / REFLECTANCE_SCALE), np.float32(0.5 / REFLECTANCE_SCALE)
 _LOWEST = np.finfo(np.float32).min
 _Test = Callable[[np.ndarray], np.ndarray]
 
@@ -168,9 +168,11 @@ def pack_counts(
     kept = len(calibration.bands)
     file_bands = _as_slice(calibration.bands)
     dead = _DeadElements.of(calibration, samples)
-    any_dead = len(dead.at) > 0
     scale, offset = _line_constants(calibration, samples)
-    per_flat = None if calibration.flat is None else _reciprocal(calibration.flat)
+    flat = calibration.flat
+    if flat is not None and not (np.isfinite(flat).all() and (flat > 0.0).all()):
+        raise ValueError("the illumination is not positive everywhere")
+    per_flat = None if flat is None else np.reciprocal(flat, dtype=np.float32)
     tests = _tests_of_counts(calibration, counts.dtype)
     # Bounds as packed numbers; the values include half a unit, so that truncation rounds them.
     low, high = (round(float(np.clip(b * REFLECTANCE_SCALE, 0, FLAGGED - 1))) for b in calibration.bounds)
@@ -180,10 +182,13 @@ def pack_counts(
     if buffer is None:
         buffer = np.empty(lines * samples * kept, np.uint16)
     packed = np.rot90(buffer[: lines * samples * kept].reshape(*upright_shape, kept), -turns)
-    flags = np.zeros((lines, samples), np.uint8)
-    flags |= dead.pixel_flags
+    flags = np.tile(dead.pixel_flags, (lines, 1))
     line_pictures = _LinePictures(pictures, kept, lines, samples)
-    counters = {name: _LineCounter(kept, samples) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
+    counted = {name: np.zeros(kept, np.int64) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
+
+    def count(name: str, marked: Bool[np.ndarray, "kept samples"]) -> None:
+        marked.reshape(-1)[dead.at] = False
+        counted[name] += cv2.reduce(marked.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[:, 0]
 
     values = np.empty((kept, samples), np.float32)
     numbers = np.empty((kept, samples), np.uint16)
@@ -200,10 +205,9 @@ def pack_counts(
                 continue
             if flag == PixelFlag.NO_DATA:
                 values[found] = _LOWEST
-            found.reshape(-1)[dead.at] = False
             if flagged is not None:
                 found &= ~flagged
-            counters[name].add(found)
+            count(name, found)
             flags[line][found.any(axis=0)] |= np.uint8(flag)
             flagged = found if flagged is None else flagged | found
 
@@ -215,17 +219,15 @@ def pack_counts(
         smallest, largest, _, _ = cv2.minMaxLoc(values)
         if smallest < low or largest >= high + 1:
             for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
-                counters[name].add(clipped if flagged is None else clipped & ~flagged)
+                count(name, clipped if flagged is None else clipped & ~flagged)
             np.clip(values, low + _HALF, high + _HALF, out=values)
-        if any_dead:
-            values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
+        values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
         line_pictures.add(line, values)
 
         np.copyto(numbers, values, casting="unsafe")
         if flagged is not None:
             numbers[flagged] = FLAGGED
-        if any_dead:
-            numbers.reshape(-1)[dead.at] = FLAGGED
+        numbers.reshape(-1)[dead.at] = FLAGGED
         in_block = line % len(block)
         cv2.transpose(numbers, dst=block[in_block])
         if turns == 0:
@@ -233,9 +235,7 @@ def pack_counts(
         elif in_block == len(block) - 1 or line == lines - 1:
             packed[line - in_block : line + 1] = block[: in_block + 1]
 
-    pixel_counts = PixelCounts(
-        dead=dead.per_band * lines, **{name: counter.by_band(dead.at) for name, counter in counters.items()}
-    )
+    pixel_counts = PixelCounts(dead=dead.per_band * lines, **counted)
     return PackedReflectance(packed, flags, pixel_counts, line_pictures.rgb, line_pictures.gray, line_pictures.binned)
 
 
@@ -282,12 +282,6 @@ def _line_constants(
     return scale.astype(np.float32), offset.astype(np.float32)
 
 
-def _reciprocal(flat: Float[np.ndarray, "lines samples"]) -> Float[np.ndarray, "lines samples"]:
-    if not (np.isfinite(flat).all() and (flat > 0.0).all()):
-        raise ValueError("the illumination is not positive everywhere")
-    return np.reciprocal(flat, dtype=np.float32)
-
-
 def _tests_of_counts(calibration: FrameCalibration, dtype: np.dtype) -> list[tuple[str, PixelFlag, _Test]]:
     """Tests of a frame's counts (as float32); the first that applies counts."""
     tests: list[tuple[str, PixelFlag, _Test]] = []
@@ -315,65 +309,24 @@ class _LinePictures:
     """Collects the pictures of a frame (`PackedReflectance`) line by line."""
 
     def __init__(self, bands: PictureBands, kept: int, lines: int, samples: int) -> None:
-        whole_bins, rest = divmod(kept, bands.bin_width)
+        self._rgb_bands, self._gray_bands = bands.rgb, _as_slice(bands.gray)
+        self._whole_bins, rest = divmod(kept, bands.bin_width)
+        self._bin_width = bands.bin_width
         self.rgb = np.empty((3, lines, samples), np.float32)
         self.gray = np.empty((lines, samples), np.float32)
         # Contiguous by line, as it is written.
-        by_line = np.empty((lines, whole_bins + (rest > 0), samples), np.float32)
-        self.binned = by_line.swapaxes(0, 1)
-        self._rgb_bands = bands.rgb
-        self._gray_bands = _as_slice(bands.gray)
-        self._per_gray = np.float32(1.0 / (len(bands.gray) * REFLECTANCE_SCALE))
-        self._bin_shape = (whole_bins, bands.bin_width, samples)
-        self._in_whole_bins = kept - rest
-        self._sums = np.empty((len(self.binned), samples), np.float32)
-        widths = np.full((len(self.binned), 1), bands.bin_width)
-        widths[whole_bins:] = rest
-        self._per_width = (1.0 / (widths * REFLECTANCE_SCALE)).astype(np.float32)
+        self.binned = np.empty((lines, self._whole_bins + (rest > 0), samples), np.float32).swapaxes(0, 1)
 
     def add(self, line: int, values: Float[np.ndarray, "kept samples"]) -> None:
         """Add a line, whose values are packed numbers plus a half."""
-        self.rgb[:, line] = values[self._rgb_bands] * np.float32(1.0 / REFLECTANCE_SCALE) - _HALF_UNIT
-        gray = self.gray[line]
-        np.add.reduce(values[self._gray_bands], axis=0, out=gray)
-        gray *= self._per_gray
-        gray -= _HALF_UNIT
-        whole_bins = self._bin_shape[0]
-        binnable = values[: self._in_whole_bins].reshape(self._bin_shape)
-        np.add.reduce(binnable, axis=1, out=self._sums[:whole_bins])
-        if len(self._sums) > whole_bins:
-            np.add.reduce(values[self._in_whole_bins :], axis=0, out=self._sums[-1])
-        self._sums *= self._per_width
-        np.subtract(self._sums, _HALF_UNIT, out=self.binned[:, line])
-
-
-class _LineCounter:
-    """Counts the lines in which each element is marked; 8-bit sums are flushed before they overflow."""
-
-    _MAX_LINES = 255
-
-    def __init__(self, bands: int, samples: int) -> None:
-        self._total = np.zeros((bands, samples), np.int64)
-        self._recent = np.zeros((bands, samples), np.uint8)
-        self._lines = 0
-
-    def add(self, marked: Bool[np.ndarray, "bands samples"]) -> None:
-        """Count one line."""
-        np.add(self._recent, marked.view(np.uint8), out=self._recent)
-        self._lines += 1
-        if self._lines == self._MAX_LINES:
-            self._flush()
-
-    def by_band(self, without: Int[np.ndarray, "elements"]) -> Int[np.ndarray, "bands"]:
-        """Sum over the samples, without some elements (flat indices)."""
-        self._flush()
-        self._total.reshape(-1)[without] = 0
-        return self._total.sum(axis=1)
-
-    def _flush(self) -> None:
-        self._total += self._recent
-        self._recent[:] = 0
-        self._lines = 0
+        whole, in_whole = self._whole_bins, self._whole_bins * self._bin_width
+        gray, rest = values[self._gray_bands], values[in_whole:]
+        bins = values[:in_whole].reshape(whole, self._bin_width, -1)
+        self.rgb[:, line] = values[self._rgb_bands] * _UNIT - _HALF_UNIT
+        self.gray[line] = np.add.reduce(gray, axis=0) * (_UNIT / len(gray)) - _HALF_UNIT
+        self.binned[:whole, line] = np.add.reduce(bins, axis=1) * (_UNIT / self._bin_width) - _HALF_UNIT
+        if len(rest):
+            self.binned[whole, line] = np.add.reduce(rest, axis=0) * (_UNIT / len(rest)) - _HALF_UNIT
 
 
 def _as_slice(indices: Int[np.ndarray, "count"]) -> slice | Int[np.ndarray, "count"]:

@@ -33,18 +33,18 @@ PERCENTILE_STEP = 5.0
 DRIFT_NM = (450.0, 600.0, 750.0, 900.0)
 REFLECTANCES = (0.1, 0.5, 0.9)
 SMALLEST_P = 1e-6
+"""p-values below this are shown as this."""
 
 
 def describe_calibration(session: Session, calibration: SessionCalibration) -> list[str]:
     """Sentences on what was measured before any frame is calibrated."""
-    white = calibration.white
-    if white is None:
-        sentences = ["White: none needed, the instrument's finished reflectance is taken."]
-    elif calibration.source == "capture":
-        sentences = ["White: the WHITEREF cube of each capture."]
-    else:
-        where = f"the tarp in {session.white.name}" if session.white and calibration.source == "tarp" else "a target"
-        sentences = [f"White: {white.pixels} pixels of {where}."]
+    pixels = 0 if calibration.white is None else calibration.white.pixels
+    sentences = {
+        "product": ["White: none needed, the instrument's finished reflectance is taken."],
+        "capture": ["White: the WHITEREF cube of each capture."],
+        "target": [f"White: {pixels} pixels of a target."],
+        "tarp": [f"White: {pixels} pixels of the tarp in {session.white.name if session.white else ''}."],
+    }[calibration.source]
     if calibration.defects is not None:
         sentences.append(f"Detector: {calibration.defects.summary()}.")
     return [*sentences, _describe_drift(calibration)]
@@ -59,9 +59,9 @@ def describe_pixel_counts(pixel_counts: PixelCounts, values: int) -> str:
         "dead": "of dead detector elements",
         "no_data": "without data",
     }
-    percent = {name: 100.0 * int(getattr(pixel_counts, name).sum()) / values for name in reasons}
-    parts = [f"{percent[name]:.2g} % {reason}" for name, reason in reasons.items() if percent[name] > 0.0]
-    return f"Values: {', '.join(parts) if parts else 'none clipped or flagged'}."
+    percent = {reason: 100.0 * int(getattr(pixel_counts, name).sum()) / values for name, reason in reasons.items()}
+    parts = [f"{number:.2g} % {reason}" for reason, number in percent.items() if number > 0.0]
+    return f"Values: {', '.join(parts) or 'none clipped or flagged'}."
 
 
 def write_calibration(
@@ -111,18 +111,15 @@ def draw_calibration(
     Raises:
         InputError: the operating system refused to write.
     """
-    wavelengths_nm = session.wavelengths_nm
-    white = calibration.white
+    wavelengths_nm, white, drift = session.wavelengths_nm, calibration.white, calibration.drift
     if isinstance(white, WhiteReference):
         capture = session.white if calibration.source == "tarp" else session.frames[0]
         assert capture is not None
         draw_white_reference(folder / "white_reference.png", capture.cube, white, rgb_nm)
     elif white is not None:
         draw_column_white(folder / "white_reference.png", white, wavelengths_nm)
-    if isinstance(calibration.drift, LampDriftEstimate):
-        draw_lamp_drift(
-            folder / "lamp_drift.png", calibration.drift, wavelengths_nm, corrected=calibration.drift_corrected
-        )
+    if isinstance(drift, LampDriftEstimate):
+        draw_lamp_drift(folder / "lamp_drift.png", drift, wavelengths_nm, corrected=calibration.drift_corrected)
     if calibration.uncertainty is not None:
         draw_uncertainty(folder / "uncertainty.png", calibration.uncertainty, wavelengths_nm[calibration.bands])
 
@@ -130,48 +127,35 @@ def draw_calibration(
 def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: Sequence[float]) -> None:
     """Draw the steps to the white reference (the paper's appendix).
 
-    These are the coarse region, the deviation map, the mask at three percentiles, and the spectrum before and after
-    smoothing.
+    These are the coarse region with the part that is kept, the deviation map, the mask at three percentiles, and the
+    spectrum before and after smoothing.
     """
     x0, y0, x1, y1 = white.roi
     bands = nearest_bands(cube.wavelengths_nm, rgb_nm)
     counts = fill_no_data(cube.memmap()[..., bands], cube.ignore_value).astype(float)
     image = to_8_bit(counts / np.maximum(np.percentile(counts, 95.0, axis=(0, 1)), 1e-9))
-    figure = new_figure(12.0, 12.0)
-    axes = figure.subplot_mosaic(
-        [["image", "deviation", "kept"], ["lower", "used", "higher"], ["spectrum"] * 3, ["smoothing"] * 3],
-        height_ratios=[4.0, 4.0, 3.0, 1.5],
-    )
-    axes["image"].imshow(image)
+    figure = new_figure(12.0, 10.0)
+    rows = [["image", "image", "image", "deviation", "deviation", "deviation"]]
+    rows += [["lower"] * 2 + ["used"] * 2 + ["higher"] * 2, ["spectrum"] * 6]
+    axes = figure.subplot_mosaic(rows, height_ratios=[4.0, 4.0, 3.0])
+    axes["image"].imshow(draw_outline(image, white.region(image.shape[:2])))
     region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2)
     axes["image"].add_patch(region)
-    axes["image"].set_title("White and its coarse region")
+    axes["image"].set_title(f"White: coarse region, and the {white.pixels} pixels that are kept")
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
     top = np.percentile(white.deviation, 99.0)
     shown = axes["deviation"].imshow(white.deviation, cmap="viridis", extent=extent, vmin=0.0, vmax=top)
     figure.colorbar(shown, ax=axes["deviation"], extend="max", shrink=0.8)
-    axes["deviation"].set_title(f"Deviation D from the mean spectrum\n{_percentiles(white.deviation)}", fontsize=10)
-    kept = np.zeros(image.shape[:2], dtype=bool)
-    kept[y0:y1, x0:x1] = white.mask
-    axes["kept"].imshow(draw_outline(image, kept))
-    in_mask = white.deviation[white.mask]
-    axes["kept"].set_title(f"Region kept: {white.pixels} pixels\n{_percentiles(in_mask)}", fontsize=10)
+    axes["deviation"].set_title(f"Deviation D from the mean spectrum, median {np.median(white.deviation):.4f}")
     for name, step in {"lower": -PERCENTILE_STEP, "used": 0.0, "higher": PERCENTILE_STEP}.items():
         percentile = min(paper.WHITE_PERCENTILE + step, 100.0)
         mask = white_mask(white.deviation, percentile=percentile, kernel_px=white.kernel_px)
         inside = image[y0:y1, x0:x1]
         axes[name].imshow(np.where(mask[..., None], inside, inside // 4), extent=extent)
         mean = f"{white.deviation[mask].mean():.4f}" if mask.any() else "-"
-        axes[name].set_title(
-            f"{percentile:g}th percentile{' (used)' if step == 0.0 else ''}\n"
-            f"keeps {100.0 * mask.mean():.1f} % of the region, mean D {mean}",
-            fontsize=10,
-        )
+        kept_percent = 100.0 * mask.mean()
+        axes[name].set_title(f"{percentile:g}th percentile keeps {kept_percent:.1f} %,\nmean D {mean}", fontsize=10)
     _draw_spectrum(axes["spectrum"], white, cube.wavelengths_nm)
-    change = 100.0 * (white.spectrum[0] / white.measured[0] - 1.0)
-    axes["smoothing"].plot(cube.wavelengths_nm, change, color="tab:blue", linewidth=1)
-    axes["smoothing"].set(xlabel="wavelength (nm)", ylabel="change by\nsmoothing (%)")
-    axes["smoothing"].sharex(axes["spectrum"])
     save_figure(figure, path)
 
 
@@ -184,7 +168,6 @@ def draw_column_white(path: Path, white: White, wavelengths_nm: Float[np.ndarray
     figure.colorbar(shown, ax=by_column, label="counts above dark")
     by_column.set(xlabel="band", ylabel="sample", title="White by detector column (blank where an element is dead)")
     _draw_spectrum(spectrum, white, wavelengths_nm)
-    spectrum.set_xlabel("wavelength (nm)")
     save_figure(figure, path)
 
 
@@ -192,29 +175,25 @@ def draw_lamp_drift(
     path: Path, drift: LampDriftEstimate, wavelengths_nm: Float[np.ndarray, "bands"], *, corrected: bool
 ) -> None:
     """Draw the lamps' light by frame at some wavelengths, and by wavelength in the last frame."""
-    change, error, measured = (
-        100.0 * part for part in (drift.factor - 1.0, drift.standard_error, drift.measured - 1.0)
-    )
+    change, two_sd = 100.0 * (drift.factor - 1.0), 200.0 * drift.standard_error
     figure = new_figure(12.0, 4.5)
     by_frame, by_band = figure.subplots(1, 2)
     bands = list(dict.fromkeys(nearest_bands(wavelengths_nm, DRIFT_NM)))
     for band, colour in zip(bands, colormaps["plasma"](np.linspace(0.0, 0.8, len(bands))), strict=True):
-        label = f"{wavelengths_nm[band]:.0f} nm"
-        two_sd = 2.0 * error[:, band]
-        by_frame.errorbar(
-            np.arange(len(change)), change[:, band], two_sd, color=colour, marker=".", capsize=2, label=label
-        )
+        bars = {"color": colour, "marker": ".", "capsize": 2, "label": f"{wavelengths_nm[band]:.0f} nm"}
+        by_frame.errorbar(np.arange(len(change)), change[:, band], two_sd[:, band], **bars)
     by_frame.legend(title="with 2 standard errors")
     by_frame.xaxis.set_major_locator(MaxNLocator(integer=True))
-    p_value = f"p = {drift.p_value:.1g}" if drift.p_value > SMALLEST_P else f"p < {SMALLEST_P:g}"
     by_frame.set(xlabel="frame", ylabel="change since the first frame (%)")
     by_frame.set_title(
         f"Light of the lamps: {'corrected' if corrected else 'not corrected'} "
-        f"({'significant' if drift.significant else 'not significant'}, {p_value})"
+        f"({'significant' if drift.significant else 'not significant'}, p = {max(drift.p_value, SMALLEST_P):.1g})"
     )
-    by_band.plot(wavelengths_nm, measured[-1], ".", color="tab:gray", markersize=3, label="measured")
+    by_band.plot(
+        wavelengths_nm, 100.0 * (drift.measured[-1] - 1.0), ".", color="tab:gray", markersize=3, label="measured"
+    )
     by_band.plot(wavelengths_nm, change[-1], color="tab:blue", label="smooth, with 2 standard errors")
-    low, high = change[-1] - 2.0 * error[-1], change[-1] + 2.0 * error[-1]
+    low, high = change[-1] - two_sd[-1], change[-1] + two_sd[-1]
     by_band.fill_between(wavelengths_nm, low, high, color="tab:blue", alpha=0.3, linewidth=0)
     by_band.legend()
     by_band.set(xlabel="wavelength (nm)", ylabel="change in the last frame (%)")
@@ -276,18 +255,11 @@ def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:
 
 def _draw_spectrum(axes: Axes, white: White, wavelengths_nm: Float[np.ndarray, "bands"]) -> None:
     """The mean white spectrum before and after smoothing, with its bad bands marked."""
-    for number in np.flatnonzero(white.bad_bands).tolist():
-        left, right = max(number - 1, 0), min(number + 1, len(wavelengths_nm) - 1)
-        middle = wavelengths_nm[number]
-        span = (middle + wavelengths_nm[left]) / 2.0, (middle + wavelengths_nm[right]) / 2.0
-        axes.axvspan(*span, color="tab:red", alpha=0.25, linewidth=0)
+    for middle in wavelengths_nm[white.bad_bands]:
+        axes.axvline(middle, color="tab:red", alpha=0.25, linewidth=3)
     axes.plot(wavelengths_nm, mean_over_columns(white.measured), color="tab:gray", label="measured")
     axes.plot(wavelengths_nm, white.mean_spectrum(), color="tab:blue", linewidth=1, label="smoothed")
     bad = np.count_nonzero(white.bad_bands)
-    axes.set(ylabel="counts above dark", title=f"White spectrum{f', {bad} bad bands marked' if bad else ''}")
+    axes.set(xlabel="wavelength (nm)", ylabel="counts above dark")
+    axes.set_title(f"White spectrum{f', {bad} bad bands marked' if bad else ''}")
     axes.legend()
-
-
-def _percentiles(deviation: Float[np.ndarray, "n"]) -> str:
-    middle, high = np.percentile(deviation, [50.0, 95.0])
-    return f"median {middle:.4f}, 95th percentile {high:.4f}\nlargest {deviation.max():.4f}"

@@ -74,10 +74,10 @@ class SessionCalibration:
         cubes: the cube that each frame is read from.
         frames: the calibration of each frame.
         bands: the bands of the files that are kept.
+        drift: of the lamps, or why it is unknown.
         white: of the session, or of the first frame if each has its own; None for "product".
         defects: of the detector; None for "product".
         noise: of a reading; None for "product".
-        drift: of the lamps, or why it is unknown.
         drift_corrected: whether the frames are divided by it.
         uncertainty: of reflectance in the kept bands; None for "product".
     """
@@ -86,12 +86,12 @@ class SessionCalibration:
     cubes: tuple[Cube, ...]
     frames: tuple[FrameCalibration, ...]
     bands: Int[np.ndarray, "kept"]
-    white: White | None
-    defects: Defects | None
-    noise: NoiseModel | None
     drift: LampDriftEstimate | NotMeasurable
-    drift_corrected: bool
-    uncertainty: ReflectanceUncertainty | None
+    white: White | None = None
+    defects: Defects | None = None
+    noise: NoiseModel | None = None
+    drift_corrected: bool = False
+    uncertainty: ReflectanceUncertainty | None = None
 
 
 def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCalibration:
@@ -120,64 +120,35 @@ def _from_products(session: Session, config: CalibrationConfig) -> SessionCalibr
     """The instrument's own reflectance is only scaled."""
     cubes = tuple(frame.product for frame in session.frames if frame.product is not None)
     bands = _kept(session, ~np.logical_and.reduce([cube.good_bands for cube in cubes]))
+    frames = tuple(
+        FrameCalibration(
+            dark=np.zeros((1, cube.shape[2])),
+            gain=np.full((1, cube.shape[2]), 1.0 / cube.reflectance_scale),
+            bands=bands,
+            bounds=config.bounds,
+            ignore_value=cube.ignore_value,
+            quarter_turns=session.quarter_turns,
+        )
+        for cube in cubes
+    )
     return SessionCalibration(
-        source="product",
-        cubes=cubes,
-        frames=tuple(
-            FrameCalibration(
-                dark=np.zeros((1, cube.shape[2])),
-                gain=np.full((1, cube.shape[2]), 1.0 / cube.reflectance_scale),
-                bands=bands,
-                bounds=config.bounds,
-                ignore_value=cube.ignore_value,
-                quarter_turns=session.quarter_turns,
-            )
-            for cube in cubes
-        ),
-        bands=bands,
-        white=None,
-        defects=None,
-        noise=None,
-        drift=NotMeasurable("the noise of finished reflectance is unknown"),
-        drift_corrected=False,
-        uncertainty=None,
+        "product", cubes, frames, bands, NotMeasurable("the noise of finished reflectance is unknown")
     )
 
 
 def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfig) -> SessionCalibration:
     captures = session.frames
-    first = captures[0].cube
-    lines, samples, bands = first.shape
+    lines, samples, bands = captures[0].cube.shape
     darks = _dark_spectra(captures)
     defects = _defects(session, source, config)
     whites = measure_whites(session, source, config.roi, defects)
     panel = np.ones(bands)
     panel_path = config.panel or session.panel_reflectance_path
     if panel_path is not None:
-        panel = read_panel(panel_path, first.wavelengths_nm)
+        panel = read_panel(panel_path, session.wavelengths_nm)
     noise = _noise(session, source, whites[0], defects)
 
-    survey = survey_lines(lines)
-    saturated = defects.saturation_counts
-    exposures = np.array([exposure_ratio(capture, captures[0]) for capture in captures])
-
-    def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
-        cube = captures[frame].cube
-        counts = np.asarray(cube.memmap()[survey])
-        missing = no_data(counts, cube.ignore_value)
-        if missing is not None:
-            counts = np.where(missing, np.float32(np.nan), counts)
-        return counts if exposures[frame] == 1.0 else counts / exposures[frame]
-
-    drift = measure_lamp_drift(
-        read_lines,
-        len(captures),
-        [dark / exposure for dark, exposure in zip(darks, exposures, strict=True)],
-        noise,
-        first.wavelengths_nm,
-        saturation_counts=None if saturated is None else saturated / exposures.max(),
-        dead=defects.dead,
-    )
+    drift = _drift(session, darks, noise, defects)
     # A white in every frame drifts with the lamps.
     drift_factor = correction(drift, config.lamp_drift) if source == "tarp" else None
 
@@ -221,6 +192,33 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
         drift=drift,
         drift_corrected=drift_factor is not None,
         uncertainty=_uncertainty(session, source, whites[0], noise, panel, kept),
+    )
+
+
+def _drift(
+    session: Session, darks: Sequence[Float[np.ndarray, "columns bands"]], noise: NoiseModel, defects: Defects
+) -> LampDriftEstimate | NotMeasurable:
+    """The lamps' drift, from counts at the first frame's integration time."""
+    captures = session.frames
+    survey = survey_lines(captures[0].cube.shape[0])
+    exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
+
+    def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
+        cube = captures[frame].cube
+        counts = np.asarray(cube.memmap()[survey])
+        missing = no_data(counts, cube.ignore_value)
+        if missing is not None:
+            counts = np.where(missing, np.float32(np.nan), counts)
+        return counts if exposures[frame] == 1.0 else counts / exposures[frame]
+
+    return measure_lamp_drift(
+        read_lines,
+        len(captures),
+        [dark / exposure for dark, exposure in zip(darks, exposures, strict=True)],
+        noise,
+        session.wavelengths_nm,
+        saturation_counts=None if defects.saturation_counts is None else defects.saturation_counts / max(exposures),
+        dead=defects.dead,
     )
 
 
@@ -272,11 +270,7 @@ def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> R
 
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:
     cube, dark = white_cubes(session, source)
-    region = np.ones(cube.shape[:2], bool)
-    if isinstance(white, WhiteReference):
-        x0, y0, x1, y1 = white.roi
-        region[:] = False
-        region[y0:y1, x0:x1] = white.mask
+    region = white.region(cube.shape[:2]) if isinstance(white, WhiteReference) else np.ones(cube.shape[:2], bool)
     counts = cube.memmap()
     for number in np.flatnonzero(region.any(axis=1)):
         missing = no_data(counts[number], cube.ignore_value)

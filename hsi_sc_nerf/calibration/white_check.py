@@ -114,11 +114,9 @@ def _check_tarp(session: Session) -> _Verdict:
         looks_white = None if best is None else frames[best].name
     fault = None
     if brighter < BRIGHTER and alike >= ALIKE:
-        fault = f"the white {tarp.name} shows the same as the frames, and what is brightest in it is no brighter than there"
+        fault = f"the white {tarp.name} shows the same as the frames, and nothing in it is brighter than there"
     elif compared.outshone > OUTSHONE_FRACTION:
-        fault = (
-            f"the white {tarp.name} is too dark or coloured: the frames are over twice as bright in some bands"
-        )
+        fault = f"the white {tarp.name} is too dark or coloured: the frames are over twice as bright in some bands"
     elif roughness > ROUGHNESS:
         fault = f"the white {tarp.name} is not flat: neighbouring pixels differ by {100.0 * roughness:.0f} %"
     if fault is not None:

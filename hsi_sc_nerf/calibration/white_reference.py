@@ -74,6 +74,13 @@ class WhiteReference(White):
     mask: Bool[np.ndarray, "y x"]
     kernel_px: int
 
+    def region(self, shape: tuple[int, ...]) -> Bool[np.ndarray, "lines samples"]:
+        """The refined region in an image of that shape."""
+        x0, y0, x1, y1 = self.roi
+        image = np.zeros(shape, bool)
+        image[y0:y1, x0:x1] = self.mask
+        return image
+
 
 def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects | None = None) -> WhiteReference:
     """Steps 1 to 5 on an image that shows the white; the spectrum has one column.
@@ -110,15 +117,10 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
             f"{cube.header_path}: the tarp has no usable region, because no part of it is evenly bright; take it "
             "again or give its place with --calibration.roi."
         )
-    columns = column_sums(
-        counts,
-        mask,
-        ignore_value=cube.ignore_value,
-        saturation_counts=None if defects is None else defects.saturation_counts,
-    ).without(dead)
+    readings = ElementSums.of(counts, mask, dead, cube.ignore_value, defects)
     dark = dark_columns(None if capture.dark is None else capture.dark.read(), samples, bands)
-    measured = mean_spectrum(columns, dark if len(dark) == 1 else dark[x0:x1])[None]
-    bad_bands = _bad_bands(cube, measured, columns, defects)
+    measured = readings.mean_spectrum(dark if len(dark) == 1 else dark[x0:x1])[None]
+    bad_bands = _bad_bands(cube, measured, readings, defects)
     measured = np.where(bad_bands, np.nan, measured)
     spectrum, window_bands = smooth_spectrum(measured, cube.wavelengths_nm)
     return WhiteReference(
@@ -149,21 +151,17 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     """
     counts = white.read()
     width, bands = counts.shape[1:]
-    columns = column_sums(
-        counts,
-        np.ones(counts.shape[:2], bool),
-        ignore_value=white.ignore_value,
-        saturation_counts=None if defects is None else defects.saturation_counts,
-    ).without(_dead(defects, width, bands))
+    everywhere = np.ones(counts.shape[:2], bool)
+    readings = ElementSums.of(counts, everywhere, _dead(defects, width, bands), white.ignore_value, defects)
     dark_spectra = dark_columns(None if dark is None else dark.read(), width, bands)
     if width == samples:
         with np.errstate(invalid="ignore"):
-            measured = columns.sums / columns.numbers - dark_spectra
+            measured = readings.sums / readings.numbers - dark_spectra
         pixels = len(counts)
     else:
-        measured, pixels = mean_spectrum(columns, dark_spectra)[None], len(counts) * width
+        measured, pixels = readings.mean_spectrum(dark_spectra)[None], everywhere.size
         dark_spectra = dark_spectra.mean(axis=0, keepdims=True)
-    bad_bands = _bad_bands(white, measured, columns, defects)
+    bad_bands = _bad_bands(white, measured, readings, defects)
     measured = np.where(bad_bands | ~(measured > 0.0), np.nan, measured)
     spectrum, window_bands = smooth_spectrum(measured, white.wavelengths_nm)
     return White(measured, spectrum, dark_spectra, pixels, window_bands.max(axis=0), bad_bands)
@@ -228,48 +226,37 @@ def white_mask(deviation: Float[np.ndarray, "y x"], *, percentile: float, kernel
 
 
 @dataclass(frozen=True, eq=False)
-class ColumnSums:
-    """Sums over the readings of each detector element inside a mask.
-
-    Attributes:
-        sums: of the counts.
-        numbers: how many readings were summed.
-        saturated: how many of them are saturated.
-    """
+class ElementSums:
+    """Sums over the readings of each detector element: of the counts, of the readings and of the saturated ones."""
 
     sums: Float[np.ndarray, "x bands"]
     numbers: Int[np.ndarray, "x bands"]
     saturated: Int[np.ndarray, "x bands"]
 
-    def without(self, dead: Bool[np.ndarray, "x bands"]) -> ColumnSums:
-        """The same without the readings of dead elements."""
-        return ColumnSums(*(np.where(dead, 0, array) for array in (self.sums, self.numbers, self.saturated)))
+    @staticmethod
+    def of(
+        white: Num[np.ndarray, "y x bands"],
+        mask: Bool[np.ndarray, "y x"],
+        dead: Bool[np.ndarray, "x bands"],
+        ignore_value: float | None,
+        defects: Defects | None,
+    ) -> ElementSums:
+        """Sum inside the mask, without dead elements and readings that are no data."""
+        sums = np.zeros(white.shape[1:])
+        numbers, saturated = np.zeros((2, *white.shape[1:]), np.int64)
+        level = np.inf if defects is None or defects.saturation_counts is None else defects.saturation_counts
+        for line, kept in zip(white, mask, strict=True):
+            missing = no_data(line, ignore_value)
+            valid = kept[:, None] & ~dead if missing is None else kept[:, None] & ~dead & ~missing
+            np.add(sums, line, out=sums, where=valid)
+            numbers += valid
+            saturated += valid & (line >= level)
+        return ElementSums(sums, numbers, saturated)
 
-
-def column_sums(
-    white: Num[np.ndarray, "y x bands"],
-    mask: Bool[np.ndarray, "y x"],
-    *,
-    ignore_value: float | None = None,
-    saturation_counts: float | None = None,
-) -> ColumnSums:
-    """Sum each column's counts inside the mask, without readings that are no data."""
-    sums = np.zeros(white.shape[1:])
-    numbers, saturated = np.zeros((2, *white.shape[1:]), np.int64)
-    for line, kept in zip(white, mask, strict=True):
-        missing = no_data(line, ignore_value)
-        valid = kept[:, None] if missing is None else kept[:, None] & ~missing
-        np.add(sums, line, out=sums, where=valid)
-        numbers += valid
-        if saturation_counts is not None:
-            saturated += valid & (line >= saturation_counts)
-    return ColumnSums(sums, numbers, saturated)
-
-
-def mean_spectrum(columns: ColumnSums, dark: Float[np.ndarray, "dark_columns bands"]) -> Float[np.ndarray, "bands"]:
-    """Step 4: mean of all readings above dark; nan in a band without any reading."""
-    with np.errstate(invalid="ignore"):
-        return (columns.sums - columns.numbers * dark).sum(axis=0) / columns.numbers.sum(axis=0)
+    def mean_spectrum(self, dark: Float[np.ndarray, "dark_columns bands"]) -> Float[np.ndarray, "bands"]:
+        """Step 4: mean of all readings above dark; nan in a band without any reading."""
+        with np.errstate(invalid="ignore"):
+            return (self.sums - self.numbers * dark).sum(axis=0) / self.numbers.sum(axis=0)
 
 
 def smooth_spectrum(
@@ -311,7 +298,7 @@ def _dead(defects: Defects | None, samples: int, bands: int) -> Bool[np.ndarray,
 
 
 def _bad_bands(
-    cube: Cube, measured: Float[np.ndarray, "columns bands"], columns: ColumnSums, defects: Defects | None
+    cube: Cube, measured: Float[np.ndarray, "columns bands"], readings: ElementSums, defects: Defects | None
 ) -> Bool[np.ndarray, "bands"]:
     """Bands in which the white measures nothing.
 
@@ -319,7 +306,7 @@ def _bad_bands(
         InputError: more than half of the bands are bad.
     """
     bad = unlit_bands(measured)
-    bad |= columns.saturated.sum(axis=0) > MAX_SATURATED * columns.numbers.sum(axis=0)
+    bad |= readings.saturated.sum(axis=0) > MAX_SATURATED * readings.numbers.sum(axis=0)
     if defects is not None:
         bad |= defects.bad_bands
     if 2 * np.count_nonzero(bad) > len(bad):

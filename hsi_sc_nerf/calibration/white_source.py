@@ -19,22 +19,17 @@ def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: R
     Raises:
         InputError: the session does not have it, or it is a target and ``roi`` is None.
     """
-    available: dict[WhiteSource, bool] = {
-        "tarp": session.white is not None and session.has_counts,
-        "capture": session.has_own_whites,
-        "product": session.has_products,
-        "target": session.has_counts,
+    available: dict[WhiteSource, tuple[bool, str]] = {
+        "tarp": (session.white is not None and session.has_counts, "has no capture of a white tarp"),
+        "capture": (session.has_own_whites, "does not have a WHITEREF cube with every capture"),
+        "product": (session.has_products, "does not have a REFLECTANCE cube of every frame"),
+        "target": (session.has_counts, "does not have raw counts of every frame"),
     }
     if source == "auto":
         # open_session refuses sessions without any of the first three.
-        return next(source for source, is_available in available.items() if is_available)
-    if not available[source]:
-        missing = {
-            "tarp": "has no capture of a white tarp",
-            "capture": "does not have a WHITEREF cube with every capture",
-            "product": "does not have a REFLECTANCE cube of every frame",
-            "target": "does not have raw counts of every frame",
-        }[source]
+        return next(source for source, (is_available, _) in available.items() if is_available)
+    is_available, missing = available[source]
+    if not is_available:
         raise InputError(f"{session.path}: {missing}; choose another --calibration.white-source, or auto.")
     if source == "target" and roi is None:
         raise InputError(
@@ -74,9 +69,7 @@ def white_cubes(session: Session, source: WhiteSource) -> tuple[Cube, Cube | Non
 
 def exposure_ratio(capture: Capture, other: Capture) -> float:
     """Ratio of two captures' integration times; 1 if one is unknown."""
-    if capture.integration_time_ms is None or other.integration_time_ms is None:
-        return 1.0
-    return capture.integration_time_ms / other.integration_time_ms
+    return _ratio(capture.integration_time_ms, other.integration_time_ms)
 
 
 def white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture) -> float:
@@ -84,6 +77,8 @@ def white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture
     if source == "tarp":
         assert session.white is not None
         return exposure_ratio(session.white, capture)
-    if source == "target" or capture.white_integration_time_ms is None or capture.integration_time_ms is None:
-        return 1.0
-    return capture.white_integration_time_ms / capture.integration_time_ms
+    return 1.0 if source == "target" else _ratio(capture.white_integration_time_ms, capture.integration_time_ms)
+
+
+def _ratio(one_ms: float | None, other_ms: float | None) -> float:
+    return 1.0 if one_ms is None or other_ms is None else one_ms / other_ms

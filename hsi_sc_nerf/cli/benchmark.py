@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -183,34 +183,18 @@ def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) ->
 
 
 def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
-    """Rehearse if a time is given, then train; results are kept with their job."""
-    iterations = job.iterations
-    if iterations is None:
-        found = _finished(folder / "rehearsal.json", job, identity)
-        if found is None:
-            rehearsed_in = folder / "rehearsal"
-            try:
-                rehearsal = replace(job, output_dir=str(rehearsed_in.resolve()))
-                found = _process(folder, "rehearsal", rehearsal, job, identity)
-            finally:
-                shutil.rmtree(rehearsed_in, ignore_errors=True)
-        iterations = found["iterations"]
-    shutil.rmtree(folder / "benchmark", ignore_errors=True)
-    return _process(folder, "result", replace(job, iterations=iterations), job, identity)
-
-
-def _process(folder: Path, name: str, job: Job, key: Job, identity: dict[str, Any]) -> dict[str, Any]:
-    """Run ``job`` in its own process; the result is kept as ``NAME.json`` with ``key``."""
-    log = folder.parent / "logs" / f"{folder.name}-{name}.log"
+    """Train in a process of its own; the result is kept as ``result.json`` with its job."""
+    log = folder.parent / "logs" / f"{folder.name}.log"
     for needed in (folder, log.parent):
         make_folder(needed)
+    shutil.rmtree(folder / "benchmark", ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY_PREFIX) as temporary:
         job_path, found_path = Path(temporary, "job.json"), Path(temporary, "found.json")
         write_json(job_path, asdict(job))
         module = "hsi_sc_nerf.benchmark.run"
-        run_step(f"{name} of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
+        run_step(f"training of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
         found = json.loads(found_path.read_text(encoding="utf-8"))
-    write_json(folder / f"{name}.json", {"job": asdict(key), **identity, **found})
+    write_json(folder / "result.json", {"job": asdict(job), **identity, **found})
     return found
 
 
@@ -237,6 +221,8 @@ def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dic
     }
     out = command.output_dir / "benchmark"
     results.write_csv(out.with_suffix(".csv"), runs)
-    results.write_results(out.with_suffix(".json"), runs, settings, machine)
+    write_json(
+        out.with_suffix(".json"), {"machine": machine, "settings": settings, "runs": [asdict(run) for run in runs]}
+    )
     results.write_page(out.with_suffix(".md"), runs, settings, machine)
     results.draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)

@@ -44,7 +44,7 @@ class CompareCommand:
 
         # Slow to import.
         from hsi_sc_nerf.evaluation.comparison_report import screen_tables, write_comparison
-        from hsi_sc_nerf.simulate.scores.visible_surface import true_reference
+        from hsi_sc_nerf.simulate.scores.surface import true_reference
 
         if self.reference.is_dir():
             reference = true_reference(self.reference, self.config, shown)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.cli.steps import StepCost
-from hsi_sc_nerf.evaluation.spatial import f_score_with_spread, sample_surface
+from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import project
@@ -48,9 +48,8 @@ def score(out: Path) -> tuple[dict[str, float], ProcessingScore]:
     truth = load_truth(out / "session")
     mesh, cloud = truth.mesh(), read_spectral_ply(out / "point_cloud.ply")
     reference = sample_surface(mesh.vertices, mesh.triangles, REFERENCE_POINTS)
-    spatial, spread = f_score_with_spread(cloud.points, reference, paper.F_SCORE_THRESHOLD_M)
-    metrics |= {"f_score": spatial.f_score, "f_score_std": spread}
-    metrics |= {"precision": spatial.precision, "recall": spatial.recall}
+    spatial = precision_recall_f_score(cloud.points, reference, paper.F_SCORE_THRESHOLD_M)
+    metrics |= asdict(spatial)
     return metrics, score_processing(open_packed(out / "data"), truth)
 
 
@@ -84,7 +83,8 @@ def show_table(
     for key, title in units.items():
         digits = 1 if key in ("psnr", "f_score") else 4
         published = f"{PAPER_APPLE[key]:.{digits}f}" if key in PAPER_APPLE else "-"
-        quality.add_row(title, f"{metrics[key]:.{digits}f} ± {metrics[key + '_std']:.{digits}f}", published)
+        spread = f" ± {metrics[f'{key}_std']:.{digits}f}" if f"{key}_std" in metrics else ""
+        quality.add_row(title, f"{metrics[key]:.{digits}f}{spread}", published)
     errors_table = Table("error", "value", "target", title="Processing against the truth")
     for row in (
         ("rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"),

@@ -78,7 +78,7 @@ class RenderCommand:
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_write(*files)) if files else []
             videos = [stack.enter_context(open_video(path, self.frames_per_second)) for path in temporary]
-            with progress_bar("rendering", "views", len(views)) as update:
+            with progress_bar("rendering", "views", len(views.names)) as update:
                 for i, (name, camera) in enumerate(views):
                     rendered = render_view(run.model, camera)
                     if self.cubes != "none":
@@ -91,4 +91,4 @@ class RenderCommand:
                     update(i + 1)
         legends = {path.name: item.legend for path, item in zip(files, shown, strict=True)}
         write_report(self.output_dir / "render", rows, legends)
-        Console().print(f"{len(views)} views: {escape(str(self.output_dir / 'render.md'))}")
+        Console().print(f"{len(views.names)} views: {escape(str(self.output_dir / 'render.md'))}")

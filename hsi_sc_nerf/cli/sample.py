@@ -15,7 +15,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between, check_options
 
 _METRES = {"m": 1.0, "mm": 1e-3}
-_EXTRA = ("sampled_views", "sampled_std")
 
 
 @dataclass(frozen=True)
@@ -48,38 +47,28 @@ class SampleCommand:
                 written.
         """
         check_options(self)
-        from hsi_sc_nerf.export.sampled_ply import SpectralColumns, read_points
+        from hsi_sc_nerf.export.sample_points import sample_points
+        from hsi_sc_nerf.export.sampled_ply import read_points, write_sampled_ply
+        from hsi_sc_nerf.models.trained_run import open_run
 
         given = read_points(self.points)
         normals = given.normals()
-
-        from hsi_sc_nerf.export.sample_points import sample_points
-        from hsi_sc_nerf.models.trained_run import open_run
-        from hsi_sc_nerf.progress import progress_bar
-
         run = open_run(self.load_config)
-        columns = SpectralColumns(given, run.dataset.wavelengths_nm, _EXTRA)
-        no_spectrum = 0
-        points_m = given.positions() * _METRES[self.unit]
-        parts = sample_points(run, points_m, normals, self.max_distance_mm / 1e3, self.views)
-        with progress_bar("sampling", "points", len(given)) as update:
-            for rows, outward, found in parts:
-                extra = dict(zip(_EXTRA, (found.views, found.spectral_std), strict=True))
-                columns.fill(rows, outward, found.spectra, run.model.rgb_bands, extra)
-                no_spectrum += int((found.views == 0).sum())
-                update(rows.stop)
-        if no_spectrum == len(given):
+        points_m = given.positions * _METRES[self.unit]
+        found = sample_points(run, points_m, normals, self.max_distance_mm / 1e3, self.views)
+        count, no_spectrum = len(found.views), int((found.views == 0).sum())
+        if no_spectrum == count:
             raise InputError(
                 f"{self.points}: none of its points lies on the object; give them in the object's frame (origin on "
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
         output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
-        columns.write(output)
+        write_sampled_ply(output, given, found, run.dataset.wavelengths_nm, run.model.rgb_bands)
         console = Console()
         if no_spectrum:
             console.print(
-                f"[yellow]{no_spectrum:,} of {len(given):,} points have no spectrum (NaN): no training camera that "
+                f"[yellow]{no_spectrum:,} of {count:,} points have no spectrum (NaN): no training camera that "
                 f"faces them sees a surface within {self.max_distance_mm:g} mm of them."
             )
         bands = len(run.dataset.wavelengths_nm)
-        console.print(f"{escape(str(output))}: {len(given) - no_spectrum:,} points with spectra of {bands} bands.")
+        console.print(f"{escape(str(output))}: {count - no_spectrum:,} points with spectra of {bands} bands.")

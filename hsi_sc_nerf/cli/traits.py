@@ -57,8 +57,6 @@ class TraitsCommand:
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
-    roi_file: Path | None = None
-    """YAML file with more regions of interest, such as `bruise: {centre_m: [0.03, 0.0, 0.1], radius_m: 0.004}`."""
 
     def main(self) -> None:
         """Measure and write.
@@ -70,15 +68,14 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.size import size_of, size_spread
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
-        from hsi_sc_nerf.analysis.traits import analyse, classified, read_regions, region_of_interest
+        from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
         from hsi_sc_nerf.progress import progress_bar
 
         check_options(self)
         if self.classes and self.library is None:
             raise InputError("--classes names spectra of a library; give it with --library.")
-        picked = [region_of_interest(*words) for words in self.roi]
-        picked += read_regions(self.roi_file) if self.roi_file else []
+        picked = [RegionOfInterest(name, (x_m, y_m, z_m), radius_m) for name, x_m, y_m, z_m, radius_m in self.roi]
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
             library = library.only(self.classes)
@@ -118,31 +115,29 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis import pictures, report
         from hsi_sc_nerf.analysis.closed_mesh import open_edges
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+        from hsi_sc_nerf.files import write_json
 
         views = pictures.SideViews(surface.mesh)
-        drawn = {}
-        extra = {}
+        drawn, extra = {}, {}
         if (found := traits.classes) is not None:
             for caption, picture, column, labels in (
                 ("Classes by angle", "classes.png", "class", found.labels),
                 ("Classes by mixture", "classes_by_mixture.png", "class_by_mixture", found.mixture_labels),
             ):
                 pictures.draw_classes(self.output_dir / picture, found.names, labels, surface, views)
-                drawn[caption] = picture
-                extra[column] = labels.astype("float32")
+                drawn[caption], extra[column] = picture, labels.astype("float32")
         drawn["Spectra of regions"] = "region_spectra.png"
         pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
-        for caption, name, draw, table in (
-            ("Composites", "composites.png", pictures.draw_composites, traits.composites),
-            ("Indices", "indices.png", pictures.draw_indices, traits.indices),
-        ):
-            if any(table.values()):
-                draw(self.output_dir / name, surface, views, traits)
-                drawn[caption] = name
+        if traits.regions[0].composites:
+            drawn["Composites"] = "composites.png"
+            pictures.draw_composites(self.output_dir / "composites.png", surface, views)
+        if traits.regions[0].indices:
+            drawn["Indices"] = "indices.png"
+            pictures.draw_indices(self.output_dir / "indices.png", surface, views)
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
-        watertight = open_edges(surface.mesh) == 0
         options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
         settings = {"cloud": self.cloud.name, **asdict(config), **options}
-        report.write_traits_json(self.output_dir / "traits.json", size, spread, watertight, traits, settings)
-        report.write_page(self.output_dir / "traits.md", self.cloud.name, size, spread, watertight, traits, drawn)
+        content = report.trait_content(size, spread, open_edges(surface.mesh) == 0, traits, settings)
+        write_json(self.output_dir / "traits.json", content)
+        report.write_page(self.output_dir / "traits.md", self.cloud.name, content, drawn)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,6 +23,12 @@ from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader
 from hsi_sc_nerf.processing.region_spectra import median_of_smallest
 
+MAX_FRAMES = 12
+"""Frames that are read, evenly spread over the session: enough for a median."""
+MAX_CELLS = 128
+"""Cells along the image's longer side; the chamber is smooth."""
+MIN_FRACTION = 0.2
+"""Fraction of the frames read that has to show the chamber at a cell; other cells are inpainted."""
 MARGIN_FRACTION = 0.01
 """Object and turntable are dilated by this fraction of the image's shorter side, because their edges are blurred."""
 SMOOTHING_CELLS = 5
@@ -37,29 +42,9 @@ _SIGMA_OF_MAD = 1.4826
 _QUASIRANDOM_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 
 
-@dataclass(frozen=True, eq=False)
-class StaticBackground:
-    """The chamber as the camera sees it.
-
-    Attributes:
-        image: reflectance.
-        coverage: fraction of the frames read that show the chamber there; 0 where it was inpainted.
-        cell_px: side of a cell in pixels of the camera's image; cells count from the image's upper left corner.
-    """
-
-    image: Float[np.ndarray, "lines samples bands"]
-    coverage: Float[np.ndarray, "lines samples"]
-    cell_px: int
-
-
 def estimate_static_background(
-    dataset: PackedDataset,
-    frames: Sequence[PackedFrame],
-    *,
-    max_frames: int = 12,
-    max_cells: int = 128,
-    min_fraction: float = 0.2,
-) -> StaticBackground:
+    dataset: PackedDataset, frames: Sequence[PackedFrame]
+) -> tuple[Float[np.ndarray, "lines samples bands"], int]:
     """The chamber behind the turntable, on a coarse grid over the camera's image.
 
     Each frame contributes another single pixel of a cell, so that memory and reading do not grow with the image.
@@ -69,19 +54,20 @@ def estimate_static_background(
     Args:
         dataset: its camera, boxes and container.
         frames: the frames that may be read (training frames).
-        max_frames: number of frames that are read, evenly spread over the session.
-        max_cells: cells of the image along its longer side.
-        min_fraction: fraction of the frames read that has to show the chamber at a cell; other cells are inpainted.
+
+    Returns:
+        Reflectance of the cells, and their side in pixels of the camera's image, from its upper left corner.
 
     Example:
         >>> dataset = open_packed("apple_01-data")
-        >>> estimate_static_background(dataset, dataset.frames).image.shape
+        >>> image, cell_px = estimate_static_background(dataset, dataset.frames)
+        >>> image.shape
         (128, 128, 204)
     """
-    count = min(len(frames), max_frames)
+    count = min(len(frames), MAX_FRAMES)
     chosen = [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]
     height, width = dataset.intrinsics.h, dataset.intrinsics.w
-    cell_px = -(-max(width, height) // max_cells)
+    cell_px = -(-max(width, height) // MAX_CELLS)
     margin_px = 2 * max(1, round(MARGIN_FRACTION * min(width, height))) + 1
     pixels = [cell_pixels(height, width, cell_px, k) for k in range(count)]
     free = np.empty((count, len(pixels[0][0]), len(pixels[0][1])), bool)
@@ -89,7 +75,7 @@ def estimate_static_background(
         turning = frame.mask() | turntable_silhouette(dataset, frame.camera_to_world)
         free[k] = ~dilate(turning, margin_px)[np.ix_(y, x)]
 
-    min_frames = max(1, int(np.ceil(min_fraction * count)))
+    min_frames = max(1, int(np.ceil(MIN_FRACTION * count)))
     with closing(PixelReader(frame.cube() for frame in chosen)) as reader:
         image = np.empty((*free.shape[1:], reader.shape[2]), np.float32)
         variance = np.empty_like(image)
@@ -97,12 +83,7 @@ def estimate_static_background(
             indices = [np.stack(np.broadcast_arrays(k, y[line], x), axis=-1) for k, (y, x) in enumerate(pixels)]
             counts = reader.read(np.concatenate(indices)).reshape(count, len(image[0]), -1)
             image[line], variance[line] = median_over_frames(counts, free[:, line], min_frames)
-    image = wiener_filter(image, variance, SMOOTHING_CELLS)
-    return StaticBackground(
-        image=inpaint(image, dataset.background_reflectance),
-        coverage=np.where(free.sum(axis=0) >= min_frames, free.mean(axis=0), 0.0).astype(np.float32),
-        cell_px=cell_px,
-    )
+    return inpaint(wiener_filter(image, variance, SMOOTHING_CELLS), dataset.background_reflectance), cell_px
 
 
 def cell_pixels(

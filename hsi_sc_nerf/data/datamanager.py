@@ -19,7 +19,7 @@ from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 from hsi_sc_nerf.packed.dataset import PackedFrame
-from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 
 
 @dataclass
@@ -132,12 +132,6 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         """Random pixels of held-out views."""
         self.eval_count += 1
         return self._with_rays(self.eval_pixel_sampler.sample(step), self.eval_ray_generator)
-
-    def fixed_eval_pixels(self, count: int = 4) -> tuple[RayBundle, dict]:
-        """The same pixels of the object in the first held-out view each time; of all of it where it shows none."""
-        mask = self.eval_pixel_sampler.masks[:1]
-        indices = spread_over(mask if mask.any() else ~mask, count)
-        return self._with_rays(self.eval_pixel_sampler.at(indices), self.eval_ray_generator)
 
     def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         return PixelSampler(

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
@@ -19,11 +20,16 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.session import is_session
-from hsi_sc_nerf.data.cameras import pinhole_cameras
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, is_packed, open_packed
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
+
+FRAME_INDEX = "frame_index"
+"""Camera metadata: index of the session's frame that a ray belongs to."""
+CAMERA_ROTATION = "camera_rotation"
+"""Camera metadata: the nine elements of the camera-to-world rotation of a ray, row by row."""
 
 
 @dataclass
@@ -98,6 +104,39 @@ class SpectralDataParser(DataParser):
                 },
             },
         )
+
+
+def pinhole_cameras(
+    poses: Float[np.ndarray, "n 4 4"],
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"],
+    frames: Int[np.ndarray, "n"] | None = None,
+) -> Cameras:
+    """Cameras at poses in scene units.
+
+    Args:
+        poses: camera-to-world, OpenGL axes.
+        intrinsics: of all cameras.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        frames: indices of the session's frames that were taken at these poses, which the model refines; None for
+            poses that belong to no frame and are not refined.
+    """
+    k1, k2, p1, p2 = distortion
+    metadata = {CAMERA_ROTATION: torch.from_numpy(poses[:, :3, :3].reshape(-1, 9)).float()}
+    if frames is not None:
+        metadata[FRAME_INDEX] = torch.from_numpy(frames)[:, None].float()
+    return Cameras(
+        camera_to_worlds=torch.from_numpy(poses[:, :3]).float(),
+        fx=intrinsics.fl_x,
+        fy=intrinsics.fl_y,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        width=intrinsics.w,
+        height=intrinsics.h,
+        distortion_params=torch.tensor([k1, k2, 0.0, 0.0, p1, p2]).float() if np.any(distortion) else None,
+        camera_type=CameraType.PERSPECTIVE,
+        metadata=metadata,
+    )
 
 
 def processed_dir(session_dir: Path) -> Path:

@@ -54,15 +54,12 @@ class SpectralSubspace:
         return self.mean_spectrum @ self.basis / np.sqrt(len(self.basis))
 
 
-def training_subspace(
-    dataset: PackedDataset, frames: Sequence[PackedFrame], rank: int | None = None
-) -> SpectralSubspace:
+def training_subspace(dataset: PackedDataset, frames: Sequence[PackedFrame]) -> SpectralSubspace:
     """The subspace of training pixels, half of which lie on the object.
 
     Args:
         dataset: its uncertainty is the noise; where it has none, the noise is estimated from the spectra.
         frames: training frames.
-        rank: number of directions; None for those above the noise.
 
     Raises:
         InputError: too few pixels are free of flagged values.
@@ -74,15 +71,13 @@ def training_subspace(
     """
     spectra, valid = sample_training_spectra(frames)
     noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
-    return find_subspace(spectra, noise, valid, rank=rank)
+    return find_subspace(spectra, noise, valid)
 
 
 def find_subspace(
     spectra: Float[np.ndarray, "n bands"],
     noise: Float[np.ndarray, "*n bands"] | None = None,
     valid: Bool[np.ndarray, "n bands"] | None = None,
-    *,
-    rank: int | None = None,
     max_rank: int = 16,
 ) -> SpectralSubspace:
     """The subspace of spectra above their noise.
@@ -94,11 +89,10 @@ def find_subspace(
         spectra: reflectance.
         noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
         valid: which values are measurements; spectra with any other are left out. All if not given.
-        rank: number of directions; None for those above the noise.
         max_rank: largest number of directions above the noise that is taken.
 
     Raises:
-        InputError: too few spectra have all bands, or the rank is not from 1 to the number of bands.
+        InputError: too few spectra have all bands.
         ValueError: the noise is not above 0.
     """
     complete = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
@@ -108,9 +102,6 @@ def find_subspace(
             f"basis needs {MIN_SPECTRA}; calibration.json in the dataset counts the flags of each band: list the "
             "worst bands as bad (bbl) in the headers and process again, or train with --pipeline.model.head direct."
         )
-    bands = spectra.shape[1]
-    if rank is not None and not 1 <= rank <= bands:
-        raise InputError(f"a basis for spectra of {bands} bands has 1 to {bands} columns, not {rank}; choose a rank.")
     sample = spectra[complete].astype(np.float64)
     deviation = estimate_noise(sample) if noise is None else np.broadcast_to(noise, spectra.shape)[complete]
     deviation = np.broadcast_to(deviation, sample.shape).astype(np.float64)
@@ -122,9 +113,9 @@ def find_subspace(
     # The triangle of a QR decomposition has the singular values and directions of the whole.
     _, singular, directions = np.linalg.svd(np.linalg.qr(sample / noise_scale, mode="r"))
     above_noise = int((singular > _largest_noise_value(deviation / noise_scale)).sum())
-    chosen = rank or max(1, min(above_noise, max_rank))
+    rank = max(1, min(above_noise, max_rank))
 
-    span, _ = np.linalg.qr((directions[:chosen] * band_noise).T)
+    span, _ = np.linalg.qr((directions[:rank] * band_noise).T)
     _, _, rotation = np.linalg.svd(sample @ span, full_matrices=False)
     basis = span @ rotation.T
     basis *= np.where((sample @ basis).sum(axis=0) < 0.0, -1.0, 1.0)
@@ -172,18 +163,11 @@ def pixel_noise(
 
 
 def sample_training_spectra(
-    frames: Sequence[PackedFrame], count: int = 4096, foreground_fraction: float | None = 0.5, seed: int = 0
+    frames: Sequence[PackedFrame], count: int = 4096
 ) -> tuple[Float[np.ndarray, "count bands"], Bool[np.ndarray, "count bands"]]:
-    """Reflectance at random pixels of the frames, and which values are measurements (0 where they are not).
-
-    Args:
-        frames: of a packed dataset.
-        count: number of pixels; only these are read.
-        foreground_fraction: fraction drawn from the foreground; None for pixels of whole frames.
-        seed: of the random choice.
-    """
+    """Reflectance at random pixels, half of them on the object, and which values are measurements (others are 0)."""
     masks = np.stack([frame.mask() for frame in frames])
     # Closed at once: the data manager opens a file for each of these frames as well.
     with closing(PixelReader(frame.cube() for frame in frames)) as reader:
-        batch = PixelSampler(reader, masks, count, seed, has_flagged=True).sample(0, foreground_fraction)
+        batch = PixelSampler(reader, masks, count, seed=0, has_flagged=True).sample(0, 0.5)
     return batch["spectral"], batch["valid"]

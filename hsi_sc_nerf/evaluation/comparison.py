@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from plyfile import PlyData
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
@@ -21,12 +22,13 @@ from hsi_sc_nerf.evaluation.spatial import (
     sample_surface,
     threshold_curves,
 )
-from hsi_sc_nerf.evaluation.surface_files import read_surface
+from hsi_sc_nerf.meshes.mesh import ply_triangles
 
 Alignment = Literal["features", "icp", "none"]
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Wraps what takes long, with a description of it, to show a progress bar."""
 
+FORMATS = (".ply", ".obj", ".stl")
 METRES = {"m": 1.0, "mm": 0.001}
 THRESHOLDS = 201
 FEWEST_POINTS = 100
@@ -122,7 +124,7 @@ def compare(
 
     Args:
         cloud_path: PLY cloud, or PLY, OBJ or STL mesh, in metres.
-        reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.scores.visible_surface.true_reference` of a
+        reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.scores.surface.true_reference` of a
             simulated session.
         config: settings.
         track: shows progress.
@@ -182,6 +184,43 @@ def surface_of(path: Path, config: CompareConfig, unit_m: float = 1.0) -> Surfac
         return Surface(sample_surface(vertices, triangles, config.points, config.seed), vertices, triangles)
     except ValueError as error:
         raise InputError(f"{path}: its triangles have no area; export the mesh again.") from error
+
+
+def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+    """Vertices, in the file's unit, and triangles (none for a point cloud). Polygons are triangulated as fans.
+
+    Raises:
+        InputError: the file is missing, has another format, cannot be read, or has no points or points that are not
+            finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give a point cloud (PLY) or a mesh (PLY, OBJ, STL).")
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: is no file that can be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
+    try:
+        vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
+    except Exception as error:  # readers raise errors of many types
+        raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
+    if not len(vertices):
+        raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
+    return vertices, triangles
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    # Memory-mapped: only three of a spectral cloud's hundreds of columns are read.
+    content = PlyData.read(path)
+    vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
+    return vertices, ply_triangles(content)
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    read = trimesh.load_mesh(path, process=False)
+    return np.asarray(read.vertices, float), np.asarray(read.faces, np.int64)
 
 
 def _check(config: CompareConfig, alignment: Alignment) -> None:

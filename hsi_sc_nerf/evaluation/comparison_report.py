@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps, rc_context
 from plyfile import PlyData, PlyElement
 from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.evaluation.comparison import Comparison
-from hsi_sc_nerf.evaluation.comparison_pictures import (
-    colour_limit_m,
-    distance_colours,
-    draw_curves,
-    draw_distances,
-)
-from hsi_sc_nerf.evaluation.spatial import distance_statistics, score_at, threshold_for_m
+from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.tables import markdown_table, screen_table
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _DISTANCE_TITLES = ["distance, mm", "mean", "median", "RMS", "95th percentile", "largest"]
 _REACHED_PERCENT = (90.0, 95.0, 99.0)
+_DRAWN_POINTS = 60_000
+# Title, direction of y across and of x towards the viewer; z is up.
+_SIDES = (("seen from +x", 1), ("seen from −x", -1))
+_PANEL_IN = 2.5
 
 
 def score_rows(comparison: Comparison) -> list[list[str]]:
@@ -43,7 +46,7 @@ def score_rows(comparison: Comparison) -> list[list[str]]:
 def distance_rows(comparison: Comparison) -> list[list[str]]:
     """Statistics of the distances in both directions."""
     return [
-        [label, *(f"{1000 * value:.3f}" for value in asdict(distance_statistics(distances)).values())]
+        [label, *(f"{1000 * value:.3f}" for value in distance_statistics(distances).values())]
         for label, distances in (
             ("cloud to reference", comparison.to_reference_m),
             ("reference to cloud", comparison.to_cloud_m),
@@ -74,8 +77,8 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "f_score_reaches": {
             f"{percent:g}_percent_m": threshold_for_m(forth, back, percent) for percent in _REACHED_PERCENT
         },
-        "cloud_to_reference": {"points": len(forth), **asdict(distance_statistics(forth))},
-        "reference_to_cloud": {"points": len(back), **asdict(distance_statistics(back))},
+        "cloud_to_reference": {"points": len(forth), **distance_statistics(forth)},
+        "reference_to_cloud": {"points": len(back), **distance_statistics(back)},
         "alignment": _alignment(comparison),
         "seen_fraction_of_reference": comparison.seen_fraction,
         "settings": asdict(comparison.config),
@@ -97,7 +100,7 @@ def _alignment(comparison: Comparison) -> dict[str, Any]:
         "rival": None if registration.rival is None else asdict(registration.rival),
         "within_m": registration.within_m,
         "matched_fraction": len(matched) / len(comparison.to_reference_m),
-        "matched_rms_m": distance_statistics(matched).rms_m if len(matched) else None,
+        "matched_rms_m": distance_statistics(matched)["rms_m"] if len(matched) else None,
     }
 
 
@@ -108,7 +111,7 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
         InputError: the operating system refused to write.
     """
     names = ("comparison.md", "comparison.json", "curves.png", "distances.png", "distances.ply")
-    limit_m = colour_limit_m(comparison.to_reference_m, comparison.to_cloud_m)
+    limit_m = _colour_limit_m(comparison.to_reference_m, comparison.to_cloud_m)
     figures = summary(comparison)
     with atomic_write(*(folder / name for name in names)) as (page, numbers, curves, pictures, cloud):
         write_json(numbers, {"cloud": cloud_name, "reference": reference_name, **figures})
@@ -116,17 +119,17 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
             (figures["scores"][name]["threshold_m"], figures["scores"][name]["f_score"])
             for name in ("knee", "chosen")
         )
-        draw_curves(curves, comparison.curves, knee, chosen)
+        _draw_curves(curves, comparison.curves, knee, chosen)
         surfaces = [
             ("cloud", comparison.cloud.points_m, comparison.to_reference_m),
             ("reference", comparison.reference.points_m, comparison.to_cloud_m),
         ]
-        draw_distances(pictures, surfaces, limit_m)
-        write_distance_ply(cloud, comparison.cloud.points_m, comparison.to_reference_m, limit_m)
+        _draw_distances(pictures, surfaces, limit_m)
+        _write_distance_ply(cloud, comparison.cloud.points_m, comparison.to_reference_m, limit_m)
         page.write_text(_page(comparison, figures, cloud_name, reference_name, limit_m), encoding="utf-8")
 
 
-def write_distance_ply(
+def _write_distance_ply(
     path: Path, points_m: Float[np.ndarray, "n 3"], distances_m: Float[np.ndarray, "n"], limit_m: float
 ) -> None:
     """Points with their distance as colour and as ``scalar_distance_m``, a scalar field in CloudCompare."""
@@ -135,7 +138,7 @@ def write_distance_ply(
     vertices = np.empty(len(points_m), columns)
     for name, values in zip("xyz", points_m.T, strict=True):
         vertices[name] = values
-    for name, values in zip(("red", "green", "blue"), distance_colours(distances_m, limit_m).T, strict=True):
+    for name, values in zip(("red", "green", "blue"), _distance_colours(distances_m, limit_m).T, strict=True):
         vertices[name] = values
     vertices["scalar_distance_m"] = distances_m
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
@@ -204,3 +207,91 @@ def _seen_sentence(comparison: Comparison) -> str:
         f" Recall counts the {100 * comparison.seen_fraction:.1f} % of the true surface that some view sees; "
         "distances of the cloud are to all of it."
     )
+
+
+def _colour_limit_m(*distances_m: Float[np.ndarray, "n"]) -> float:
+    """Upper end of the colour scale: the largest 95th percentile, so that outliers do not darken the rest."""
+    return max(float(np.percentile(distances, 95)) for distances in distances_m) or 1e-6
+
+
+def _distance_colours(distances_m: Float[np.ndarray, "n"], limit_m: float) -> UInt8[np.ndarray, "n 3"]:
+    """Dark blue at 0 to yellow at the limit and beyond (viridis)."""
+    return colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
+
+
+@rc_context(STYLE)
+def _draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], chosen: tuple[float, float]) -> None:
+    """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
+
+    Args:
+        path: the PNG file.
+        curves: over the threshold.
+        knee: threshold (metres) and F-score (percent) of the curve's knee.
+        chosen: likewise of ``--threshold-m``, which may lie beyond the curves.
+    """
+    figure = new_figure(6.0, 3.4)
+    axes = figure.subplots()
+    millimetres = 1000 * curves.thresholds_m
+    drawn = {"precision": curves.precision, "recall": curves.recall, "F-score": curves.f_score}
+    for (name, values), colour in zip(drawn.items(), COLOURS, strict=False):
+        axes.plot(millimetres, values, color=colour, linewidth=2.2 if name == "F-score" else 1.3, label=name)
+    for (place_m, score), name, line in ((knee, "knee", "--"), (chosen, "chosen", ":")):
+        label = f"{name}: {1000 * place_m:.2f} mm, F-score {score:.1f} %"
+        axes.axvline(1000 * place_m, color="black", linestyle=line, linewidth=1.1, label=label)
+    axes.set(
+        xlabel="distance threshold (mm)",
+        ylabel="%",
+        xlim=(0, max(millimetres[-1], 1000 * chosen[0])),
+        ylim=(0, 102),
+    )
+    axes.legend(loc="lower right")
+    save_figure(figure, path)
+
+
+@rc_context(STYLE)
+def _draw_distances(
+    path: Path, surfaces: Sequence[tuple[str, Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]], limit_m: float
+) -> None:
+    """Points coloured by distance, each surface from two sides, in parallel projection and to one scale.
+
+    Args:
+        path: the PNG file.
+        surfaces: title, points and their distances, in metres.
+        limit_m: upper end of the colour scale.
+    """
+    low, high = np.percentile(np.concatenate([points for _, points, _ in surfaces]), (0.1, 99.9), axis=0)
+    margin_m = 0.05 * float((high - low).max())
+    low, high = low - margin_m, high + margin_m
+    width, height = 1000 * (high[1] - low[1]), 1000 * (high[2] - low[2])
+    inch_per_mm = _PANEL_IN / max(width, height)
+    panels = len(surfaces) * len(_SIDES)
+    figure = new_figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 0.9)
+    rows = figure.subplots(1, panels, squeeze=False, sharey=True)[0]
+    for index, (axes, (title, points, distances)) in enumerate(
+        zip(rows, (surface for surface in surfaces for _ in _SIDES), strict=True)
+    ):
+        side, sign = _SIDES[index % len(_SIDES)]
+        stride = math.ceil(len(points) / _DRAWN_POINTS)
+        order = np.argsort(sign * points[::stride, 0])
+        # Each side shows about half of the points; dots of twice their spacing leave few gaps.
+        dot_mm = 2.2 * math.sqrt(2.0 * width * height / len(order))
+        drawn = axes.scatter(
+            *(1000 * points[::stride][order][:, 1:].T),
+            c=1000 * distances[::stride][order],
+            s=max(0.6, dot_mm * inch_per_mm * 72) ** 2,
+            cmap=INDEX_COLOURS,
+            vmin=0,
+            vmax=1000 * limit_m,
+            linewidths=0,
+            rasterized=True,
+        )
+        axes.set(
+            title=f"{title},\n{side}",
+            xlabel="y (mm)",
+            xlim=(1000 * low[1], 1000 * high[1])[::sign],
+            ylim=(1000 * low[2], 1000 * high[2]),
+            aspect="equal",
+        )
+    rows[0].set_ylabel("z (mm)")
+    figure.colorbar(drawn, ax=rows.tolist(), label="distance (mm)", extend="max", fraction=0.05, pad=0.01)
+    save_figure(figure, path)

@@ -1,8 +1,4 @@
-"""Bring a cloud into a reference's frame: features (FPFH, RANSAC), then iterative closest points.
-
-Features, normals and RANSAC are Open3D's. The closest-point rounds are our own, because Open3D's point-to-plane
-estimation has no scale, and its point-to-point estimation of a scale shrinks noisy clouds.
-"""
+"""Bring a cloud into a reference's frame: features (FPFH, RANSAC), then iterative closest points, all by Open3D."""
 
 from __future__ import annotations
 
@@ -20,29 +16,21 @@ from hsi_sc_nerf.geometry.camera import Similarity
 if TYPE_CHECKING:
     import open3d
 
-NEARLY_CONVERGED = 1e-3
-"""Fraction of the object's radius: the search for a start ends with a round that moves no point further."""
-MOST_POINTS = 50_000
-"""Points of the reference that are used."""
-SEARCHED_POINTS = 10_000
-"""Points of the reference that are used while a start is searched for."""
-JUDGED_POINTS = 20_000
-"""Points by which fits are compared."""
+REFERENCE_POINTS, MOVED_POINTS = 50_000, 20_000
+"""Largest numbers of points of the reference and of the cloud."""
+SEARCH_REFERENCE_POINTS, SEARCH_POINTS = 10_000, 1_000
+"""The same while a start is searched for."""
+SEARCH_FRACTIONS = (1 / 3, 1 / 10)
+"""Largest distances of pairs in the first rounds, as fractions of the reference's radius."""
+ROUNDS, CONVERGED = 50, 1e-7
+SCALE_ROUNDS, SCALE_CONVERGED = 30, 1e-5
 RESTARTS = 3
 TURN_DEG = 30.0
 SIGNIFICANT = 4.0
 """A fit is worse than the best one if it differs by this many standard errors."""
 SAME_TURN_DEG = 10.0
-ROUNDS = 50
-CONVERGED = 1e-5
-"""Fraction of the object's radius: the rounds end when no point moves further."""
 NEIGHBOURS = 30
 """Points that a tangent plane is fitted to."""
-MOVED_POINTS = 20_000
-"""Points of the cloud that are used in the last rounds."""
-SEARCH_POINTS = 1_000
-"""Points of the cloud that are used in the first rounds."""
-FEWEST_PAIRS = 10
 
 
 @dataclass(frozen=True)
@@ -75,7 +63,10 @@ def refine(
     with_scale: bool = False,
     seed: int = 0,
 ) -> Registration:
-    """Iterative closest points, point to tangent plane (Chen and Medioni 1992), from a roughly correct start.
+    """Iterative closest points, point to tangent plane, with Tukey's loss, from a roughly correct start.
+
+    The first rounds pair points up to a third of the object's radius apart, the last ones up to three robust standard
+    deviations, so that neither outliers nor parts missing in the reference bias the result.
 
     Args:
         cloud_m: moves.
@@ -88,8 +79,13 @@ def refine(
         >>> shifted_m = reference_m + [0.002, 0.0, 0.0]
         >>> refine(shifted_m, reference_m).transform(shifted_m)  # close to reference_m
     """
-    target = Target.of(drawn(reference_m, MOST_POINTS, seed))
-    return Registration(*refined(cloud_m, target, start or Similarity(), with_scale, seed))
+    target = _Target(drawn(reference_m, REFERENCE_POINTS, seed))
+    transform = _approached(drawn(cloud_m, SEARCH_POINTS, seed), target, start or Similarity(), with_scale)
+    moved_m = drawn(cloud_m, MOVED_POINTS, seed)
+    off_m = np.median(target.off_plane_m(transform(moved_m), target.radius_m / 10))
+    spacing_m = np.median(target.tree.query(target.points[:: max(1, len(target.points) // 1000)], k=2)[0][:, 1])
+    within_m = min(target.radius_m / 10, float(3 * 1.4826 * off_m + 2 * spacing_m))
+    return Registration(_closest_points(moved_m, target, transform, within_m, with_scale), within_m)
 
 
 def align_by_features(
@@ -115,37 +111,30 @@ def align_by_features(
     import open3d
 
     open3d.utility.random.seed(seed)
-    cloud, reference = (Target.of(drawn(points, MOST_POINTS, seed)) for points in (cloud_m, reference_m))
-    radius = robust_radius(reference.points)
-    sized = Similarity(radius / robust_radius(cloud.points) if with_scale else 1.0)
-    few = drawn(cloud.points, SEARCH_POINTS, seed)
-    thinned = reference.thinned(SEARCHED_POINTS)
-    judged_cloud, judged_reference = (drawn(target.points, JUDGED_POINTS, seed) for target in (cloud, reference))
+    cloud, reference = (_Target(drawn(points, MOVED_POINTS, seed)) for points in (cloud_m, reference_m))
+    few, thinned = drawn(cloud_m, SEARCH_POINTS, seed), _Target(drawn(reference_m, SEARCH_REFERENCE_POINTS, seed))
+    sized = Similarity(reference.radius_m / cloud.radius_m if with_scale else 1.0)
+    cap_m = reference.radius_m / 10
 
-    def approached_from(start: Similarity) -> Similarity:
-        return approached(few, thinned, start, with_scale, NEARLY_CONVERGED * radius)
-
-    def fit_of(transform: Similarity) -> _Fit:
+    def fit_from(start: Similarity) -> _Fit:
+        transform = _approached(few, thinned, start, with_scale)
         # Both ways, so that a cloud shrunk into a corner does not fit.
-        forth = reference.off_plane(transform(judged_cloud), radius / 10)
-        back = cloud.off_plane(transform.inverse()(judged_reference), radius / 10 / transform.scale)
-        return _Fit(transform, np.concatenate([forth, transform.scale * back]) ** 2)
+        forth_m = reference.off_plane_m(transform(cloud.points), cap_m)
+        back_m = cloud.off_plane_m(transform.inverse()(reference.points), cap_m / transform.scale)
+        return _Fit(transform, np.concatenate([forth_m, transform.scale * back_m]) ** 2)
 
-    matched = _matched_features(sized(cloud.points), reference.points, radius, with_scale)
-    start = min((fit_of(approached_from(found.after(sized))) for found in matched), key=_Fit.misfit)
-    best = fit_of(refined(cloud_m, reference, start.transform, with_scale, seed)[0])
-    turned = [fit_of(approached_from(best.transform.after(turn))) for turn in track(_rotations(cloud.points))]
-    best, *others = sorted([best, *turned], key=_Fit.misfit)
-    rivals = ((other, other.transform.after(best.transform.inverse()).turn_deg()) for other in others)
-    rival = next(
-        (
-            Rival(turn_deg, other.misfit(), best.misfit())
-            for other, turn_deg in rivals
-            if turn_deg > SAME_TURN_DEG and not other.is_worse_than(best)
-        ),
-        None,
-    )
-    return Registration(*refined(cloud_m, reference, best.transform, with_scale, seed), rival)
+    found = _matched_features(sized(cloud.points), reference.points, cap_m, with_scale)
+    best = min((fit_from(start.after(sized)) for start in found), key=_Fit.rms)
+    turned = [fit_from(best.transform.after(turn)) for turn in track(_rotations(cloud.points))]
+    best, *others = sorted([best, *turned], key=_Fit.rms)
+    rival = None
+    for other in others:
+        turn_deg = other.transform.after(best.transform.inverse()).turn_deg()
+        if turn_deg > SAME_TURN_DEG and not other.is_worse_than(best):
+            rival = Rival(turn_deg, other.rms(), best.rms())
+            break
+    last = refine(cloud_m, reference_m, best.transform, with_scale, seed)
+    return Registration(last.transform, last.within_m, rival)
 
 
 @dataclass(frozen=True)
@@ -154,7 +143,7 @@ class _Fit:
     squares: Float[np.ndarray, "n"]
     """Squared distances off the tangent planes, of the same points for every fit."""
 
-    def misfit(self) -> float:
+    def rms(self) -> float:
         return float(np.sqrt(np.mean(self.squares)))
 
     def is_worse_than(self, other: _Fit) -> bool:
@@ -162,80 +151,20 @@ class _Fit:
         return bool(more.mean() > SIGNIFICANT * more.std() / np.sqrt(len(more)))
 
 
-def _rotations(cloud: np.ndarray) -> list[Similarity]:
-    """Rotations about the three principal axes through the cloud's centre."""
-    centre = np.median(cloud, axis=0)
-    axes = np.linalg.svd(cloud - centre, full_matrices=False)[2]
-    turns = []
-    for axis in axes:
-        for angle_deg in np.arange(TURN_DEG, 360, TURN_DEG):
-            rotation = Rotation.from_rotvec(np.deg2rad(angle_deg) * axis).as_matrix()
-            turns.append(Similarity(1.0, rotation, centre - rotation @ centre))
-    return turns
+class _Target:
+    """Points with their normals, which point away from their centre, and a search tree."""
 
+    def __init__(self, points: Float[np.ndarray, "n 3"]) -> None:
+        import open3d
 
-def _matched_features(cloud: np.ndarray, reference: np.ndarray, radius: float, with_scale: bool) -> list[Similarity]:
-    import open3d
+        self.points, self.tree, self.radius_m = points, cKDTree(points), robust_radius(points)
+        self.cloud = _open3d_cloud(points)
+        self.cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+        self.normals = np.array(self.cloud.normals)
+        self.normals[np.einsum("ij,ij->i", self.normals, points - np.median(points, axis=0)) < 0] *= -1
+        self.cloud.normals = open3d.utility.Vector3dVector(self.normals)
 
-    register = open3d.pipelines.registration
-    voxel = radius / 10
-    (source, source_features), (target, target_features) = (_features(p, voxel) for p in (cloud, reference))
-
-    def tried() -> Similarity:
-        found = register.registration_ransac_based_on_feature_matching(
-            source,
-            target,
-            source_features,
-            target_features,
-            True,
-            1.5 * voxel,
-            register.TransformationEstimationPointToPoint(with_scale),
-            3,
-            [
-                register.CorrespondenceCheckerBasedOnEdgeLength(0.8),
-                register.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
-            ],
-            register.RANSACConvergenceCriteria(20_000, 0.999),
-        )
-        return Similarity.from_matrix(found.transformation)
-
-    # Fruit has few mutual matches; Open3D then warns and uses one-way matches.
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        return [tried() for _ in range(RESTARTS)]
-
-
-def _features(
-    points: np.ndarray, voxel: float
-) -> tuple[open3d.geometry.PointCloud, open3d.pipelines.registration.Feature]:
-    import open3d
-
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
-    cloud = with_normals(np.asarray(cloud.points))
-    features = open3d.pipelines.registration.compute_fpfh_feature(
-        cloud, open3d.geometry.KDTreeSearchParamRadius(5 * voxel)
-    )
-    return cloud, features
-
-
-@dataclass(frozen=True)
-class Target:
-    """Reference points with their normals and search tree."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    tree: cKDTree
-
-    @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"]) -> Target:
-        """The points with their normals."""
-        return cls(points, np.asarray(with_normals(points).normals), cKDTree(points))
-
-    def thinned(self, count: int) -> Target:
-        """About ``count`` of the points, with the normals that all points give."""
-        chosen = slice(None, None, max(1, len(self.points) // count))
-        return Target(self.points[chosen], self.normals[chosen], cKDTree(self.points[chosen]))
-
-    def off_plane(self, points: Float[np.ndarray, "m 3"], cap_m: float) -> Float[np.ndarray, "m"]:
+    def off_plane_m(self, points: Float[np.ndarray, "m 3"], cap_m: float) -> Float[np.ndarray, "m"]:
         """Distance of each point to the tangent plane at its closest point, at most ``cap_m``."""
         distance, nearest = self.tree.query(points, distance_upper_bound=cap_m)
         off = np.full(len(points), cap_m)
@@ -243,99 +172,20 @@ class Target:
         off[near] = np.abs(np.einsum("ij,ij->i", points[near] - self.points[there], self.normals[there]))
         return off
 
+    def scale_step(self, points: Float[np.ndarray, "m 3"], within_m: float) -> Similarity:
+        """The scale about the points' centre that brings them closest to the tangent planes."""
+        distance, nearest = self.tree.query(points, distance_upper_bound=within_m)
+        near, there = np.isfinite(distance), nearest[np.isfinite(distance)]
+        centre = points.mean(axis=0)
+        along = np.einsum("ij,ij->i", points[near] - centre, self.normals[there])
+        off = np.einsum("ij,ij->i", self.points[there] - points[near], self.normals[there])
+        scale = float(np.exp(along @ off / max(along @ along, 1e-30)))
+        return Similarity(scale, translation=(1.0 - scale) * centre)
+
 
 def robust_radius(points: Float[np.ndarray, "n 3"]) -> float:
     """Median distance of the points from their median, which outliers hardly change; for a sphere, its radius."""
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-
-
-def refined(
-    cloud: Float[np.ndarray, "n 3"], target: Target, start: Similarity, with_scale: bool, seed: int
-) -> tuple[Similarity, float]:
-    """All closest-point rounds, and the largest distance of the pairs in the last round (metres).
-
-    The first rounds pair points closer than a third of the object's radius, the last ones points closer than three
-    robust standard deviations, so that neither outliers nor parts missing in the reference bias the result.
-    """
-    radius = robust_radius(target.points)
-    few, many = (drawn(cloud, count, seed) for count in (SEARCH_POINTS, MOVED_POINTS))
-    transform = approached(few, target, start, with_scale, CONVERGED * radius)
-    off = target.off_plane(transform(many), radius / 10)
-    within = min(radius / 10, 3 * 1.4826 * float(np.median(off)) + 2 * _spacing(target))
-    return _closest_point_rounds(many, target, transform, within, with_scale, CONVERGED * radius), within
-
-
-def approached(
-    cloud: Float[np.ndarray, "n 3"], target: Target, start: Similarity, with_scale: bool, converged_m: float
-) -> Similarity:
-    """The first rounds: pairs up to a third, then up to a tenth of the radius apart."""
-    radius = robust_radius(target.points)
-    transform = start
-    for within in (radius / 3, radius / 10):
-        transform = _closest_point_rounds(cloud, target, transform, within, with_scale, converged_m)
-    return transform
-
-
-def _closest_point_rounds(
-    cloud: np.ndarray, target: Target, transform: Similarity, within: float, with_scale: bool, converged_m: float
-) -> Similarity:
-    for _ in range(ROUNDS):
-        moved = transform(cloud)
-        distance, nearest = target.tree.query(moved, distance_upper_bound=within)
-        paired = np.isfinite(distance)
-        if paired.sum() < FEWEST_PAIRS:
-            break
-        here, there = moved[paired], nearest[paired]
-        step = plane_step(here, target.points[there], target.normals[there], with_scale)
-        transform = step.after(transform)
-        if np.linalg.norm(step(here) - here, axis=1).max() < converged_m:
-            break
-    return transform
-
-
-def plane_step(
-    points: Float[np.ndarray, "n 3"],
-    on_plane: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    with_scale: bool = False,
-) -> Similarity:
-    """One Gauss-Newton step of point-to-plane registration.
-
-    Linearised in the rotation (and the scale) about the points' centre; motions that the planes do not determine stay
-    0. Low 2004, "Linear Least-Squares Optimization for Point-to-Plane ICP Surface Registration".
-    """
-    centre = points.mean(axis=0)
-    arms = points - centre
-    columns = [np.cross(arms, normals), normals]
-    if with_scale:
-        columns.append(np.einsum("ij,ij->i", arms, normals)[:, None])
-    size = float(np.sqrt(np.mean(arms**2))) or 1.0
-    # Rotation and scale in units of length, so that one bound finds the undetermined motions.
-    units = np.array([size] * 3 + [1.0] * 3 + [size] * with_scale)
-    design = np.concatenate(columns, axis=1) / units
-    off = np.einsum("ij,ij->i", on_plane - points, normals)
-    motion = np.linalg.lstsq(design.T @ design, design.T @ off, rcond=1e-6)[0] / units
-    rotation = Rotation.from_rotvec(motion[:3]).as_matrix()
-    scale = float(np.exp(motion[6])) if with_scale else 1.0
-    return Similarity(scale, rotation, centre + motion[3:6] - scale * rotation @ centre)
-
-
-def with_normals(points: np.ndarray) -> open3d.geometry.PointCloud:
-    """An Open3D cloud with normals that point away from its centre."""
-    import open3d
-
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
-    normals = np.asarray(cloud.normals)
-    outwards = np.einsum("ij,ij->i", normals, points - np.median(points, axis=0))
-    cloud.normals = open3d.utility.Vector3dVector(np.where(outwards[:, None] < 0, -normals, normals))
-    return cloud
-
-
-def _spacing(target: Target) -> float:
-    """Median distance between neighbouring points."""
-    few = target.points[:: max(1, len(target.points) // SEARCH_POINTS)]
-    return float(np.median(target.tree.query(few, k=2)[0][:, 1]))
 
 
 def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
@@ -344,3 +194,76 @@ def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.n
     if len(points) <= count:
         return points
     return points[np.random.default_rng(seed).choice(len(points), count, replace=False)]
+
+
+def _approached(few: np.ndarray, target: _Target, start: Similarity, with_scale: bool) -> Similarity:
+    for fraction in SEARCH_FRACTIONS:
+        start = _closest_points(few, target, start, fraction * target.radius_m, with_scale)
+    return start
+
+
+def _closest_points(
+    points: np.ndarray, target: _Target, transform: Similarity, within_m: float, with_scale: bool
+) -> Similarity:
+    """Rounds of pairs up to ``within_m`` apart; Open3D's point-to-plane estimate has no scale, which alternates."""
+    from open3d.pipelines import registration as open3d_registration
+
+    loss = open3d_registration.TukeyLoss(within_m)
+    estimate = open3d_registration.TransformationEstimationPointToPlane(loss)
+    criteria = open3d_registration.ICPConvergenceCriteria(CONVERGED, CONVERGED, ROUNDS)
+    for _ in range(SCALE_ROUNDS if with_scale else 1):
+        moved = transform(points)
+        found = open3d_registration.registration_icp(
+            _open3d_cloud(moved), target.cloud, within_m, np.eye(4), estimate, criteria
+        )
+        step = Similarity.from_matrix(found.transformation)
+        if with_scale:
+            step = target.scale_step(step(moved), within_m).after(step)
+        transform = step.after(transform)
+        if abs(step.scale - 1.0) < SCALE_CONVERGED:
+            break
+    return transform
+
+
+def _rotations(cloud: np.ndarray) -> list[Similarity]:
+    """Rotations about the three principal axes through the cloud's centre."""
+    centre = np.median(cloud, axis=0)
+    turns = []
+    for axis in np.linalg.svd(cloud - centre, full_matrices=False)[2]:
+        for angle_deg in np.arange(TURN_DEG, 360, TURN_DEG):
+            rotation = Rotation.from_rotvec(np.deg2rad(angle_deg) * axis).as_matrix()
+            turns.append(Similarity(1.0, rotation, centre - rotation @ centre))
+    return turns
+
+
+def _matched_features(cloud: np.ndarray, reference: np.ndarray, voxel_m: float, with_scale: bool) -> list[Similarity]:
+    import open3d
+
+    register = open3d.pipelines.registration
+    clouds, features = [], []
+    for points in (cloud, reference):
+        thinned = _open3d_cloud(points).voxel_down_sample(voxel_m)
+        clouds.append(_Target(np.asarray(thinned.points)).cloud)
+        radius = open3d.geometry.KDTreeSearchParamRadius(5 * voxel_m)
+        features.append(register.compute_fpfh_feature(clouds[-1], radius))
+    estimate = register.TransformationEstimationPointToPoint(with_scale)
+    checks = [
+        register.CorrespondenceCheckerBasedOnEdgeLength(0.8),
+        register.CorrespondenceCheckerBasedOnDistance(1.5 * voxel_m),
+    ]
+    criteria = register.RANSACConvergenceCriteria(20_000, 0.999)
+    # Fruit has few mutual matches; Open3D then warns and uses one-way matches.
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        found = [
+            register.registration_ransac_based_on_feature_matching(
+                *clouds, *features, True, 1.5 * voxel_m, estimate, 3, checks, criteria
+            )
+            for _ in range(RESTARTS)
+        ]
+    return [Similarity.from_matrix(one.transformation) for one in found]
+
+
+def _open3d_cloud(points: np.ndarray) -> open3d.geometry.PointCloud:
+    import open3d
+
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
@@ -39,47 +39,13 @@ def precision_recall_f_score(
         >>> precision_recall_f_score(reference_m + [0.001, 0.0, 0.0], reference_m).f_score
         100.0
     """
-    return _score(*_hits(reconstructed_m, reference_m, threshold_m))
-
-
-def f_score_with_spread(
-    reconstructed_m: Float[np.ndarray, "n 3"],
-    reference_m: Float[np.ndarray, "m 3"],
-    threshold_m: float = F_SCORE_THRESHOLD_M,
-    resamples: int = 100,
-    seed: int = 0,
-) -> tuple[SpatialScore, float]:
-    """`precision_recall_f_score`, and the standard deviation of the F-score (percent) over bootstrap resamples.
-
-    The points of both clouds are resampled with replacement (Efron 1979). The spread measures the effect of sampling
-    points only, not how well the surface is known.
-    """
-    precise, recalled = _hits(reconstructed_m, reference_m, threshold_m)
-    rng = np.random.default_rng(seed)
-    scores = [
-        _score(rng.choice(precise, len(precise)), rng.choice(recalled, len(recalled))).f_score
-        for _ in range(resamples)
-        if len(precise) and len(recalled)
-    ]
-    return _score(precise, recalled), float(np.std(scores)) if scores else 0.0
-
-
-def _hits(
-    reconstructed_m: Float[np.ndarray, "n 3"], reference_m: Float[np.ndarray, "m 3"], threshold_m: float
-) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "m"]]:
-    """Which points of each cloud have a point of the other within the threshold; none, if one is empty."""
     if not len(reconstructed_m) or not len(reference_m):
-        return np.zeros(len(reconstructed_m), bool), np.zeros(len(reference_m), bool)
-    precise, recalled = (
-        cKDTree(there).query(here, workers=-1)[0] <= threshold_m
+        return SpatialScore(0.0, 0.0, 0.0)
+    to_reference_m, to_reconstruction_m = (
+        Surface(there).distances_m(here)
         for here, there in ((reconstructed_m, reference_m), (reference_m, reconstructed_m))
     )
-    return precise, recalled
-
-
-def _score(precise: Bool[np.ndarray, "n"], recalled: Bool[np.ndarray, "m"]) -> SpatialScore:
-    precision, recall = (100.0 * float(np.mean(hits)) if len(hits) else 0.0 for hits in (precise, recalled))
-    return SpatialScore(precision, recall, float(f_score(precision, recall)))
+    return score_at(to_reference_m, to_reconstruction_m, threshold_m)
 
 
 def f_score(precision: ArrayLike, recall: ArrayLike) -> Float[np.ndarray, "*n"]:
@@ -147,26 +113,12 @@ class ThresholdCurves:
     f_score: Float[np.ndarray, "t"]
 
 
-@dataclass(frozen=True)
-class DistanceStatistics:
-    """Of unsigned distances, in metres."""
-
-    mean_m: float
-    median_m: float
-    rms_m: float
-    percentile_95_m: float
-    largest_m: float
-
-
 def threshold_curves(
     to_reference_m: Float[np.ndarray, "n"], to_cloud_m: Float[np.ndarray, "m"], thresholds_m: Float[np.ndarray, "t"]
 ) -> ThresholdCurves:
     """Precision and recall: the fractions of distances within each threshold, the threshold itself included.
 
-    Args:
-        to_reference_m: Distance of each point of the cloud to the reference, for the precision.
-        to_cloud_m: Distance of each point of the reference to the cloud, for the recall.
-        thresholds_m: In any order.
+    The distances are those of the cloud's points to the reference, for the precision, and back, for the recall.
 
     Raises:
         ValueError: one side has no points.
@@ -205,25 +157,19 @@ def best_threshold_m(curves: ThresholdCurves) -> float:
 def threshold_for_m(
     to_reference_m: Float[np.ndarray, "n"], to_cloud_m: Float[np.ndarray, "m"], percent: float
 ) -> float:
-    """The smallest threshold at which the F-score reaches ``percent``.
-
-    Args:
-        to_reference_m: Distance of each point of the cloud to the reference.
-        to_cloud_m: Distance of each point of the reference to the cloud.
-        percent: In (0, 100].
-    """
+    """The smallest threshold at which the F-score reaches ``percent``, in (0, 100]."""
     candidates = np.sort(np.concatenate([to_reference_m, to_cloud_m]))
     curves = threshold_curves(to_reference_m, to_cloud_m, candidates)
     # Rounding must not keep 100 % from being reached.
     return float(candidates[int(np.argmax(curves.f_score >= percent - 1e-9))])
 
 
-def distance_statistics(distances_m: Float[np.ndarray, "n"]) -> DistanceStatistics:
-    """Mean, median, RMS, 95th percentile and largest of unsigned distances."""
-    return DistanceStatistics(
-        mean_m=float(np.mean(distances_m)),
-        median_m=float(np.median(distances_m)),
-        rms_m=float(np.sqrt(np.mean(np.square(distances_m)))),
-        percentile_95_m=float(np.percentile(distances_m, 95)),
-        largest_m=float(np.max(distances_m)),
-    )
+def distance_statistics(distances_m: Float[np.ndarray, "n"]) -> dict[str, float]:
+    """Mean, median, RMS, 95th percentile and largest of unsigned distances, metres, by name."""
+    return {
+        "mean_m": float(np.mean(distances_m)),
+        "median_m": float(np.median(distances_m)),
+        "rms_m": float(np.sqrt(np.mean(np.square(distances_m)))),
+        "percentile_95_m": float(np.percentile(distances_m, 95)),
+        "largest_m": float(np.max(distances_m)),
+    }

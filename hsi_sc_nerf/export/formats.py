@@ -11,18 +11,17 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream, SpectralCloud
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream
 from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
-from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, make_folder
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
 _SUFFIXES: dict[CloudFormat, str] = {"ply": ".ply", "las": ".las", "netcdf": ".nc", "zarr": ".zarr"}
@@ -49,7 +48,6 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
 
     Raises:
         InputError: a package is missing, the format has no room for so many bands, or the file cannot be written.
-        ValueError: the chunks do not fit together.
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")
@@ -68,16 +66,7 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
 
 
 def require_format(path_without_suffix: Path, file_format: CloudFormat, num_bands: int, num_extra: int) -> Path:
-    """Refuse what `write_cloud` could not write, before anything is computed.
-
-    Args:
-        path_without_suffix: path of the file without its suffix.
-        file_format: format of the file.
-        num_bands: bands of the cloud.
-        num_extra: extra columns of the cloud.
-
-    Returns:
-        The path with its suffix.
+    """Refuse what `write_cloud` could not write, before anything is computed, and return the path with its suffix.
 
     Raises:
         InputError: a package is missing, the format has no room for so many bands, or the Zarr folder would replace
@@ -85,7 +74,13 @@ def require_format(path_without_suffix: Path, file_format: CloudFormat, num_band
     """
     path = path_without_suffix.with_name(path_without_suffix.name + _SUFFIXES[file_format])
     if file_format in _PACKAGES:
-        _import(file_format)
+        try:
+            importlib.import_module(_PACKAGES[file_format])
+        except ImportError as error:
+            raise InputError(
+                f"the format {file_format} needs the package {_PACKAGES[file_format]}, which is not installed; run "
+                "`pip install 'hsi-sc-nerf[formats]'`, or export as PLY."
+            ) from error
     room = LAS_MAX_DIMENSIONS - len(_LAS_NORMALS) - num_extra
     if file_format == "las" and num_bands > room:
         raise InputError(
@@ -97,27 +92,17 @@ def require_format(path_without_suffix: Path, file_format: CloudFormat, num_band
     return path
 
 
-def _import(file_format: CloudFormat) -> ModuleType:
-    package = _PACKAGES[file_format]
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"the format {file_format} needs the package {package}, which is not installed; run "
-            "`pip install 'hsi-sc-nerf[formats]'`, or export as PLY."
-        ) from error
-
-
 def _write_las(path: Path, cloud: CloudStream) -> None:
     """Write a LAS file: positions in steps of a micrometre, 16-bit colours, all else as float dimensions."""
-    laspy = _import("las")
+    import laspy
+
     bands = [name.removeprefix("scalar_") for name in band_property_names(cloud.wavelengths_nm)]
     names = [*_LAS_NORMALS, *bands, *cloud.extra_names]
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:
-        for _, chunk in cloud.placed():
+        for chunk in cloud.chunks:
             record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
             record.x, record.y, record.z = np.asarray(chunk.points, np.float64).T
             for name, channel in zip(_COLOURS, chunk.colours.T, strict=True):
@@ -126,17 +111,6 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
             for name, values in zip(names, columns, strict=True):
                 record[name] = values
             writer.write_points(record)
-
-
-def _columns(chunk: SpectralCloud) -> dict[str, np.ndarray]:
-    """The variables of a table, each with one row a point."""
-    return {
-        "reflectance": chunk.spectra,
-        **dict(zip("xyz", chunk.points.T, strict=True)),
-        **dict(zip(_NORMALS, chunk.normals.T, strict=True)),
-        **dict(zip(_COLOURS, chunk.colours.T, strict=True)),
-        **chunk.extra,
-    }
 
 
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
@@ -148,8 +122,25 @@ def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], 
         yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
 
 
+def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:
+    """Write the chunks into the variables of a table."""
+    start = 0
+    for chunk in cloud.chunks:
+        columns = {
+            "reflectance": chunk.spectra,
+            **dict(zip("xyz", chunk.points.T, strict=True)),
+            **dict(zip(_NORMALS, chunk.normals.T, strict=True)),
+            **dict(zip(_COLOURS, chunk.colours.T, strict=True)),
+            **chunk.extra,
+        }
+        for name, values in columns.items():
+            variables[name][start : start + len(chunk)] = values
+        start += len(chunk)
+
+
 def _write_netcdf(path: Path, cloud: CloudStream) -> None:
-    h5netcdf = _import("netcdf")
+    import h5netcdf
+
     with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
         file.attrs.update(_TABLE_ATTRIBUTES)
         file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
@@ -157,19 +148,19 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
         wavelength.attrs.update(_WAVELENGTH_ATTRIBUTES)
         for name, dtype, dimensions, attributes in _variables(cloud):
             file.create_variable(name, dimensions, dtype).attrs.update(attributes)
-        for rows, chunk in cloud.placed():
-            for name, values in _columns(chunk).items():
-                file.variables[name][rows] = values
+        _fill(file.variables, cloud)
 
 
 def _write_zarr(path: Path, cloud: CloudStream) -> None:
     """Write a Zarr folder (format 3); an existing one is replaced."""
-    zarr = _import("zarr")
+    import zarr
+
     sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
     chunk_sizes = sizes | {"point": max(1, min(CHUNK_POINTS, cloud.count))}
+    # Zarr writes a folder, which `atomic_write` could not delete.
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
         group.attrs.update(_TABLE_ATTRIBUTES)
 
@@ -184,10 +175,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
             )
 
         create("wavelength", "<f8", ("wavelength",), _WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
-        arrays = {variable[0]: create(*variable) for variable in _variables(cloud)}
-        for rows, chunk in cloud.placed():
-            for name, values in _columns(chunk).items():
-                arrays[name][rows] = values
+        _fill({variable[0]: create(*variable) for variable in _variables(cloud)}, cloud)
         if path.exists():
             shutil.rmtree(path)
         os.replace(temporary, path)

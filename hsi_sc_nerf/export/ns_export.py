@@ -15,6 +15,8 @@ from typing import Any
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
+from hsi_sc_nerf.errors import InputError
+
 _EXPORTER = "nerfstudio.scripts.exporter"
 
 
@@ -31,16 +33,28 @@ def _wrap_main(module: types.ModuleType) -> None:
 
     def main(self: Any) -> None:
         """Export point cloud."""
-        from hsi_sc_nerf.export.spectral_export import export_spectral_point_cloud
         from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 
         config = yaml.load(self.load_config.read_text(), Loader=yaml.Loader)
         if isinstance(config, TrainerConfig) and isinstance(config.pipeline.model, SpectralModelConfig):
-            export_spectral_point_cloud(self)
+            _export_spectral_cloud(self)
         else:
             original(self)
 
     module.ExportPointCloud.main = main
+
+
+def _export_spectral_cloud(options: Any) -> None:
+    """`export_cloud` with the options of nerfstudio's `ExportPointCloud`; bad input ends in one sentence."""
+    from hsi_sc_nerf.export.options import CloudOptions
+    from hsi_sc_nerf.export.spectral_export import export_cloud
+    from hsi_sc_nerf.models.trained_run import open_run
+
+    try:
+        cloud_options = CloudOptions.from_nerfstudio(options)
+        export_cloud(open_run(options.load_config), options.output_dir, cloud_options)
+    except InputError as error:
+        raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
 
 class _ExporterBeingImported(types.ModuleType):

@@ -17,6 +17,14 @@ from hsi_sc_nerf.spectra.bands import require_bands
 
 Vector = tuple[float, float, float]
 _RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
+_FIXED = {
+    "reorient_normals": True,
+    "normal_output_name": "normals",
+    "depth_output_name": "depth",
+    "rgb_output_name": "rgb",
+}
+"""Options of `ns-export pointcloud` of which one value alone has a meaning: normals point outwards, the surface is
+searched around the median depth, and colours are the pseudo-RGB of the spectra."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +41,6 @@ class CloudOptions:
     roi_box: tuple[float, float, float, float, float, float] | None = None
     """Keep the points in a box: smallest x, y, z, then largest x, y, z, metres in the object frame (z along the
     turntable's axis, 0 on the disc)."""
-    roi_cylinder: tuple[float, float, float, float, float] | None = None
-    """Keep the points in an upright cylinder: x and y of its axis, radius, lowest and highest z, metres."""
     roi_masks: Path | None = None
     """Keep the points in painted regions: a folder of pictures named as the dataset's masks, for one or more frames,
     white in the region. A point is kept if it is white in every such frame that sees it, and at least one sees it."""
@@ -44,17 +50,8 @@ class CloudOptions:
     """Remove points that lie unusually far from their neighbours."""
     std_ratio: float = 10.0
     """How many standard deviations above the average distance make an outlier."""
-    reorient_normals: bool = True
-    """Turn the normals towards the camera."""
     normal_method: Literal["open3d", "model_output"] = "model_output"
-    """Normals from neighbouring points (open3d), or from the model."""
-    normal_output_name: str = "normals"
-    """Which of the model's normals: normals is the density gradient; pred_normals exists only in a model trained to
-    predict normals."""
-    depth_output_name: str = "depth"
-    """Which of the model's depths the surface is searched around: depth (the median) or expected_depth."""
-    rgb_output_name: str = "rgb"
-    """Which of the model's outputs gives the colours: rgb is the pseudo-RGB of the spectra."""
+    """Normals from neighbouring points (open3d), or from the gradient of the model's density."""
     obb_center: Vector | None = None
     """Centre of an oriented box to crop to, in nerfstudio's scene units; needs all three obb options."""
     obb_rotation: Vector | None = None
@@ -72,23 +69,23 @@ class CloudOptions:
             raise InputError("--num-points and --num-rays-per-batch must be at least 1.")
         if not self.std_ratio > 0.0:
             raise InputError("--std-ratio must be greater than 0.")
-        box, cylinder = self.roi_box, self.roi_cylinder
+        box = self.roi_box
         if box is not None and any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
             raise InputError("--roi-box takes the smallest x, y and z first, then the largest; give six numbers so.")
-        if cylinder is not None and (cylinder[2] <= 0 or cylinder[3] >= cylinder[4]):
-            raise InputError(
-                "--roi-cylinder takes x, y, a radius above 0, the lowest and the highest z, in this order."
-            )
 
     @classmethod
     def from_nerfstudio(cls, options: Any) -> CloudOptions:
         """The options of nerfstudio's `ExportPointCloud`; all others keep their defaults.
 
         Raises:
-            InputError: options contradict each other.
+            InputError: options contradict each other, or have no meaning for a spectral cloud.
         """
-        shared = (field.name for field in fields(cls) if hasattr(options, field.name))
-        return cls(**{name: getattr(options, name) for name in shared})
+        for name, value in _FIXED.items():
+            if getattr(options, name, value) != value:
+                raise InputError(f"--{name.replace('_', '-')} is always {value} for hsi-sc-nerf; leave it out.")
+        return cls(
+            **{field.name: getattr(options, field.name) for field in fields(cls) if hasattr(options, field.name)}
+        )
 
 
 def select_bands(wavelengths_nm: Float[np.ndarray, "bands"], words: Sequence[str]) -> Int[np.ndarray, "selected"]:
@@ -110,20 +107,18 @@ def select_bands(wavelengths_nm: Float[np.ndarray, "bands"], words: Sequence[str
     selected: set[int] = set()
     for word in words:
         if match := _RANGE.fullmatch(word):
-            low, high = float(match[1]), float(match[2])
+            low, high = map(float, match.groups())
             inside = np.flatnonzero((wavelengths_nm >= low) & (wavelengths_nm <= high))
             if len(inside) == 0:
                 raise InputError(
                     f"--bands {word}: the bands go from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm and "
                     "none lies in this range; give another one, the smaller wavelength first."
                 )
-            selected.update(inside.tolist())
+        elif re.fullmatch(r"\d+(\.\d+)?", word):
+            inside = require_bands(wavelengths_nm, [float(word)], f"--bands {word}")
         else:
-            try:
-                wavelength_nm = float(word)
-            except ValueError as error:
-                raise InputError(
-                    f"--bands {word}: is neither a wavelength in nm, such as 670, nor a range, such as 600-700."
-                ) from error
-            selected.update(require_bands(wavelengths_nm, [wavelength_nm], f"--bands {word}").tolist())
+            raise InputError(
+                f"--bands {word}: is neither a wavelength in nm, such as 670, nor a range, such as 600-700."
+            )
+        selected.update(inside.tolist())
     return np.array(sorted(selected))

@@ -68,7 +68,7 @@ def write_spectral_ply(
     )
     with atomic_write(Path(path)) as (temporary,), temporary.open("wb") as file:
         file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        for _, chunk in cloud.placed():
+        for chunk in cloud.chunks:
             rows = np.empty(len(chunk), layout)
             rows["points"], rows["normals"], rows["colours"] = chunk.points, chunk.normals, chunk.colours
             rows["spectra"] = chunk.spectra

@@ -8,19 +8,20 @@ before it or behind it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
-from torch import Tensor
 
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
+from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, render_object, surface_depth
 
 BATCH_POINTS = 1 << 12
@@ -31,14 +32,16 @@ class PointSpectra:
     """Spectra of points over the training cameras that see them.
 
     Attributes:
+        normals: the points' normals, outward.
         spectra: mean reflectance over the views; NaN without a view.
         spectral_std: standard deviation over the views, averaged over the bands; NaN with fewer than two views.
         views: number of views.
     """
 
+    normals: Float[np.ndarray, "n 3"]
     spectra: Float[np.ndarray, "n bands"]
     spectral_std: Float[np.ndarray, "n"]
-    views: Int[np.ndarray, "n"]
+    views: Float[np.ndarray, "n"]
 
 
 def sample_points(
@@ -47,10 +50,8 @@ def sample_points(
     normals: Float[np.ndarray, "n 3"],
     max_distance_m: float,
     max_views: int,
-) -> Iterator[tuple[slice, Float[np.ndarray, "batch 3"], PointSpectra]]:
-    """Outward normals and spectra of points, in batches, so that memory does not grow with their number.
-
-    Lens distortion is neglected when selecting the images that hold a point.
+) -> PointSpectra:
+    """Spectra of points. Lens distortion is neglected when selecting the images that hold a point.
 
     Args:
         run: the trained run.
@@ -59,24 +60,31 @@ def sample_points(
         max_distance_m: largest distance of a point from the model's surface, along its normal.
         max_views: number of training cameras to average over, at most.
 
-    Returns:
-        An iterator over the rows of a batch, their outward normals and their spectra.
-
     Example:
         >>> run, points = open_run(Path("config.yml")), read_points(Path("scan.ply"))
-        >>> batches = sample_points(run, points.positions(), points.normals(), max_distance_m=0.003, max_views=4)
-        >>> spectra = np.concatenate([found.spectra for _, _, found in batches])
+        >>> found = sample_points(run, points.positions, points.normals(), max_distance_m=0.003, max_views=4)
+        >>> found.spectra.shape
+        (80000, 204)
     """
     frames = run.manager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
     poses = run.refined_poses_m()[frames]
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
     max_distance = max_distance_m * run.scale
-    model, intrinsics = run.model, run.dataset.intrinsics
-    for start in range(0, len(points_m), BATCH_POINTS):
-        rows = slice(start, min(start + BATCH_POINTS, len(points_m)))
-        points = run.to_scene(points_m[rows])
-        outward = outward_normals(normals[rows], points, lambda p: _density(model, p), max_distance)
-        yield rows, outward, _render_batch(model, poses, intrinsics, points, outward, max_distance, max_views)
+    points = run.to_scene(points_m)
+    outward = outward_normals(normals, points, lambda p: _density(run.model, p), max_distance)
+    count, bands = len(points), len(run.model.wavelengths_nm)
+    result = PointSpectra(outward, np.empty((count, bands), np.float32), *np.zeros((2, count), np.float32))
+    with progress_bar("sampling", "points", count) as update:
+        for start in range(0, count, BATCH_POINTS):
+            rows = slice(start, start + BATCH_POINTS)
+            views = _render_views(run, poses, points[rows], outward[rows], max_distance, max_views)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of points without a view
+                result.spectra[rows] = np.nanmean(views, axis=1)
+                result.spectral_std[rows] = np.nanstd(views, axis=1, ddof=1).mean(axis=1)
+            result.views[rows] = np.isfinite(views[..., 0]).sum(axis=1)
+            update(min(rows.stop, count))
+    return result
 
 
 def outward_normals(
@@ -95,8 +103,8 @@ def outward_normals(
 
 def frontal_views(
     cosines: Float[np.ndarray, "n cameras"], in_frame: Bool[np.ndarray, "n cameras"], count: int
-) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """Indices of points and of the ``count`` most frontal cameras that have them in their image.
+) -> tuple[Int[np.ndarray, "n views"], Bool[np.ndarray, "n views"]]:
+    """The ``count`` most frontal cameras of each point, or all if there are fewer, and which of them see it.
 
     Args:
         cosines: of the angle between the point's normal and the direction to the camera.
@@ -104,52 +112,37 @@ def frontal_views(
         count: cameras a point, at most.
     """
     ranked = np.where(in_frame, cosines, -1.0)
-    count = min(count, ranked.shape[1])
-    best = np.argpartition(-ranked, count - 1, axis=1)[:, :count]
-    point, rank = np.nonzero(np.take_along_axis(ranked, best, axis=1) > np.cos(np.deg2rad(MAX_INCIDENCE_DEG)))
-    return point, best[point, rank]
-
-
-def mean_and_std(
-    spectra: Float[np.ndarray, "pairs bands"], point: Int[np.ndarray, "pairs"], num_points: int
-) -> PointSpectra:
-    """Mean and standard deviation of the spectra of each point."""
-    views = np.bincount(point, minlength=num_points)
-    total, squares = np.zeros((2, num_points, spectra.shape[1]))
-    np.add.at(total, point, spectra)
-    with np.errstate(invalid="ignore"):
-        mean = np.where(views[:, None] > 0, total / views[:, None], np.nan)
-        np.add.at(squares, point, np.square(spectra - mean[point]))
-        std = np.where(views > 1, np.sqrt(squares / (views[:, None] - 1.0)).mean(axis=1), np.nan)
-    return PointSpectra(mean.astype(np.float32), std.astype(np.float32), views)
+    cameras = np.argsort(-ranked, axis=1)[:, :count]
+    return cameras, np.take_along_axis(ranked, cameras, axis=1) > np.cos(np.deg2rad(MAX_INCIDENCE_DEG))
 
 
 @torch.no_grad()
-def _render_batch(
-    model: SpectralModel,
+def _render_views(
+    run: TrainedRun,
     poses: Float[np.ndarray, "cameras 4 4"],
-    intrinsics: PinholeIntrinsics,
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     max_distance: float,
     max_views: int,
-) -> PointSpectra:
-    """Spectra of one batch of points; ``normals`` are outward, and all lengths in scene units."""
+) -> Float[np.ndarray, "n views bands"]:
+    """Spectra of points in their most frontal cameras; NaN where the ray ends elsewhere. Scene units."""
+    model, intrinsics = run.model, run.dataset.intrinsics
     to_point = points[:, None] - poses[:, :3, 3]
     distances = np.linalg.norm(to_point, axis=-1)
     directions = to_point / distances[..., None]
     cosines = -np.einsum("nk,nck->nc", normals, directions)
     in_frame = np.stack([_in_frame(points, pose, intrinsics) for pose in poses], axis=1)
-    point, camera = frontal_views(cosines, in_frame, max_views)
-    spectra, hit_points = [np.zeros((0, len(model.wavelengths_nm)), np.float32)], [np.zeros(0, int)]
+    cameras, facing = frontal_views(cosines, in_frame, max_views)
+    spectra = np.full((*cameras.shape, len(model.wavelengths_nm)), np.nan, np.float32)
+    point, view = np.nonzero(facing)
     chunk = model.config.eval_num_rays_per_chunk
     for start in range(0, len(point), chunk):
-        p, c = point[start : start + chunk], camera[start : start + chunk]
+        p, v = point[start : start + chunk], view[start : start + chunk]
+        c = cameras[p, v]
         rendered, opacity, depth = _render_rays(model, poses[c, :3, 3], directions[p, c], cosines[p, c])
         hit = (opacity > MIN_OPACITY) & (np.abs(depth - distances[p, c]) * cosines[p, c] <= max_distance)
-        spectra.append(rendered[hit])
-        hit_points.append(p[hit])
-    return mean_and_std(np.concatenate(spectra), np.concatenate(hit_points), len(points))
+        spectra[p[hit], v[hit]] = rendered[hit]
+    return spectra
 
 
 def _render_rays(
@@ -175,8 +168,8 @@ def _render_rays(
 
 @torch.no_grad()
 def _density(model: SpectralModel, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1"]:
-    positions: Tensor = torch.from_numpy(points).float().to(model.device)
-    return model.field.density_fn(positions[:, None])[:, 0].cpu().numpy()
+    parts = torch.from_numpy(points).float().to(model.device)[:, None].split(BATCH_POINTS)
+    return torch.cat([model.field.density_fn(part)[:, 0] for part in parts]).cpu().numpy()
 
 
 def _in_frame(

@@ -1,4 +1,4 @@
-"""Nerfacto's field with a spectrum instead of a colour, its variant with several densities, and the proposals.
+"""Nerfacto's field with a spectrum instead of a colour, and the proposals.
 
 The paper (section "Model Formulation") follows the variant C1, sigma_0 of HS-NeRF (Chen et al. 2024, "Hyperspectral
 Neural Radiance Fields", arXiv 2403.14839): one density for all wavelengths, and a radiance of n channels that depends
@@ -7,8 +7,6 @@ channels are coefficients of a spectral basis, linear so that they can be compos
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 from jaxtyping import Float
@@ -84,11 +82,6 @@ class SpectralField(NerfactoField):
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
         """Density and geometry features; positions carry a gradient only where normals are needed."""
-        hidden, inside = self._hidden(ray_samples)
-        return self._density(hidden[..., :1], inside), hidden[..., 1:]
-
-    def _hidden(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs hidden"], Float[Tensor, "*bs 1"]]:
-        """Outputs of the base network, and 1 for samples inside the scene, 0 for the others."""
         positions = ray_samples.frustums.get_positions()
         if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
             positions.requires_grad_()
@@ -97,17 +90,10 @@ class SpectralField(NerfactoField):
         in_grid, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
         hidden = self.mlp_base(in_grid.view(-1, 3))
         hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
-        self._density_before_activation = self._log_density(hidden)  # type: ignore[assignment]
-        return hidden, inside
-
-    def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
-        """Logarithm of the density up to a constant; normals are its gradients."""
-        return hidden[..., :1]
-
-    def _density(
-        self, before_activation: Float[Tensor, "*bs channels"], inside: Float[Tensor, "*bs 1"]
-    ) -> Float[Tensor, "*bs channels"]:
-        return self.average_init_density * trunc_exp(before_activation.to(inside)) * inside
+        # The logarithm of the density up to a constant; normals are its gradients.
+        self._density_before_activation = hidden[..., :1]  # type: ignore[assignment]
+        density = self.average_init_density * trunc_exp(hidden[..., :1].to(inside)) * inside
+        return density, hidden[..., 1:]
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
@@ -145,55 +131,8 @@ class SpectralField(NerfactoField):
         with torch.enable_grad():
             positions = positions.detach().requires_grad_()
             hidden = self.mlp_base(grid_positions(positions, self.aabb, self.spatial_distortion))
-            (gradient,) = torch.autograd.grad(self._log_density(hidden).sum(), positions)
+            (gradient,) = torch.autograd.grad(hidden[..., 0].sum(), positions)
         return gradient
-
-
-class BandGroupField(SpectralField):
-    """A field with a density for each group of bands (HS-NeRF's variant sigma_n), for translucent objects.
-
-    Light of one wavelength may pass where light of another is absorbed. The mean of the groups' densities guides the
-    proposals and gives depth, normals and accumulation. The channels of the optical depths follow those of the
-    spectrum, for `composite_band_groups`. The head is the direct one: coefficients of a basis that spans all groups
-    cannot be composited group by group.
-
-    Args:
-        aabb: scene box, scene units.
-        num_bands: bands of the spectra.
-        num_groups: groups of neighbouring bands; with one group, the field is a `SpectralField`.
-        geo_feat_dim: features of the radiance head beside the groups' own.
-        **field: other arguments of `SpectralField`, without ``coefficient_start``.
-    """
-
-    group_sizes: tuple[int, ...]
-
-    def __init__(
-        self, aabb: Float[Tensor, "2 3"], num_bands: int, num_groups: int, geo_feat_dim: int = 15, **field
-    ) -> None:
-        super().__init__(aabb, num_bands, geo_feat_dim=geo_feat_dim + num_groups - 1, **field)
-        self.group_sizes = group_sizes(num_bands, num_groups)
-
-    def _log_density(self, hidden: Float[Tensor, "*bs hidden"]) -> Float[Tensor, "*bs 1"]:
-        groups = hidden[..., : len(self.group_sizes)]
-        return groups.logsumexp(dim=-1, keepdim=True) - math.log(groups.shape[-1])
-
-    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
-        """Mean density, and the groups' densities followed by the geometry features."""
-        hidden, inside = self._hidden(ray_samples)
-        densities = self._density(hidden[..., : len(self.group_sizes)], inside)
-        return densities.mean(dim=-1, keepdim=True), torch.cat([densities, hidden[..., 1:]], dim=-1)
-
-    def get_outputs(
-        self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
-    ) -> dict[FieldHeadNames, Tensor]:
-        """Spectra followed by optical depths (and predicted normals) at samples along rays."""
-        assert density_embedding is not None
-        assert ray_samples.deltas is not None
-        groups = len(self.group_sizes)
-        outputs = super().get_outputs(ray_samples, density_embedding[..., groups:])
-        depths = density_embedding[..., :groups] * ray_samples.deltas
-        outputs[FieldHeadNames.RGB] = torch.cat([outputs[FieldHeadNames.RGB], depths], dim=-1)
-        return outputs
 
 
 class SpectralProposalField(HashMLPDensityField):
@@ -232,17 +171,6 @@ class CoefficientGain(nn.Module):
     def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
         """Coefficients from the outputs of the network."""
         return raw * self.gains
-
-
-def group_sizes(num_bands: int, num_groups: int) -> tuple[int, ...]:
-    """Numbers of neighbouring bands in each group, as even as possible.
-
-    Raises:
-        ValueError: the number of groups is not between 1 and that of the bands.
-    """
-    if not 1 <= num_groups <= num_bands:
-        raise ValueError(f"{num_bands} bands cannot be divided into {num_groups} groups")
-    return tuple(num_bands * (i + 1) // num_groups - num_bands * i // num_groups for i in range(num_groups))
 
 
 def grid_positions(

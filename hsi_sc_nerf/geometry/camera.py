@@ -35,9 +35,8 @@ class PinholeIntrinsics:
 
 def rotation_about_z(angle_deg: float) -> Float[np.ndarray, "4 4"]:
     """Homogeneous rotation by ``angle_deg`` about z, counter-clockwise seen from +z."""
-    a = np.deg2rad(angle_deg)
     pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    pose[:3, :3] = Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
     return pose
 
 
@@ -48,12 +47,11 @@ def look_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Floa
         ValueError: the viewing direction is parallel to z, so "up" is undefined.
     """
     back = np.asarray(eye, float) - np.asarray(target, float)
-    back = back / np.linalg.norm(back)
+    back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
-    length = np.linalg.norm(right)
-    if length < 1e-9:
+    if np.linalg.norm(right) < 1e-9:
         raise ValueError("look_at: the viewing direction is parallel to the z axis")
-    right = right / length
+    right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
     return pose
@@ -77,8 +75,7 @@ def project(
     world_to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
     in_camera = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = in_camera[..., 2]
-    scale = np.array([intrinsics.fl_x, intrinsics.fl_y])
-    centre = np.array([intrinsics.cx, intrinsics.cy])
+    scale, centre = (intrinsics.fl_x, intrinsics.fl_y), (intrinsics.cx, intrinsics.cy)
     return in_camera[..., :2] / depth[..., None] * scale + centre, depth
 
 

@@ -6,11 +6,10 @@ A. Laurentini, "The visual hull concept for silhouette-based image understanding
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 
@@ -47,7 +46,12 @@ def visual_hull(
     max_missed = int(MAX_MISSED_FRACTION * len(masks) + 1e-9)
     # A few frames rule out most points, before all frames test the rest.
     for step in (_FIRST_STEP, 1):
-        pixels_of = partial(_pixels_of, camera_to_worlds[::step], intrinsics)
+
+        def pixels_of(frame: int, points: Float[np.ndarray, "n 3"], step: int = step) -> tuple[Any, Any]:
+            pixels, depth = project(points, camera_to_worlds[frame * step], intrinsics)
+            inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
+            return inside, np.where(inside[:, None], pixels, 0.0).astype(int)
+
         in_image, in_mask = silhouette_counts(points, masks[::step], pixels_of)
         keep = in_image - in_mask <= max_missed
         points, in_image = points[keep], in_image[keep]
@@ -57,17 +61,13 @@ def visual_hull(
 def silhouette_counts(points: Any, masks: Iterable[Any], pixels_of: Callable[[int, Any], Any]) -> tuple[Any, Any]:
     """Count the frames that have each point in their image, and those that have it in the object's mask.
 
-    Occlusion is ignored: a point of the object projects into the mask whether the object hides it or not. NumPy
-    arrays and tensors are both taken; the result is of the same kind.
+    Occlusion is ignored. Takes NumPy arrays or tensors and returns two counts (n) of the same kind.
 
     Args:
         points: (n, 3), in the unit that ``pixels_of`` takes.
         masks: of each frame (lines, samples), true on the object.
         pixels_of: of a frame's index and points, which points lie in the image (n), and their pixels (n, 2) as
             (sample, line), (0, 0) where they do not.
-
-    Returns:
-        Two counts of shape (n): of frames with the point in the image, and of frames with the point in the mask.
     """
     in_image: Any = 0
     in_mask: Any = 0
@@ -76,14 +76,3 @@ def silhouette_counts(points: Any, masks: Iterable[Any], pixels_of: Callable[[in
         in_image = in_image + inside
         in_mask = in_mask + (inside & mask[pixels[:, 1], pixels[:, 0]])
     return in_image, in_mask
-
-
-def _pixels_of(
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    index: int,
-    points: Float[np.ndarray, "n 3"],
-) -> tuple[Bool[np.ndarray, "n"], Int[np.ndarray, "n 2"]]:
-    pixels, depth = project(points, camera_to_worlds[index], intrinsics)
-    inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
-    return inside, np.where(inside[:, None], pixels, 0.0).astype(int)

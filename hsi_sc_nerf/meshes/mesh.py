@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 class Mesh:
     """A triangle mesh in metres; triangles run counter-clockwise seen from outside.
 
-    Area, volume and the test for holes are plain sums: trimesh gives the same figures, but takes three to eight times
-    as long and seconds to import.
+    Area, volume and the test for holes are plain sums, many times faster than trimesh's.
 
     Example:
         >>> triangle = Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))
@@ -55,10 +54,7 @@ class Mesh:
         return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
-        """Outward unit normal of each vertex: the mean of its triangles' normals, weighted by area.
-
-        A vertex of no triangle has the normal 0.
-        """
+        """Outward unit normal of each vertex: the area-weighted mean of its triangles', 0 for a vertex of none."""
         normals = self.area_weighted_normals()
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 

@@ -22,9 +22,7 @@ from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 BackgroundKind = Literal["last-sample", "spectrum", "image"]
 
 
-def make_background(
-    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]
-) -> BackgroundSpectrum | BackgroundImage | None:
+def make_background(kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]) -> Background | None:
     """The background of a dataset; None for "last-sample", which has none.
 
     Args:
@@ -35,60 +33,35 @@ def make_background(
     if kind == "last-sample":
         return None
     spectrum = torch.from_numpy(dataset.background_reflectance).float()
-    if kind == "spectrum":
-        return BackgroundSpectrum(spectrum)
-    picture = estimate_static_background(dataset, frames)
+    image, cell_px = (None, 1) if kind == "spectrum" else estimate_static_background(dataset, frames)
     k1, k2, p1, p2 = dataset.distortion.tolist()
-    return BackgroundImage(
-        torch.from_numpy(picture.image),
-        cell_px=picture.cell_px,
-        intrinsics=dataset.intrinsics,
-        distortion=(k1, k2, p1, p2),
-        spectrum=spectrum,
+    return Background(
+        spectrum, None if image is None else torch.from_numpy(image), cell_px, dataset.intrinsics, (k1, k2, p1, p2)
     )
 
 
-class BackgroundSpectrum(nn.Module):
-    """One spectrum behind every ray.
+class Background(nn.Module):
+    """A picture of the chamber, looked up by the rays' directions in the camera's frame, or one spectrum.
 
     Args:
-        spectrum: reflectance.
-    """
-
-    spectrum: Tensor
-
-    def __init__(self, spectrum: Float[Tensor, "bands"]) -> None:
-        super().__init__()
-        self.register_buffer("spectrum", spectrum)
-
-    def forward(
-        self, directions: Float[Tensor, "*rays 3"], rotations: Float[Tensor, "*rays 9"] | None
-    ) -> Float[Tensor, "*rays bands"]:
-        """Reflectance behind rays; ``rotations`` are not used."""
-        return self.spectrum.expand(*directions.shape[:-1], -1)
-
-
-class BackgroundImage(nn.Module):
-    """A picture of the chamber, looked up by the rays' directions in the camera's frame.
-
-    Args:
-        image: reflectance.
+        spectrum: reflectance behind rays without a camera (a viewer's), those that point backwards, and all rays
+            where there is no picture.
+        image: reflectance; None for none.
         cell_px: side of the picture's cells, pixels of the camera's image.
         intrinsics: of the camera.
         distortion: k1, k2, p1, p2 (OpenCV).
-        spectrum: background of rays without a camera (a viewer's), and of those that point backwards.
     """
 
-    image: Tensor
+    image: Tensor | None
     spectrum: Tensor
 
     def __init__(
         self,
-        image: Float[Tensor, "lines samples bands"],
+        spectrum: Float[Tensor, "bands"],
+        image: Float[Tensor, "lines samples bands"] | None,
         cell_px: float,
         intrinsics: PinholeIntrinsics,
         distortion: tuple[float, float, float, float],
-        spectrum: Float[Tensor, "bands"],
     ) -> None:
         super().__init__()
         self.cell_px = cell_px
@@ -106,7 +79,7 @@ class BackgroundImage(nn.Module):
             directions: of the rays as measured, before the pose refinement.
             rotations: camera-to-world rotations as measured, row by row; None for rays without a camera.
         """
-        if rotations is None:
+        if rotations is None or self.image is None:
             return self.spectrum.expand(*directions.shape[:-1], -1)
         pixels, forward = image_coordinates(in_camera_frame(directions, rotations), self.intrinsics, self.distortion)
         return torch.where(forward[..., None], interpolate_image(self.image, pixels / self.cell_px), self.spectrum)

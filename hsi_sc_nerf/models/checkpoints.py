@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -33,28 +35,39 @@ def checkpoint_path(folder: Path, step: int) -> Path:
     return folder / f"step-{step:09d}.ckpt"
 
 
-def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all.
+@contextmanager
+def _appearing_whole(path: Path) -> Iterator[Path]:
+    """A temporary file in a folder beside that of ``path``, moved to it at the end of the block.
 
     nerfstudio takes every file of a checkpoint folder for a checkpoint, so that an unfinished one must never lie
-    there. The file is written in a folder beside it and then moved.
+    there.
 
     Raises:
         InputError: it could not be written; the folder of ``path`` has not changed.
     """
-    temporary = path.parent.with_name(f".{path.parent.name}-writing")
+    folder = path.parent.with_name(f".{path.parent.name}-writing")
     try:
-        temporary.mkdir(parents=True, exist_ok=True)
-        torch.save(state, temporary / path.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder / path.name
         path.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(temporary / path.name, path)
+        os.replace(folder / path.name, path)
     except (OSError, RuntimeError) as error:  # torch's writer raises the latter on a full disk
         raise InputError(
             f"{path}: the checkpoint could not be written ({error}); free some space and resume with --load-dir from "
             "the checkpoint before it."
         ) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint whole or not at all.
+
+    Raises:
+        InputError: it could not be written.
+    """
+    with _appearing_whole(path) as temporary:
+        torch.save(state, temporary)
 
 
 def link_checkpoint(path: Path, folder: Path) -> None:
@@ -63,21 +76,11 @@ def link_checkpoint(path: Path, folder: Path) -> None:
     Raises:
         InputError: it could not be written.
     """
-    kept = folder / path.name
-    temporary = path.parent.with_name(f".{folder.name}-writing") / path.name
-    try:
-        temporary.parent.mkdir(parents=True, exist_ok=True)
-        temporary.unlink(missing_ok=True)
+    with _appearing_whole(folder / path.name) as temporary:
         try:
             os.link(path, temporary)
         except OSError:
             shutil.copy2(path, temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        os.replace(temporary, kept)
-    except OSError as error:
-        raise InputError(f"{kept}: cannot be written ({error}); free some space.") from error
-    finally:
-        shutil.rmtree(temporary.parent, ignore_errors=True)
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
@@ -97,8 +100,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of the staged trainer to the CPU.
 
     Raises:
-        InputError: the file is damaged, missing or no such checkpoint, or an older version made it with averaged
-            weights.
+        InputError: the file is damaged, missing or no such checkpoint.
     """
     try:
         state = torch.load(path, map_location="cpu")
@@ -106,6 +108,4 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is no readable checkpoint ({error}); take an earlier one.") from error
     if not isinstance(state, dict) or not state.keys() >= CHECKPOINT_KEYS:
         raise InputError(f"{path}: is no checkpoint that hsi-sc-nerf can go on from; train anew.")
-    if state["training"].get("weights"):
-        raise InputError(f"{path}: was made with --ema-decay, which this version does not have; train anew.")
     return state

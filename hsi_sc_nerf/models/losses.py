@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
-from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, select_pixels, spectral_angle, widen
+from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
 
 DIRECTION_FLOOR = 1e-4
 """Root mean square reflectance below which a spectrum has no usable direction (a packed count is 2e-5)."""
@@ -22,7 +22,6 @@ DIRECTION_FLOOR = 1e-4
 def hsi_loss(
     predicted: Float[Tensor, "*pixels bands"],
     target: Float[Tensor, "*pixels bands"],
-    mask: Bool[Tensor, "*pixels"] | None = None,
     valid: Bool[Tensor, "*pixels bands"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared error over pixels **and bands** (paper, L_hsi).
@@ -33,11 +32,10 @@ def hsi_loss(
     Args:
         predicted: rendered reflectance.
         target: measured reflectance.
-        mask: pixels that count; None for all.
         valid: values of the target that are measurements, each of which counts alike; None for all.
 
     Raises:
-        ValueError: the mask is not boolean, or its shape is not that of the pixels; likewise ``valid``.
+        ValueError: ``valid`` is not boolean, or its shape is not that of the spectra.
 
     Example:
         >>> target = torch.rand(1024, 204)
@@ -46,44 +44,37 @@ def hsi_loss(
     """
     if valid is not None:
         predicted, target = cleared(predicted, valid), cleared(target, valid)
-        valid = select_pixels(valid, mask)
-    difference = widen(select_pixels(predicted, mask)) - widen(select_pixels(target, mask))
-    return narrow(masked_mean(difference.square(), valid), predicted, target)
+    return narrow(masked_mean((widen(predicted) - widen(target)).square(), valid), predicted, target)
 
 
 def angular_loss(
     predicted: Float[Tensor, "*pixels bands"],
     target: Float[Tensor, "*pixels bands"],
-    mask: Bool[Tensor, "*pixels"] | None = None,
     valid: Bool[Tensor, "*pixels bands"] | None = None,
-    direction_floor: float = DIRECTION_FLOOR,
 ) -> Float[Tensor, ""]:
     """Mean over pixels of one minus the cosine of the spectral angle, in [0, 2] (paper, Eq. ang_cosine_loss).
 
     The paper's constant in the denominator has no printed value. Here it is a lower bound of each norm, not an
     addend: spectra above it are compared exactly, and the gradient of nearly black ones stays below
-    ``1 / (direction_floor sqrt(bands))``. A zero spectrum costs 1 and has gradient 0.
+    ``1 / (DIRECTION_FLOOR sqrt(bands))``. A zero spectrum costs 1 and has gradient 0.
 
     Args:
         predicted: rendered reflectance.
         target: measured reflectance.
-        mask: pixels that count; None for all.
         valid: values of the target that are measurements; None for all. The angle is that between the spectra in a
             pixel's valid bands; a pixel with fewer than two valid bands is left out.
-        direction_floor: root mean square reflectance below which a spectrum's direction fades.
 
     Raises:
-        ValueError: the mask is not boolean, or its shape is not that of the pixels; likewise ``valid``.
+        ValueError: ``valid`` is not boolean, or its shape is not that of the spectra.
     """
-    p, t, counted = _pixels_with_an_angle(predicted, target, mask, valid)
-    norm_floor = direction_floor * math.sqrt(predicted.shape[-1])
+    p, t, counted = _pixels_with_an_angle(predicted, target, valid)
+    norm_floor = DIRECTION_FLOOR * math.sqrt(predicted.shape[-1])
     return narrow(masked_mean(one_minus_cosine(p, t, norm_floor=norm_floor), counted), predicted, target)
 
 
 def angle_loss(
     predicted: Float[Tensor, "*pixels bands"],
     target: Float[Tensor, "*pixels bands"],
-    mask: Bool[Tensor, "*pixels"] | None = None,
     valid: Bool[Tensor, "*pixels bands"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean over pixels of the spectral angle (radians, in [0, pi]): the paper's loss before its cosine.
@@ -91,18 +82,18 @@ def angle_loss(
     Unlike that of the cosine, the gradient does not vanish at small angles. Arguments and errors are those of
     `angular_loss`; a zero spectrum costs pi / 2 and has gradient 0.
     """
-    p, t, counted = _pixels_with_an_angle(predicted, target, mask, valid)
+    p, t, counted = _pixels_with_an_angle(predicted, target, valid)
     return narrow(masked_mean(spectral_angle(p, t), counted), predicted, target)
 
 
 def _pixels_with_an_angle(
-    predicted: Tensor, target: Tensor, mask: Tensor | None, valid: Tensor | None
-) -> tuple[Float[Tensor, "n bands"], Float[Tensor, "n bands"], Bool[Tensor, "n"] | None]:
-    """Spectra of the pixels in the mask, and which of them have an angle (None for all)."""
-    p, t, counted = predicted, target, None
-    if valid is not None:
-        # The norm over fewer bands is smaller. Scaled to all bands, it compares with the norm floor.
-        scale = (predicted.shape[-1] / valid.sum(-1, keepdim=True).clamp_min(1)).sqrt()
-        p, t = widen(cleared(predicted, valid)) * scale, widen(cleared(target, valid)) * scale
-        counted = select_pixels(has_angle(valid)[..., None], mask)[:, 0]
-    return select_pixels(p, mask), select_pixels(t, mask), counted
+    predicted: Tensor, target: Tensor, valid: Tensor | None
+) -> tuple[Float[Tensor, "*pixels bands"], Float[Tensor, "*pixels bands"], Bool[Tensor, "*pixels"] | None]:
+    """Spectra whose flagged values are cleared, and which of them have an angle (None for all)."""
+    if valid is None:
+        return predicted, target, None
+    cleared_both = cleared(predicted, valid), cleared(target, valid)
+    # The norm over fewer bands is smaller. Scaled to all bands, it compares with the norm floor.
+    scale = (predicted.shape[-1] / valid.sum(-1, keepdim=True).clamp_min(1)).sqrt()
+    p, t = (widen(spectra) * scale for spectra in cleared_both)
+    return p, t, has_angle(valid)

@@ -1,4 +1,4 @@
-"""nerfstudio's pipeline, which refuses weights of another dataset and logs the spectra of some pixels."""
+"""nerfstudio's pipeline, which refuses weights of another dataset."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from torch import Tensor
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
-from hsi_sc_nerf.models.training_log import draw_spectra
 
 SCENE_BUFFERS = ("aabb", "axis_origin")
 """Buffers that place the scene; weights are meaningless in another scene box."""
@@ -52,26 +49,6 @@ class SpectralPipeline(VanillaPipeline):
                 "on, or was processed anew since; train again, or process it with the settings of that time."
             )
         super().load_pipeline(loaded_state, step)
-
-    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics and pictures of one held-out view, and the spectra of some of its pixels."""
-        metrics, images = super().get_eval_image_metrics_and_images(step)
-        images["spectra"] = self._spectra_picture()
-        return metrics, images
-
-    def _spectra_picture(self) -> Float[Tensor, "h w 3"]:
-        rays, batch = self.datamanager.fixed_eval_pixels()
-        self.eval()
-        with torch.no_grad():
-            rendered = self.model(rays)["spectral"].cpu()
-        self.train()
-        return draw_spectra(
-            self.datamanager.eval_dataset.metadata["wavelengths_nm"],
-            batch["spectral"],
-            rendered,
-            [f"line {line}, sample {sample}" for _, line, sample in batch["indices"].tolist()],
-            batch.get("valid"),
-        )
 
     def get_average_image_metrics(
         self,

@@ -23,7 +23,10 @@ from nerfstudio.cameras.lie_groups import exp_map_SE3, exp_map_SO3xR3
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
+from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX
+
+_ANGLE_L2_PENALTY = 1e-2
+"""Penalty on the frames' angle corrections (radians)."""
 
 
 @dataclass
@@ -31,13 +34,11 @@ class PoseRefinementConfig(CameraOptimizerConfig):
     """Refinement of the measured poses during training."""
 
     _target: type = field(default_factory=lambda: PoseRefinement)
-    mode: Literal["auto", "off", "turntable", "free", "free-discarded"] = "auto"  # type: ignore[assignment]
-    """Degrees of freedom. turntable: the camera before the axis, and the table's angle in each frame. free: a
-    rotation and a shift of each frame. free-discarded: the same, reset to zero after the first stage and never
-    applied to held-out views, as in the paper's published code. off: none. auto: off for poses from markers, which
-    training does not improve (docs/concepts/poses.md), turntable for all others."""
-    angle_l2_penalty: float = 1e-2
-    """Penalty on the frames' angle corrections (radians), in mode turntable."""
+    mode: Literal["auto", "off", "turntable", "free-discarded"] = "auto"  # type: ignore[assignment]
+    """Degrees of freedom. turntable: the camera before the axis, and the table's angle in each frame. free-discarded:
+    a rotation and a shift of each frame, reset to zero after the first stage and never applied to held-out views, as
+    in the paper's published code. off: none. auto: off for poses from markers, which training does not improve
+    (docs/concepts/poses.md), turntable for all others."""
 
     def setup(self, pose_method: str | None = None, **kwargs) -> PoseRefinement:
         """The refinement of the selected mode.
@@ -49,18 +50,13 @@ class PoseRefinementConfig(CameraOptimizerConfig):
         mode = self.mode
         if mode == "auto":
             mode = "off" if pose_method == "markers" else "turntable"
-        refinement: type[PoseRefinement] = {
-            "off": NoRefinement,
-            "turntable": TurntableRefinement,
-            "free": FreeRefinement,
-            "free-discarded": DiscardedRefinement,
-        }[mode]
+        kinds = {"turntable": TurntableRefinement, "free-discarded": DiscardedRefinement}
         # nerfstudio decides by the mode whether there are parameters.
-        return refinement(replace(self, mode=mode), **kwargs)
+        return kinds.get(mode, PoseRefinement)(replace(self, mode=mode), **kwargs)
 
 
 class PoseRefinement(CameraOptimizer):
-    """A camera optimiser that corrects all views of a session, held-out ones included.
+    """The measured poses as they are (mode off), and what all refinements have in common.
 
     Args:
         config: the configuration.
@@ -73,6 +69,7 @@ class PoseRefinement(CameraOptimizer):
     """
 
     config: PoseRefinementConfig
+    interpolation: Tensor
 
     def __init__(
         self,
@@ -91,10 +88,7 @@ class PoseRefinement(CameraOptimizer):
         self.device = device
 
     def corrections(
-        self,
-        frames: Int[Tensor, "*n"],
-        rotations: Float[Tensor, "*n 3 3"],
-        positions: Float[Tensor, "*n 3"],
+        self, frames: Int[Tensor, "*n"], rotations: Float[Tensor, "*n 3 3"], positions: Float[Tensor, "*n 3"]
     ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
         """Rotations to multiply the cameras' from the left, and the cameras' corrected positions.
 
@@ -103,7 +97,7 @@ class PoseRefinement(CameraOptimizer):
             rotations: measured camera-to-world rotations.
             positions: measured positions, scene units.
         """
-        raise NotImplementedError
+        return torch.eye(3).to(rotations).expand_as(rotations), positions
 
     def corrected(self, frames: Int[Tensor, "n"], camera_to_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
         """Refined poses of frames of the session, from their measured poses in scene units."""
@@ -115,7 +109,7 @@ class PoseRefinement(CameraOptimizer):
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Correct rays that carry a frame index; others (a viewer's) are not changed."""
-        if FRAME_INDEX not in raybundle.metadata:
+        if self.config.mode == "off" or FRAME_INDEX not in raybundle.metadata:
             return
         frames = raybundle.metadata[FRAME_INDEX][..., 0].long()
         rotations = raybundle.metadata[CAMERA_ROTATION].reshape(*frames.shape, 3, 3)
@@ -140,53 +134,26 @@ class PoseRefinement(CameraOptimizer):
     def get_loss_dict(self, loss_dict: dict) -> None:
         """Add the penalty on the corrections while they are learned."""
         if not self.frozen:
-            loss_dict["camera_opt_regularizer"] = self.penalty()
-
-    def penalty(self) -> Float[Tensor, ""]:
-        """Size of the corrections, weighted by the configuration."""
-        raise NotImplementedError
-
-
-class NoRefinement(PoseRefinement):
-    """The measured poses: no parameters, and rays are not changed."""
-
-    def corrections(
-        self,
-        frames: Int[Tensor, "*n"],
-        rotations: Float[Tensor, "*n 3 3"],
-        positions: Float[Tensor, "*n 3"],
-    ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-        """Identities, and the measured positions."""
-        return torch.eye(3).to(rotations).expand_as(rotations), positions
-
-    def apply_to_raybundle(self, raybundle: RayBundle) -> None:
-        """Leave the rays as they are."""
+            super().get_loss_dict(loss_dict)
 
 
 class TurntableRefinement(PoseRefinement):
     """One twist of the camera for all views, and one angle a frame; held-out frames interpolate their neighbours'."""
 
     twist_basis: Tensor
-    interpolation: Tensor
     axis_origin: Tensor
 
     def __init__(
-        self,
-        config: PoseRefinementConfig,
-        num_cameras: int,
-        device: torch.device | str,
-        camera_to_world: Float[np.ndarray, "4 4"],
-        frame_indices: Int[np.ndarray, "train"],
-        num_frames: int,
-        axis_origin: Float[np.ndarray, "3"],
+        self, config: PoseRefinementConfig, num_cameras: int, device: torch.device | str, **turntable
     ) -> None:
-        super().__init__(config, num_cameras, device, camera_to_world, frame_indices, num_frames, axis_origin)
-        centred = np.array(camera_to_world, dtype=np.float64)
+        super().__init__(config, num_cameras, device, **turntable)
+        axis_origin = np.asarray(turntable["axis_origin"])
+        centred = np.array(turntable["camera_to_world"], dtype=np.float64)
         centred[:3, 3] -= axis_origin
         buffers = {
             "twist_basis": visible_twists(centred),
-            "interpolation": held_out_interpolation(frame_indices, num_frames),
-            "axis_origin": np.asarray(axis_origin),
+            "interpolation": held_out_interpolation(turntable["frame_indices"], turntable["num_frames"]),
+            "axis_origin": axis_origin,
         }
         for name, value in buffers.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32))
@@ -202,10 +169,7 @@ class TurntableRefinement(PoseRefinement):
         return self.twist_basis @ self.camera_twist
 
     def corrections(
-        self,
-        frames: Int[Tensor, "*n"],
-        rotations: Float[Tensor, "*n 3 3"],
-        positions: Float[Tensor, "*n 3"],
+        self, frames: Int[Tensor, "*n"], rotations: Float[Tensor, "*n 3 3"], positions: Float[Tensor, "*n 3"]
     ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
         """The camera's twist in the scene's axes, R delta R^T, then each frame's angle about the axis."""
         twist = exp_map_SE3(self.twist()[None])[0]
@@ -214,14 +178,15 @@ class TurntableRefinement(PoseRefinement):
         from_axis = positions + rotations @ twist[:, 3] - self.axis_origin
         return turns, torch.einsum("...ij,...j->...i", about_axis, from_axis) + self.axis_origin
 
-    def penalty(self) -> Float[Tensor, ""]:
+    def get_loss_dict(self, loss_dict: dict) -> None:
         """Squared lengths of the shift (scene units) and turn (radians), and mean square of the angles."""
-        shift, turn = self.twist().split(3)
-        return (
-            shift.square().sum() * self.config.trans_l2_penalty
-            + turn.square().sum() * self.config.rot_l2_penalty
-            + self.frame_angles.square().mean() * self.config.angle_l2_penalty
-        )
+        if not self.frozen:
+            shift, turn = self.twist().split(3)
+            loss_dict["camera_opt_regularizer"] = (
+                shift.square().sum() * self.config.trans_l2_penalty
+                + turn.square().sum() * self.config.rot_l2_penalty
+                + self.frame_angles.square().mean() * _ANGLE_L2_PENALTY
+            )
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
         """Add the size of the corrections, for the logs."""
@@ -231,71 +196,35 @@ class TurntableRefinement(PoseRefinement):
         metrics_dict["camera_opt_angle_max_deg"] = torch.rad2deg(self.angle_corrections().detach().abs().max())
 
 
-class FreeRefinement(PoseRefinement):
-    """A shift and a rotation of each training view in the scene's axes, as in nerfstudio's ``SO3xR3``.
-
-    Held-out views interpolate the six numbers of their neighbours. For tables that do not turn about one axis.
-    """
-
-    interpolation: Tensor
+class DiscardedRefinement(PoseRefinement):
+    """The paper's published code: nerfstudio's ``SO3xR3`` of the training views, reset when it is frozen."""
 
     def __init__(
-        self,
-        config: PoseRefinementConfig,
-        num_cameras: int,
-        device: torch.device | str,
-        frame_indices: Int[np.ndarray, "train"],
-        num_frames: int,
-        **turntable,
+        self, config: PoseRefinementConfig, num_cameras: int, device: torch.device | str, **turntable
     ) -> None:
-        super().__init__(config, num_cameras, device, frame_indices=frame_indices, num_frames=num_frames, **turntable)
-        interpolation = torch.from_numpy(self._interpolation(frame_indices, num_frames)).float()
-        self.register_buffer("interpolation", interpolation)
+        super().__init__(config, num_cameras, device, **turntable)
+        of_training = torch.eye(turntable["num_frames"])[:, turntable["frame_indices"]]
+        self.register_buffer("interpolation", of_training)
         self.pose_adjustment = torch.nn.Parameter(torch.zeros(num_cameras, 6))
 
-    def _interpolation(
-        self, frame_indices: Int[np.ndarray, "train"], num_frames: int
-    ) -> Float[np.ndarray, "num_frames train"]:
-        return held_out_interpolation(frame_indices, num_frames)
-
     def corrections(
-        self,
-        frames: Int[Tensor, "*n"],
-        rotations: Float[Tensor, "*n 3 3"],
-        positions: Float[Tensor, "*n 3"],
+        self, frames: Int[Tensor, "*n"], rotations: Float[Tensor, "*n 3 3"], positions: Float[Tensor, "*n 3"]
     ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-        """Each frame's own rotation, and its shifted position."""
+        """Each training frame's own rotation in the scene's axes, and its shifted position."""
         matrices = exp_map_SO3xR3(self.interpolation @ self.pose_adjustment)[frames]
         return matrices[..., :3], positions + matrices[..., 3]
-
-    def get_metrics_dict(self, metrics_dict: dict) -> None:
-        """Mean sizes of the corrections, for the logs, left on the GPU."""
-        shifts, turns = self.pose_adjustment.detach().split(3, dim=1)
-        metrics_dict["camera_opt_translation"] = shifts.norm(dim=-1).mean()
-        metrics_dict["camera_opt_rotation"] = turns.norm(dim=-1).mean()
-
-    def penalty(self) -> Float[Tensor, ""]:
-        """nerfstudio's: mean lengths of the shifts (scene units) and turns (radians)."""
-        shifts, turns = self.pose_adjustment.split(3, dim=1)
-        return (
-            shifts.norm(dim=-1).mean() * self.config.trans_l2_penalty
-            + turns.norm(dim=-1).mean() * self.config.rot_l2_penalty
-        )
-
-
-class DiscardedRefinement(FreeRefinement):
-    """The paper's published code: corrections apply to training views only and are reset when they are frozen."""
-
-    def _interpolation(
-        self, frame_indices: Int[np.ndarray, "train"], num_frames: int
-    ) -> Float[np.ndarray, "num_frames train"]:
-        return np.eye(num_frames)[:, frame_indices]
 
     def freeze(self, frozen: bool) -> None:
         """Stop or resume learning; stopping resets the corrections."""
         super().freeze(frozen)
         if frozen:
             torch.nn.init.zeros_(self.pose_adjustment)
+
+    def get_metrics_dict(self, metrics_dict: dict) -> None:
+        """Mean sizes of the corrections, for the logs; nerfstudio's would wait for the GPU."""
+        shifts, turns = self.pose_adjustment.detach().split(3, dim=1)
+        metrics_dict["camera_opt_translation"] = shifts.norm(dim=-1).mean()
+        metrics_dict["camera_opt_rotation"] = turns.norm(dim=-1).mean()
 
 
 def held_out_interpolation(

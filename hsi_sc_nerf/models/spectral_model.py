@@ -21,9 +21,8 @@ from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.cameras import CAMERA_ROTATION
+from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_angle_map,
     spectral_angle_mapper,
@@ -31,12 +30,11 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_rmse,
     squared_error_map,
 )
-from hsi_sc_nerf.fields.grid_size import grid_for_dataset
-from hsi_sc_nerf.fields.spectral_field import BandGroupField, SpectralField, SpectralProposalField
+from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
+from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
-from hsi_sc_nerf.models.renderers import BandGroupRenderer, BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
@@ -50,8 +48,6 @@ class SpectralModelConfig(NerfactoModelConfig):
     head: Literal["direct", "basis"] = "basis"
     """Output of the field at a sample. direct: the reflectance in every band. basis: a few coefficients in a basis of
     spectra that is found in the training pixels; they are decoded to all bands once a pixel."""
-    basis_rank: int | None = None
-    """Coefficients of the basis head. None: as many as are above the noise of the training pixels."""
     background: BackgroundKind = "image"
     """Spectrum of the light that the object lets through. image: a picture of the chamber, which stands still with
     the camera, taken from the frames. spectrum: the chamber's median spectrum. last-sample: that of the last sample
@@ -63,15 +59,9 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
     """Weight of the reflectance errors over pixels and bands."""
-    interlevel_loss_mult: float = paper.INTERLEVEL_LOSS_WEIGHT
-    """Weight of the proposal loss."""
     distortion_loss_mult: float = 0.02
     """Weight of the distortion loss, which concentrates the density along a ray. nerfacto's 0.002 leaves surfaces
     thicker, and with 0.2 no surface forms (docs/validation/reconstruction.md)."""
-    orientation_loss_mult: float = paper.ORIENTATION_LOSS_WEIGHT
-    """Weight of the orientation loss on computed normals."""
-    pred_normal_loss_mult: float = paper.PREDICTED_NORMAL_LOSS_WEIGHT
-    """Weight of the predicted-normal loss."""
     view_dependent: bool = True
     """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
     stand still while the object turns."""
@@ -107,21 +97,14 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Networks and grids. "torch" works with and without a GPU."""
     eval_num_rays_per_chunk: int = 4096
     """Rays rendered at a time."""
-    density_groups: int = 1
-    """Groups of neighbouring bands with a density of their own, for translucent objects (direct head only). 1: one
-    density for all bands."""
     camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
     """Refinement of the measured poses."""
 
     def __post_init__(self) -> None:
-        if self.density_groups < 1:
+        if self.head == "basis" and self.background == "last-sample":
             raise SystemExit(
-                f"hsi-sc-nerf: --pipeline.model.density-groups is {self.density_groups}; take 1 at least."
-            )
-        if self.head == "basis" and (self.background == "last-sample" or self.density_groups > 1):
-            raise SystemExit(
-                "hsi-sc-nerf: --pipeline.model.head basis goes neither with the background last-sample nor with "
-                "density groups, which need a value in every band at each sample; take --pipeline.model.head direct."
+                "hsi-sc-nerf: --pipeline.model.background last-sample needs a value in every band at each sample; "
+                "take --pipeline.model.head direct with it."
             )
 
 
@@ -134,7 +117,6 @@ class SpectralModel(NerfactoModel):
     config: SpectralModelConfig
     field: SpectralField
     camera_optimizer: PoseRefinement
-    subspace: SpectralSubspace | None
     decoder: nn.Module
     renderer_rgb: nn.Module  # type: ignore[assignment]
 
@@ -148,12 +130,12 @@ class SpectralModel(NerfactoModel):
         dataset: PackedDataset = metadata["dataset"]
         self.wavelengths_nm = dataset.wavelengths_nm
         self.rgb_bands: list[int] = metadata["rgb_bands"]
-        self.subspace, self.decoder = None, nn.Identity()
+        subspace, self.decoder = None, nn.Identity()
         if config.head == "basis":
-            self.subspace = training_subspace(dataset, metadata["frames"], config.basis_rank)
-            self.decoder = BasisDecoder(torch.from_numpy(self.subspace.scaled_basis).float())
+            subspace = training_subspace(dataset, metadata["frames"])
+            self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
-        self.field = self._build_field(dataset, contraction)
+        self.field = self._build_field(dataset, contraction, subspace)
         self._build_proposals(contraction)
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
@@ -164,10 +146,7 @@ class SpectralModel(NerfactoModel):
             self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
         self.background = make_background(config.background, dataset, metadata["frames"])
 
-        if isinstance(self.field, BandGroupField):
-            self.renderer_rgb = BandGroupRenderer(self.field.group_sizes)
-        else:
-            self.renderer_rgb = SpectralRenderer("last-sample" if self.background is None else "none")
+        self.renderer_rgb = SpectralRenderer(last_sample_behind=self.background is None)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.renderer_expected_depth = DepthRenderer(method="expected")
@@ -175,14 +154,11 @@ class SpectralModel(NerfactoModel):
         self.normals_shader = NormalsShader()
         self.step = 0
 
-    def _build_field(self, dataset: PackedDataset, contraction: SceneContraction | None) -> SpectralField:
+    def _build_field(
+        self, dataset: PackedDataset, contraction: SceneContraction | None, subspace: SpectralSubspace | None
+    ) -> SpectralField:
         """The spectral field, with a grid for what the camera resolves."""
-        config, num_bands = self.config, len(dataset.wavelengths_nm)
-        if config.density_groups > num_bands:
-            raise InputError(
-                f"--pipeline.model.density-groups is {config.density_groups}, but the dataset has {num_bands} bands; "
-                "take fewer groups."
-            )
+        config = self.config
         options: dict[str, Any] = {
             "num_levels": config.num_levels,
             "max_res": config.max_res,
@@ -191,13 +167,11 @@ class SpectralModel(NerfactoModel):
         if config.match_resolution:
             grid = grid_for_dataset(dataset)
             options = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
-        if self.subspace is not None:
-            options["coefficient_start"] = torch.from_numpy(self.subspace.mean_coefficients)
-        if config.density_groups > 1:
-            options["num_groups"] = config.density_groups
-        return (SpectralField if config.density_groups == 1 else BandGroupField)(
+        if subspace is not None:
+            options["coefficient_start"] = torch.from_numpy(subspace.mean_coefficients)
+        return SpectralField(
             self.scene_box.aabb,
-            num_bands=num_bands,
+            num_bands=len(dataset.wavelengths_nm),
             view_dependent=config.view_dependent,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
@@ -257,11 +231,9 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
-        spectral, opacity = self.decoder(outputs["rgb"]), outputs["accumulation"]
-        if isinstance(self.field, BandGroupField):
-            spectral, opacity = spectral.chunk(2, dim=-1)
+        spectral = self.decoder(outputs["rgb"])
         if background is not None:
-            spectral = spectral + background * (1.0 - opacity)
+            spectral = spectral + background * (1.0 - outputs["accumulation"])
         # Coefficients of a basis may decode to slightly negative reflectance.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
         # An index of numbers would be a transfer to the device, for which that has to wait.
@@ -327,3 +299,51 @@ class SpectralModel(NerfactoModel):
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }
         return metrics, images
+
+
+class SpectralRenderer(nn.Module):
+    """Composite spectra, or coefficients of a spectral basis; nerfstudio's renderer takes three channels and clamps.
+
+    Args:
+        last_sample_behind: the light that the samples let through has the spectrum of the last one, as in nerfacto;
+            otherwise the ray ends in black.
+
+    Attributes:
+        background_color: read by nerfstudio's exporters of textures; their pictures of whole rays are opaque.
+    """
+
+    background_color = "black"
+
+    def __init__(self, last_sample_behind: bool = False) -> None:
+        super().__init__()
+        self.last_sample_behind = last_sample_behind
+
+    def forward(
+        self, rgb: Float[Tensor, "*rays samples channels"], weights: Float[Tensor, "*rays samples 1"]
+    ) -> Float[Tensor, "*rays channels"]:
+        """Sum of the samples' channels (``rgb`` is nerfstudio's name for them), each with its weight."""
+        composited = torch.sum(weights * rgb, dim=-2)
+        if not self.last_sample_behind:
+            return composited
+        return composited + (1.0 - torch.sum(weights, dim=-2)) * rgb[..., -1, :]
+
+
+class BasisDecoder(nn.Module):
+    """Spectra from coefficients in a basis.
+
+    Compositing and the basis are both linear: decoding composited coefficients once a ray equals compositing decoded
+    spectra, with far fewer numbers a sample.
+
+    Args:
+        basis: one spectrum a column, linearly independent (`SpectralSubspace.scaled_basis`).
+    """
+
+    basis: Tensor
+
+    def __init__(self, basis: Float[Tensor, "bands rank"]) -> None:
+        super().__init__()
+        self.register_buffer("basis", basis.clone())
+
+    def forward(self, coefficients: Float[Tensor, "*rays rank"]) -> Float[Tensor, "*rays bands"]:
+        """Spectra of (composited) coefficients."""
+        return coefficients @ self.basis.T

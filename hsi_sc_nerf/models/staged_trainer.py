@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -26,20 +26,27 @@ from hsi_sc_nerf.models.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from hsi_sc_nerf.models.nonfinite import GuardedOptimizers, NonFiniteGuard, TrainingDivergedError, non_finite_names
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
+    StagePlan,
     full_frame_stage,
     masked_stage,
-    plan_after,
     plan_stages,
-    plan_within,
+    resumed_plan,
     step_seed,
 )
-from hsi_sc_nerf.models.training_log import TrainingProgress, stage_summary
+from hsi_sc_nerf.models.training_watch import (
+    GuardedOptimizers,
+    NonFiniteGuard,
+    TrainingDivergedError,
+    non_finite_names,
+    stage_summary,
+    training_progress,
+)
+from hsi_sc_nerf.settings_file import check_options
 
 _GPU_PROGRESS_STEPS = 16
 """On a GPU the progress bar is brought up to date once in so many steps: each time, the GPU is waited for."""
@@ -56,10 +63,33 @@ class StagedTrainerConfig(TrainerConfig):
     """Second stage: the masked object, and some background rays."""
     evaluate_stages: bool = True
     """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
-    max_nonfinite_steps: int = 20
-    """Number of consecutive skipped steps that stops the run."""
     capture_steps: bool = True
     """On a GPU, launch a step's forward and backward pass as one CUDA graph."""
+
+    def plan(self) -> StagePlan:
+        """The stages of the run.
+
+        Raises:
+            SystemExit: a setting is impossible, in one sentence.
+        """
+        stages = (self.full_frame, self.masked)
+        try:
+            check_options(self)
+            for stage in stages:
+                for group in (*stage.frozen_groups, *stage.learn_after, *stage.group_lr):
+                    if group not in self.optimizers:
+                        raise InputError(
+                            f"the {stage.name} stage names the parameter group {group!r}; there are "
+                            f"{', '.join(self.optimizers)}."
+                        )
+            return plan_stages(stages, self.max_num_iterations)
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+
+    def save_config(self) -> None:
+        """Check the settings, then write ``config.yml``, the first file of a run."""
+        self.plan()
+        super().save_config()
 
 
 class StagedTrainer(Trainer):
@@ -78,20 +108,14 @@ class StagedTrainer(Trainer):
         if self.world_size > 1:
             # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
-        stages = (self.config.full_frame, self.config.masked)
-        try:
-            for stage in stages:
-                stage.check(self.config.optimizers)
-            self.plan = plan_stages(stages, self.config.max_num_iterations)
-        except ValueError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        self.plan = self.config.plan()
         self._stage: Stage | None = None
         self._frozen: set[str] | None = None
         self._steps_since_update = 0
         self._saved_step: int | None = None
         self._loaded: Path | None = None
         self._completed: str | None = None
-        self._guard = NonFiniteGuard(self.config.max_nonfinite_steps)
+        self._guard = NonFiniteGuard()
         self._captured: CapturedSteps | None = None
         try:
             super().setup(test_mode)
@@ -132,7 +156,7 @@ class StagedTrainer(Trainer):
                     "train on."
                 )
             self.config = dataclasses.replace(self.config, max_num_iterations=left)
-            with TrainingProgress(self.plan.num_iterations, self._start_step) as self._progress:
+            with training_progress(self.plan.num_iterations, self._start_step) as self._show_progress:
                 super().train()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights, so these are the last finite ones.
@@ -168,7 +192,7 @@ class StagedTrainer(Trainer):
             for group, rate in rates.items():  # under the names of nerfstudio's own schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
         if self._captured is None or step % _GPU_PROGRESS_STEPS == 0 or step == stage.end - 1:
-            self._progress.update(step, stage, float(metrics_dict["psnr"]))
+            self._show_progress(step, stage, float(metrics_dict["psnr"]))
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
@@ -192,11 +216,9 @@ class StagedTrainer(Trainer):
         return found
 
     def _enter(self, stage: Stage) -> None:
-        """Set the rays and loss weights of ``stage``."""
+        """Set the rays of ``stage``."""
         self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_ray_fraction
         self.pipeline.datamanager.boundary_ray_fraction = stage.config.boundary_ray_fraction
-        weights: dict[str, Any] = stage.config.loss_weights()
-        self._model.config = dataclasses.replace(cast(SpectralModelConfig, self.config.pipeline.model), **weights)
         self._stage = stage
 
     def _freeze(self, frozen: set[str]) -> None:
@@ -308,11 +330,9 @@ class StagedTrainer(Trainer):
             self.grad_scaler.load_state_dict(state["scalers"])
         training = state["training"]
         self._steps_since_update = training["steps_since_update"]
-        # Another run's first stage may have had another length.
-        self.plan = plan_within(self.plan, **training["stage"])
         self._completed = training["completed_stage"]
-        if self._completed is not None:
-            self.plan = plan_after(self.plan, self._completed, self._start_step)
+        completed_at = None if self._completed is None else self._start_step
+        self.plan = resumed_plan(self.plan, **training["stage"], completed_at=completed_at)
         self._loaded = path
         CONSOLE.print(f"Going on from {escape(str(path))}", soft_wrap=True)
 

@@ -7,12 +7,15 @@ learning rates and its random numbers follow from the step alone, so that a resu
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import between
 
 
 @dataclass
@@ -21,64 +24,28 @@ class StageConfig:
 
     name: str
     """Shown in the progress bar, and the name of the stage's checkpoint folder."""
-    fraction: float
+    fraction: float = between(0.0, math.inf)
     """Fraction of --max-num-iterations that this stage takes."""
-    num_iterations: int | None = None
+    num_iterations: int | None = between(0, math.inf, default=None)
     """Length of this stage, in place of the fraction."""
-    foreground_ray_fraction: float | None = None
+    foreground_ray_fraction: float | None = between(0.0, 1.0, default=None)
     """Fraction of the rays that hit the foreground masks. The others keep empty space empty. 1: the object's pixels
     alone, as in the paper's second stage. None: rays anywhere in whole frames."""
-    boundary_ray_fraction: float = 0.0
+    boundary_ray_fraction: float = between(0.0, 1.0, default=0.0)
     """Fraction of the other rays that pass within 3 pixels of the masks, where the object ends. It has no effect
     without a foreground ray fraction."""
-    angular_loss_mult: float | None = None
-    """Weight of the spectral angle's loss in this stage. None: the model's."""
-    hsi_loss_mult: float | None = None
-    """Weight of the squared error in this stage. None: the model's."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
     learn_after: dict[str, float] = field(default_factory=lambda: {"camera_opt": 0.3})
     """Fraction of the stage's steps after which a parameter group begins to learn. Pose refinement starts after 30 %
     of the first stage, when the density has converged to a surface."""
-    lr_start: float = 1.0
+    lr_start: float = between(1e-9, math.inf, default=1.0)
     """Factor on every learning rate at the start of the stage."""
-    lr_end: float = 0.5
+    lr_end: float = between(1e-9, math.inf, default=0.5)
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
     group_lr: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Both factors for single parameter groups, in place of those above."""
-
-    def loss_weights(self) -> dict[str, float]:
-        """Loss weights that this stage sets, by their names in the model's configuration."""
-        weights = {"angular_loss_mult": self.angular_loss_mult, "hsi_loss_mult": self.hsi_loss_mult}
-        return {name: weight for name, weight in weights.items() if weight is not None}
-
-    def check(self, groups: Collection[str]) -> None:
-        """Check the settings.
-
-        Args:
-            groups: names of all parameter groups that have an optimiser.
-
-        Raises:
-            ValueError: a setting is out of range or names no parameter group; the message names the stage.
-        """
-        fractions = {
-            "foreground-ray-fraction": self.foreground_ray_fraction,
-            "boundary-ray-fraction": self.boundary_ray_fraction,
-        }
-        for option, fraction in fractions.items():
-            if fraction is not None and not 0.0 <= fraction <= 1.0:
-                raise ValueError(f"{self.name}: {option} {fraction} is not between 0 and 1")
-        if self.fraction < 0.0:
-            raise ValueError(f"{self.name}: fraction {self.fraction} is below 0")
-        factors = {"lr-start": self.lr_start, "lr-end": self.lr_end}
-        factors |= {f"group-lr of {group}": min(pair) for group, pair in self.group_lr.items()}
-        for option, factor in factors.items():
-            if factor <= 0.0:
-                raise ValueError(f"{self.name}: {option} {factor} is not above 0; frozen-groups stops a group")
-        for group in (*self.frozen_groups, *self.learn_after, *self.group_lr):
-            if group not in groups:
-                raise ValueError(f"{self.name}: no parameter group is named {group!r}; there are {', '.join(groups)}")
 
 
 def full_frame_stage() -> StageConfig:
@@ -106,15 +73,6 @@ def masked_stage() -> StageConfig:
         lr_start=0.5,
         lr_end=0.02,
     )
-
-
-def exponential_decay(final_factor: float, schedule_steps: int, step: int) -> float:
-    """Factor on a learning rate at ``step`` of a schedule that falls to ``final_factor`` over ``schedule_steps``.
-
-    The schedule of the paper's released settings is longer than the run; its values at the ends of the stages are
-    their ``lr_start`` and ``lr_end``.
-    """
-    return final_factor ** min(1.0, step / schedule_steps)
 
 
 def step_seed(seed: int, step: int) -> int:
@@ -161,29 +119,27 @@ class StagePlan:
         return self.stages[-1]
 
 
-def plan_after(plan: StagePlan, completed: str, next_step: int) -> StagePlan:
-    """The plan of a run that continues at ``next_step`` from the end of the stage named ``completed``.
+def resumed_plan(plan: StagePlan, name: str, start: int, completed_at: int | None = None) -> StagePlan:
+    """The plan of a run that goes on from a checkpoint, perhaps of another run, whose stages had other lengths.
 
-    The stages after it follow with the lengths that they have in ``plan``, however long the completed one was. If it
-    is the last stage of the plan, or not in it, the plan does not change.
+    The checkpoint's stage and those after it keep the lengths that they have in ``plan``; the one before them ends
+    where they begin. If ``plan`` has no such stage, it does not change.
+
+    Args:
+        plan: by the settings.
+        name: stage of the checkpoint.
+        start: step at which it began.
+        completed_at: the next step, if the checkpoint is the stage's last: the next stage of ``plan`` begins there.
     """
     names = [stage.config.name for stage in plan.stages]
-    if completed not in names[:-1]:
-        return plan
-    return plan_within(plan, names[names.index(completed) + 1], next_step)
-
-
-def plan_within(plan: StagePlan, name: str, start: int) -> StagePlan:
-    """The plan of a run whose stage ``name`` began at ``start``, for example after another run's first stage.
-
-    That stage and those after it keep the lengths that they have in ``plan``; the one before it ends where it begins.
-    If ``plan`` has no such stage, it does not change.
-    """
-    names = [stage.config.name for stage in plan.stages]
-    if name not in names or start == plan.stages[names.index(name)].start:
+    if name not in names:
         return plan
     position = names.index(name)
+    if completed_at is not None and name != names[-1]:
+        position, start = position + 1, completed_at
     shift = start - plan.stages[position].start
+    if shift == 0:
+        return plan
     before = (replace(stage, start=min(stage.start, start - 1), end=start) for stage in plan.stages[:position][-1:])
     later = (replace(stage, start=stage.start + shift, end=stage.end + shift) for stage in plan.stages[position:])
     return StagePlan((*before, *later))
@@ -196,7 +152,7 @@ def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> Stag
     stages have a length, the run is as long as their sum. Stages of no steps are left out.
 
     Raises:
-        ValueError: there are no steps to train, or the stages' lengths leave none for the other stages.
+        InputError: there are no steps to train, or the stages' lengths leave none for the other stages.
 
     Example:
         >>> plan = plan_stages((full_frame_stage(), masked_stage()), max_num_iterations=500)
@@ -207,13 +163,13 @@ def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> Stag
     divided = [config for config in configs if config.num_iterations is None]
     left = max_num_iterations - fixed
     if divided and left < 0:
-        raise ValueError(
+        raise InputError(
             f"the stages' num-iterations ({fixed}) exceed --max-num-iterations ({max_num_iterations}); raise the "
-            "latter, or give every stage its own"
+            "latter, or give every stage its own."
         )
     weight = sum(config.fraction for config in divided)
     if divided and left > 0 and not weight > 0.0:
-        raise ValueError("the stages' fractions add up to 0: one of them has to be above 0")
+        raise InputError("the stages' fractions add up to 0; give one of them a fraction above 0.")
     stages: list[Stage] = []
     start, cumulated = 0, 0.0
     for config in configs:
@@ -228,5 +184,7 @@ def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> Stag
             stages.append(Stage(config, start, start + length))
             start += length
     if not stages:
-        raise ValueError("no iterations to train: --max-num-iterations and the stages' num-iterations are all zero")
+        raise InputError(
+            f"--max-num-iterations is {max_num_iterations}, which leaves nothing to train; give a number above 0."
+        )
     return StagePlan(tuple(stages))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Num, UInt8, UInt16
+from jaxtyping import Float16, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
@@ -26,7 +26,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
 from hsi_sc_nerf.processing.fingerprint import capture_files, fingerprint
-from hsi_sc_nerf.processing.masks import brightness, foreground_score, spectral_bin_width
+from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_width
 from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 
@@ -42,6 +42,7 @@ class FramePaths:
     cube: Path
     flags: Path
     mask: Path
+    bins: Path
     cache: Path
 
     @staticmethod
@@ -52,6 +53,7 @@ class FramePaths:
             cube=root / "cubes" / f"{capture}.hdr",
             flags=root / "flags" / f"{capture}.png",
             mask=root / "masks" / f"{capture}.png",
+            bins=root / ".cache" / f"{capture}_bins.npy",
             cache=root / ".cache" / f"{capture}.npz",
         )
 
@@ -63,15 +65,13 @@ class FrameCache:
     Attributes:
         fingerprint: of the files and settings that the frame was made from.
         gray: mean over the marker bands, in which markers are detected.
-        score: foreground score (`masks.foreground_score`).
-        brightness: mean reflectance (`masks.brightness`).
+        bins: smoothed spectra (`smoothed_bins`), read from disk where they are used.
         pixel_counts: numbers of clipped and flagged values by kept band.
     """
 
     fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
-    score: Float[np.ndarray, "lines samples"]
-    brightness: Float[np.ndarray, "lines samples"]
+    bins: Float16[np.ndarray, "bins lines samples"]
     pixel_counts: PixelCounts
 
 
@@ -105,7 +105,7 @@ def pack_frames(
     Example:
         >>> session = open_session("apple_01")
         >>> caches = pack_frames(session, calibrate_session(session, CalibrationConfig()), Path("apple_01-data"))
-        >>> caches[0].score.shape
+        >>> caches[0].gray.shape
     """
     # A worker packs frame after frame in the same memory.
     own = threading.local()
@@ -183,20 +183,12 @@ def process_frame(
     write_packed_cube(paths.cube, upright(frame.packed), wavelengths_nm, widths_nm)
     write_png(paths.flags, upright(frame.flags))
     write_png(paths.image, upright(to_8_bit(np.moveaxis(frame.rgb, 0, -1))))
-    cache = FrameCache(
-        fingerprint,
-        gray=upright(to_8_bit(frame.gray)),
-        score=upright(foreground_score(frame.binned)),
-        brightness=upright(brightness(frame.binned)),
-        pixel_counts=frame.pixel_counts,
-    )
+    with atomic_write(paths.bins) as (temporary,):
+        np.save(temporary, np.rot90(smoothed_bins(frame.binned), calibration.quarter_turns, axes=(1, 2)))
+    gray = upright(to_8_bit(frame.gray))
     with atomic_write(paths.cache) as (temporary,):
-        np.savez(
-            temporary,
-            **{f.name: getattr(cache, f.name) for f in fields(FrameCache) if f.name != "pixel_counts"},
-            **{f.name: getattr(cache.pixel_counts, f.name) for f in fields(PixelCounts)},
-        )
-    return cache
+        np.savez(temporary, fingerprint=fingerprint, gray=gray, **vars(frame.pixel_counts))
+    return FrameCache(fingerprint, gray, np.load(paths.bins, mmap_mode="r"), frame.pixel_counts)
 
 
 def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
@@ -204,9 +196,8 @@ def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
     try:
         with np.load(paths.cache) as stored:
             pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
-            cache = FrameCache(
-                str(stored["fingerprint"]), stored["gray"], stored["score"], stored["brightness"], pixel_counts
-            )
+            bins = np.load(paths.bins, mmap_mode="r")
+            cache = FrameCache(str(stored["fingerprint"]), stored["gray"], bins, pixel_counts)
         open_cube(paths.cube)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
         return None

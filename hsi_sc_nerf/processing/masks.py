@@ -1,9 +1,8 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
-The reflectance of plant tissue changes strongly between 400 and 1000 nm, that of Teflon, plastic, paper and ink
-hardly. A pixel's foreground score is the standard deviation of its spectrum, and Otsu's threshold separates the
-object's scores from the others. What lies below the container's lid is excluded by geometry. Dark parts next to the
-object are compared by score relative to brightness, for the score falls with the light.
+Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
+excluded by geometry. Dark parts next to the object are compared by score relative to brightness, for the score falls
+with the light.
 """
 
 from __future__ import annotations
@@ -28,19 +27,17 @@ from hsi_sc_nerf.morphology import (
     touching,
 )
 from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 
-SPECTRAL_BINS = 24
-"""Neighbouring bands are averaged into this number of bins, or a few less, before the score: it reduces noise."""
-SMOOTHING_PX = 0.5
-"""Standard deviation of the Gaussian that smooths the bins over neighbouring pixels."""
-MIN_CONTRAST = 0.03
+MIN_CONTRAST = 0.005
 """Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
+MIN_SEPARATION = 6.0
+"""Smallest such difference as a multiple of the background's scatter; noise alone has 3 to 5."""
 CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
-_HISTOGRAM_BINS = 512
-# Fractions of the object's median brightness. Before a darker background noise alone gives a high relative score; so
-# it does in darker pixels.
-_MIN_BACKGROUND_BRIGHTNESS = 0.5
+# Fractions of the object's median brightness. Before a darker background noise and pixels that are partly background
+# have a high relative score; so does noise in darker pixels.
+_MIN_BACKGROUND_BRIGHTNESS = 0.9
 _MIN_BRIGHTNESS = 0.1
 
 
@@ -49,8 +46,8 @@ class MaskConfig:
     """Settings of the foreground masks."""
 
     threshold: float | None = None
-    """Foreground score (standard deviation of reflectance over the spectrum) from which a pixel is the object's.
-    Otsu's threshold over all frames if not given."""
+    """Foreground score (the part of the reflectance that the background's spectra cannot explain, RMS over the
+    spectrum) from which a pixel is the object's. Otsu's threshold over all frames if not given."""
     weak_fraction: float = 0.5
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
     shaded_fraction: float | None = 0.4
@@ -61,16 +58,14 @@ class MaskConfig:
 
 
 def foreground_masks(
-    scores: Sequence[Float[np.ndarray, "h w"]],
-    brightnesses: Sequence[Float[np.ndarray, "h w"]],
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
     config: MaskConfig,
     regions: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Bool[np.ndarray, "frames h w"]:
     """Masks of the object in all frames, with one threshold.
 
     Args:
-        scores: foreground score of each frame (`foreground_score`).
-        brightnesses: mean reflectance of each frame (`brightness`).
+        bins: of each frame (`smoothed_bins`).
         config: settings.
         regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
 
@@ -78,74 +73,33 @@ def foreground_masks(
         InputError: the spectra of object and background hardly differ.
 
     Example:
-        >>> score, bright = foreground_score(binned), brightness(binned)  # binned: (24, 512, 512) reflectance
-        >>> foreground_masks([score], [bright], MaskConfig()).shape
+        >>> foreground_masks([smoothed_bins(binned)], MaskConfig()).shape  # binned: (24, 512, 512) reflectance
         (1, 512, 512)
     """
+    background = background_subspace(bins, regions)
+    scores = [foreground_score(image, background) for image in bins]
     threshold = select_threshold(scores, config.threshold)
+    lowest = _background_level(scores, threshold)
+    weak_fraction = max(config.weak_fraction, min(1.0, lowest / threshold))
     masks = []
-    for index, (score, bright) in enumerate(zip(scores, brightnesses, strict=True)):
+    for index, score in enumerate(scores):
         region = np.ones(score.shape, bool) if regions is None else regions[index]
-        mask = foreground_mask(score, threshold, region=region, weak_fraction=config.weak_fraction)
+        mask = foreground_mask(score, threshold, region=region, weak_fraction=weak_fraction)
         if config.shaded_fraction is not None:
-            shaded = shaded_parts(mask, score, bright, region=region, fraction=config.shaded_fraction)
-            mask = fill_holes(mask | shaded)
+            brightness = bins[index].mean(axis=0, dtype=np.float32)
+            shaded = shaded_parts(mask, score, brightness, region=region, fraction=config.shaded_fraction)
+            mask = fill_holes(mask | (shaded & (score > lowest)))
         masks.append(mask)
     return np.stack(masks)
 
 
-def spectral_bin_width(bands: int) -> int:
-    """Number of neighbouring bands in a bin, so that there are `SPECTRAL_BINS` or fewer bins of one width."""
-    return -(-bands // SPECTRAL_BINS)
-
-
-def foreground_score(
-    binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX
-) -> Float[np.ndarray, "h w"]:
-    """Standard deviation over spectral bins of the slightly smoothed reflectance: 0 for a flat spectrum.
-
-    The score of a mixed pixel of object and flat background is nearly the object's score times its fraction.
-    """
-    # Differences from the first bin keep their squares within single precision, and a flat spectrum at exactly 0.
-    first = _smoothed(binned[0], smoothing_px)
-    difference, total, squares = np.empty_like(first), np.zeros_like(first), np.zeros_like(first)
-    for image in binned[1:]:
-        cv2.subtract(_smoothed(image, smoothing_px), first, dst=difference)
-        cv2.accumulate(difference, total)
-        cv2.accumulateSquare(difference, squares)
-    total /= len(binned)
-    return np.sqrt(np.maximum(squares / len(binned) - total**2, 0.0))
-
-
-def brightness(binned: Float[np.ndarray, "bins h w"], smoothing_px: float = SMOOTHING_PX) -> Float[np.ndarray, "h w"]:
-    """Mean over spectral bins of the slightly smoothed reflectance."""
-    return _smoothed(binned.mean(axis=0), smoothing_px)
-
-
-def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, float]:
-    """Otsu's threshold over all frames together, and the contrast: the difference of the two classes' means.
-
-    N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979).
-
-    Args:
-        scores: of each frame, 0 or more. Equal scores have a contrast of 0.
-    """
-    top = max(float(score.max()) for score in scores)
-    if not top > 0.0:
-        return 0.0, 0.0
-    counts = sum(np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores)
-    edges = np.linspace(0.0, top, _HISTOGRAM_BINS + 1)
-    weights = counts / np.sum(counts)
-    below = np.cumsum(weights)[:-1]
-    moment = np.cumsum(weights * (edges[:-1] + edges[1:]) / 2.0)
-    split = (below > 0.0) & (below < 1.0)
-    low = np.divide(moment[:-1], below, out=np.zeros_like(below), where=split)
-    high = np.divide(moment[-1] - moment[:-1], 1.0 - below, out=np.zeros_like(below), where=split)
-    between = below * (1.0 - below) * (high - low) ** 2
-    # Empty bins between two clear classes tie: take the middle of the plateau.
-    best = np.flatnonzero(between >= between.max() * (1.0 - 1e-9))
-    middle = int(best[len(best) // 2])
-    return float(edges[middle + 1]), float(high[middle] - low[middle])
+def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float) -> float:
+    """Score that the background hardly exceeds: six standard deviations over its median, both robust."""
+    low = np.concatenate([score[score <= threshold] for score in scores])
+    if len(low) == 0:
+        return 0.0
+    median = np.median(low)
+    return float(median + 6.0 * 1.4826 * np.median(np.abs(low - median)))
 
 
 def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:
@@ -156,8 +110,8 @@ def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: floa
     """
     if threshold is not None:
         return threshold
-    threshold, contrast = otsu_threshold(scores)
-    if contrast < MIN_CONTRAST:
+    threshold, contrast, separation = otsu_threshold(scores)
+    if contrast < MIN_CONTRAST or separation < MIN_SEPARATION:
         raise InputError(
             f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
             "object is in view, or give a threshold with --masks.threshold."
@@ -212,7 +166,7 @@ def shaded_parts(
         fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
 
     Returns:
-        The pixels to add. None where the background is less than half as bright as the body.
+        The pixels to add. None where the background is darker than the body.
     """
     empty = np.zeros_like(body)
     if not body.any() or body.all():
@@ -243,17 +197,16 @@ def above_lid(
         container: upright cylinder about the z axis, from z = 0 up.
         overhang: the space above the lid is a cylinder of this multiple of the container's radius.
     """
-    origin, directions = pixel_rays(intrinsics, camera_to_world, _undistorted_pixels(intrinsics, distortion))
-    radius = container.diameter_m / 2.0
-    above = _intersect(
-        _cylinder_interval(origin, directions, overhang * radius),
-        _slab_interval(origin, directions, container.height_m, np.inf),
-    )
-    solid = _intersect(
-        _cylinder_interval(origin, directions, radius), _slab_interval(origin, directions, 0.0, container.height_m)
-    )
-    blocked = (solid[0] < solid[1]) & (solid[0] <= above[0])
-    return (above[0] < above[1]) & ~blocked
+    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
+    pixels = np.stack([x, y], axis=-1)
+    if np.any(distortion):
+        matrix = intrinsics.matrix()
+        pixels = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, P=matrix).reshape(pixels.shape)
+    origin, directions = pixel_rays(intrinsics, camera_to_world, pixels)
+    radius, height = container.diameter_m / 2.0, container.height_m
+    above, above_end = _cylinder_interval(origin, directions, overhang * radius, height, np.inf)
+    solid, solid_end = _cylinder_interval(origin, directions, radius, 0.0, height)
+    return (above < above_end) & ~((solid < solid_end) & (solid <= above))
 
 
 def mask_picture(
@@ -286,48 +239,16 @@ def mask_picture(
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
-def _smoothed(image: Float[np.ndarray, "h w"], sigma_px: float) -> Float[np.ndarray, "h w"]:
-    return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.0 else image
-
-
-_Interval = tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]
-
-
-def _undistorted_pixels(
-    intrinsics: PinholeIntrinsics, distortion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "h w 2"]:
-    """Pixel coordinates of all pixel centres with the lens distortion removed."""
-    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
-    pixels = np.stack([x, y], axis=-1)
-    if not np.any(distortion):
-        return pixels
-    matrix = intrinsics.matrix()
-    return cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, np.asarray(distortion), P=matrix).reshape(
-        pixels.shape
-    )
-
-
 def _cylinder_interval(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float
-) -> _Interval:
-    """Ray parameters between which x² + y² <= radius² (an empty interval for a miss)."""
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float, low: float, high: float
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Ray parameters, 0 or more, between which x² + y² <= radius² and low <= z <= high; begin > end for a miss."""
     a = np.maximum(np.sum(directions[..., :2] ** 2, axis=-1), 1e-18)
     b = np.sum(directions[..., :2] * origin[:2], axis=-1)
     discriminant = b**2 - a * (np.sum(origin[:2] ** 2) - radius**2)
     root = np.sqrt(np.maximum(discriminant, 0.0))
-    hit = discriminant > 0.0
-    return np.where(hit, (-b - root) / a, np.inf), np.where(hit, (-b + root) / a, -np.inf)
-
-
-def _slab_interval(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], low: float, high: float
-) -> _Interval:
-    """Ray parameters between which low <= z <= high."""
     slope = np.where(np.abs(directions[..., 2]) < 1e-12, 1e-12, directions[..., 2])
     first, second = (low - origin[2]) / slope, (high - origin[2]) / slope
-    return np.minimum(first, second), np.maximum(first, second)
-
-
-def _intersect(a: _Interval, b: _Interval) -> _Interval:
-    """The common part of two intervals, in front of the camera."""
-    return np.maximum(np.maximum(a[0], b[0]), 0.0), np.minimum(a[1], b[1])
+    begin = np.maximum(np.maximum((-b - root) / a, np.minimum(first, second)), 0.0)
+    end = np.minimum((-b + root) / a, np.maximum(first, second))
+    return np.where(discriminant > 0.0, begin, np.inf), end

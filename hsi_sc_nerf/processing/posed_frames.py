@@ -6,7 +6,6 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -47,14 +46,13 @@ def pose_frames(
     """Find and check the poses, write ``poses.json`` and its figure, and print what was found.
 
     Args:
-        session: the session, whose frames are packed under ``output_dir``.
+        session: its frames are packed under ``output_dir``.
         images: the mean over ``marker_range_nm`` of each frame.
-        info: what is known of the session.
+        info: what is known of the session, settings included.
         camera: of an earlier session, if it is known.
-        method: how poses are found.
+        method, config, find_poses: how poses are found.
         output_dir: the dataset.
         console: prints.
-        find_poses: finds the poses.
         marker_range_nm: range in which the markers' ink is visible.
         accepted: names of checks whose red findings the user accepts.
 
@@ -138,20 +136,14 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
     """The camera of a dataset that was made before with the same camera and turntable, at the angle 0."""
     first = earlier.frames[0]
     k1, k2, p1, p2 = (float(c) for c in earlier.distortion)
+    # The sign of the angles tells the direction, unless both signs occur.
+    forward = {frame.angle_deg > 0.0 for frame in earlier.frames if frame.angle_deg != 0.0}
     return KnownCamera(
         intrinsics=earlier.intrinsics,
         distortion=(k1, k2, p1, p2),
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
-        direction=_direction([frame.angle_deg for frame in earlier.frames]),
+        direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
     )
-
-
-def _direction(angles_deg: Sequence[float]) -> Literal["ccw", "cw"] | None:
-    """Direction of the turn by the sign of the frames' angles; None where both signs occur, or neither."""
-    forth, back = max(angles_deg) > 0.0, min(angles_deg) < 0.0
-    if forth == back:
-        return None
-    return "ccw" if forth else "cw"
 
 
 def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:

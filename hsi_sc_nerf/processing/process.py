@@ -148,7 +148,7 @@ def process_session(
         progress=progress,
     )
     pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
-    num_values = sum(cache.score.size for cache in caches) * len(calibration.bands)
+    num_values = sum(cache.gray.size for cache in caches) * len(calibration.bands)
     console.print(describe_pixel_counts(pixel_counts, num_values), highlight=False)
     poses = pose_frames(
         session,
@@ -273,7 +273,7 @@ def _write_masks(
             above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
             for frame in frames
         ]
-    masks = foreground_masks([c.score for c in caches], [c.brightness for c in caches], config, regions)
+    masks = foreground_masks([cache.bins for cache in caches], config, regions)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
         if not mask.any():

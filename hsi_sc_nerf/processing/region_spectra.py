@@ -47,11 +47,7 @@ def object_spectrum(
 
 
 def border_spectrum(cube_path: Path, mask: Bool[np.ndarray, "lines samples"]) -> Float[np.ndarray, "bands"]:
-    """Median reflectance along the image's border, outside of the object's mask; nan in a band without any value.
-
-    The border is `_BORDER_FRACTION` of the image's shorter side wide, and one pixel at least. Flagged values are
-    left out.
-    """
+    """Median of what is measured on the image's border outside of the mask; nan in a band without any value."""
     lines, samples = mask.shape
     width = max(1, round(_BORDER_FRACTION * min(lines, samples)))
     border = ~mask

@@ -28,9 +28,7 @@ def object_box(
     masks: Bool[np.ndarray, "frames h w"],
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
-    *,
     min_z_m: float | None = None,
-    margin_m: float = OBJECT_MARGIN_M,
 ) -> Float[np.ndarray, "2 3"]:
     """Minimum and maximum of the masks' visual hull, object frame, metres.
 
@@ -42,7 +40,6 @@ def object_box(
         camera_to_worlds: poses, OpenGL axes.
         intrinsics: of the one camera; lens distortion is neglected.
         min_z_m: height of the container's lid, below which the box does not reach; None if unknown.
-        margin_m: the box is widened by this.
 
     Raises:
         InputError: no point projects into the masks: masks and poses do not fit each other.
@@ -73,7 +70,7 @@ def object_box(
                 "at report/masks.png and report/poses.png."
             )
         low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
-    box = np.stack([low - margin_m, high + margin_m])
+    box = np.stack([low - OBJECT_MARGIN_M, high + OBJECT_MARGIN_M])
     if min_z_m is not None:
         box[0, 2] = max(box[0, 2], min_z_m)
     return box
@@ -83,7 +80,6 @@ def scene_box(
     object_box_m: Float[np.ndarray, "2 3"],
     marker_corners_m: dict[int, Float[np.ndarray, "4 3"]],
     container: Container | None,
-    margin_m: float = SCENE_MARGIN_M,
     container_diameter_m: float | None = None,
 ) -> Float[np.ndarray, "2 3"]:
     """Minimum and maximum of everything that turns: object, container, markers and the disc under them.
@@ -98,7 +94,6 @@ def scene_box(
         object_box_m: minimum and maximum of the object's box.
         marker_corners_m: corners of the markers by their id; may be empty.
         container: where its size is known and it stands on z = 0.
-        margin_m: the box is widened by this.
         container_diameter_m: of a container whose height over the disc is not known, where lengths are metres.
     """
     corners = np.concatenate([np.zeros((1, 3)), *marker_corners_m.values()])
@@ -110,8 +105,8 @@ def scene_box(
     ]
     lowest = min(corners[:, 2].min(), object_box_m[0, 2])
     highest = max(corners[:, 2].max(), object_box_m[1, 2], 0.0 if container is None else container.height_m)
-    reach = max(radii) + margin_m
-    return np.array([[-reach, -reach, lowest - margin_m], [reach, reach, highest + margin_m]])
+    reach = max(radii) + SCENE_MARGIN_M
+    return np.array([[-reach, -reach, lowest - SCENE_MARGIN_M], [reach, reach, highest + SCENE_MARGIN_M]])
 
 
 def assumed_disc(has_markers: bool, container_diameter_m: float | None) -> str | None:

@@ -7,21 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map, spectral_metrics, squared_error_map
 from hsi_sc_nerf.files import atomic_write, write_json
-from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN
+from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, INDEX_COLOURS
+from hsi_sc_nerf.plotting.figures import STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.rendering.cubes import RenderedView
+from hsi_sc_nerf.tables import markdown_table
 
-_STYLE: Any = {"font.size": 9, "axes.titlesize": 9, "axes.linewidth": 0.0}
-_PANEL_INCHES = 2.2
+_PANEL_IN = 2.2
 _COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "valid": ("valid pixels, %", lambda fraction: f"{100.0 * fraction:.1f}"),
     "sam": ("SAM, rad", "{:.4f}".format),
@@ -46,9 +44,8 @@ def compare(
     Raises:
         InputError: the picture cannot be written.
     """
-    measured, mask, valid = item["spectral"], item["mask"][..., 0].bool(), item.get("valid")
-    _draw_comparison(folder / f"{name}.png", name, view.spectral, measured, mask, valid, rgb_bands)
-    return spectral_metrics(view.spectral, measured, mask, valid)
+    _draw_comparison(folder / f"{name}.png", view.spectral, item, rgb_bands)
+    return spectral_metrics(view.spectral, item["spectral"], item["mask"][..., 0].bool(), item.get("valid"))
 
 
 def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping[str, str]) -> None:
@@ -63,60 +60,41 @@ def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping
         InputError: the files cannot be written.
     """
     columns = {key: column for key, column in _COLUMNS.items() if key in rows[0]}
-    lines = [
-        "| view | " + " | ".join(title for title, _ in columns.values()) + " |",
-        "| --- |" + " ---: |" * len(columns),
-        *(
-            f"| {row['view']} | " + " | ".join(shown(row[key]) for key, (_, shown) in columns.items()) + " |"
-            for row in rows
-        ),
-    ]
+    cells = [[row["view"], *(shown(row[key]) for key, (_, shown) in columns.items())] for row in rows]
+    parts = [markdown_table(["view", *(title for title, _ in columns.values())], cells)]
     if "sam" in columns:
-        lines += ["", "Metrics compare rendered and measured spectra on the object (masked)."]
-    if legends:
-        lines += ["", *(f"- `{name}`: {legend}" for name, legend in legends.items())]
+        parts.append("Metrics compare rendered and measured spectra on the object (masked).")
+    parts += ["\n".join(f"- `{name}`: {legend}" for name, legend in legends.items())] if legends else []
     write_json(path.with_suffix(".json"), {"views": [dict(row) for row in rows], "videos": dict(legends)})
     with atomic_write(path.with_suffix(".md")) as (temporary,):
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-@rc_context(_STYLE)
+@rc_context(STYLE)
 def _draw_comparison(
-    path: Path,
-    name: str,
-    rendered: Float[Tensor, "h w bands"],
-    measured: Float[Tensor, "h w bands"],
-    mask: Bool[Tensor, "h w"],
-    valid: Bool[Tensor, "h w bands"] | None,
-    rgb_bands: Sequence[int],
+    path: Path, rendered: Float[Tensor, "h w bands"], item: Mapping[str, Any], rgb_bands: Sequence[int]
 ) -> None:
-    """Draw measured and rendered pseudo-RGB, the reflectance error and, on the object, the spectral angle.
+    """Measured and rendered pseudo-RGB, the reflectance error and, on the object, the spectral angle.
 
     Pixels without a valid measurement are grey.
     """
-    error = squared_error_map(rendered, measured, valid).sqrt().numpy()
-    angle = torch.where(mask, spectral_angle_map(rendered, measured, valid), torch.nan).numpy()
-    on_object = mask.numpy()
-    height, width = on_object.shape
-    size = (4 * _PANEL_INCHES + 1.2, _PANEL_INCHES * height / width + 0.6)
-    figure = Figure(figsize=size, dpi=160, layout="constrained")
-    FigureCanvasAgg(figure)
+    measured, mask, valid = item["spectral"], item["mask"][..., 0].bool(), item.get("valid")
+    height, width = mask.shape
+    figure = new_figure(4 * _PANEL_IN + 1.2, _PANEL_IN * height / width + 0.6)
     panels = figure.subplots(1, 4)
-    for axes in panels:
-        axes.set(xticks=[], yticks=[])
-    for axes, title, image in zip(panels, (f"{name}, measured", "rendered"), (measured, rendered), strict=False):
-        axes.imshow(image[..., list(rgb_bands)].clamp(0.0, 1.0).numpy(), interpolation="nearest")
+    for axes, title, spectra in zip(
+        panels, (f"{path.stem}, measured", "rendered"), (measured, rendered), strict=False
+    ):
+        show_image(axes, spectra[..., list(rgb_bands)].numpy())
         axes.set_title(title)
+    error = squared_error_map(rendered, measured, valid).sqrt()
+    angle = torch.where(mask, spectral_angle_map(rendered, measured, valid), torch.nan)
     for axes, title, values, colours, (low, high), unit in (
-        (panels[2], "reflectance error", error, "viridis", ERROR_DRAWN, ""),
+        (panels[2], "reflectance error", error, INDEX_COLOURS, ERROR_DRAWN, ""),
         (panels[3], "spectral angle", angle, ANGLE_COLOURS, ANGLE_DRAWN_RAD, " rad"),
     ):
         colour_map = matplotlib.colormaps[colours].with_extremes(bad="0.85")
-        shown = axes.imshow(values, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
-        axes.set_title(title)
-        known = values[on_object & np.isfinite(values)]
-        if len(known):
-            axes.set_xlabel(f"mean on the object {known.mean():.4f}{unit}")
+        shown = show_image(axes, values.numpy(), cmap=colour_map, vmin=low, vmax=high)
+        axes.set(title=title, xlabel=f"mean on the object {float(values[mask].nanmean()):.4f}{unit}")
         figure.colorbar(shown, ax=axes, extend="max", fraction=0.05, pad=0.02)
-    with atomic_write(path) as (temporary,):
-        figure.savefig(temporary)
+    save_figure(figure, path)

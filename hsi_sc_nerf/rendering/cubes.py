@@ -40,11 +40,7 @@ class RenderedView:
 
 
 def render_view(model: SpectralModel, camera: Cameras) -> RenderedView:
-    """Render one camera in evaluation mode; the result is on the CPU.
-
-    Args:
-        model: trained model, in evaluation mode.
-        camera: one camera, scene units.
+    """Render one camera (scene units) of a model in evaluation mode; the result is on the CPU.
 
     Example:
         >>> run = open_run(Path("config.yml"))
@@ -59,13 +55,6 @@ def write_view(folder: Path, name: str, view: RenderedView, dataset: PackedDatas
 
     A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header says. Each pair of files appears whole or
     not at all.
-
-    Args:
-        folder: folder of the files.
-        name: of the view.
-        view: the rendered view.
-        dataset: gives the bands.
-        kind: type of the numbers.
 
     Raises:
         InputError: the files cannot be written.

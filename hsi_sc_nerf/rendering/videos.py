@@ -42,15 +42,10 @@ class FalseColour:
 def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> FalseColour:
     """The composite or index of a name, in upper or lower case.
 
-    Args:
-        name: such as CIR or NDVI.
-        wavelengths_nm: band centres of the views.
-
     Raises:
         InputError: there is no such composite or index, or no band is near a wavelength that it needs.
 
     Example:
-        >>> run = open_run(Path("config.yml"))
         >>> ndvi = find_false_colour("NDVI", run.dataset.wavelengths_nm)
         >>> picture = ndvi.colours(render_view(run.model, run.manager.eval_dataset.cameras[:1]))
     """

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 from nerfstudio.cameras.camera_paths import get_path_from_json
 from nerfstudio.cameras.cameras import Cameras
 
-from hsi_sc_nerf.data.cameras import pinhole_cameras
 from hsi_sc_nerf.data.datamanager import SpectralDataset
+from hsi_sc_nerf.data.dataparser import pinhole_cameras
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -36,9 +35,6 @@ class Views:
     names: Sequence[str]
     measured: SpectralDataset | None = None
 
-    def __len__(self) -> int:
-        return len(self.names)
-
     def __iter__(self) -> Iterator[tuple[str, Cameras]]:
         return ((name, self.cameras[i : i + 1]) for i, name in enumerate(self.names))
 
@@ -56,26 +52,19 @@ def views_of_frames(run: TrainedRun, split: Literal["held-out", "training"]) -> 
     return Views(split, dataset.cameras, [frame.capture for frame in dataset.frames], dataset)
 
 
-def orbit_poses(first_camera_to_world: Float[np.ndarray, "4 4"], count: int) -> Float[np.ndarray, "count 4 4"]:
-    """Poses of a fixed camera before an object that makes one even counter-clockwise turn, from the first pose on."""
-    angles_deg = np.arange(count) * 360.0 / count
-    return np.stack([turntable_camera_to_world(first_camera_to_world, float(angle)) for angle in angles_deg])
-
-
 def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
-    """The session's camera while the object makes one even turn before the fixed background.
+    """The session's camera while the object makes one even counter-clockwise turn before the fixed background.
 
     Args:
         run: the trained run.
         count: views in the turn.
         size: factor on the size of the camera's images.
     """
-    poses = orbit_poses(run.refined_poses_m()[0], count)
+    first = run.refined_poses_m()[0]
+    poses = np.stack([turntable_camera_to_world(first, angle) for angle in np.arange(count) * 360.0 / count])
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
-    dataset = run.dataset
-    cameras = pinhole_cameras(poses, dataset.intrinsics, dataset.distortion)
-    if size != 1.0:
-        cameras.rescale_output_resolution(size)
+    cameras = pinhole_cameras(poses, run.dataset.intrinsics, run.dataset.distortion)
+    cameras.rescale_output_resolution(size)
     return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,12 +16,11 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section, read_json
-from hsi_sc_nerf.report.held_out_views import HeldOutView
-from hsi_sc_nerf.report.page import CloudViewer, KeyFigure, Section, html_page
+from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
+from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
 from hsi_sc_nerf.report.result_sections import comparison_key_figure, comparison_section, traits_section
 from hsi_sc_nerf.report.run_sections import (
     flat_settings,
-    package_versions,
     read_scalars,
     settings_section,
     stage_ends,
@@ -70,22 +69,23 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     """
     if (sources.views is not None and sources.views < 1) or sources.points < 1:
         raise InputError("--views and --points must be at least 1.")
+    # Before the slow rendering, so that unusable files are refused at once.
     comparison_path = _given_or_beside(sources.comparison, folder / "comparison.json", "hsi-sc-nerf compare")
     traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
-    comparison, traits = (read_json(path) if path else None for path in (comparison_path, traits_path))
-    # Before the slow rendering, so that unusable files are refused at once.
+    comparison, traits = read_json(comparison_path), read_json(traits_path)
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
 
-    run = _opened(folder)
-    held_out = len(run.manager.eval_dataset)
+    from hsi_sc_nerf.models.trained_run import open_run
+
+    run = open_run(folder / "config.yml")
     cloud = _cloud(run, folder, sources)
-    views = _rendered(run, min(held_out, sources.views or held_out))
-    scores, dataset = [view.scores for view in views], run.dataset
+    views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset
+    scores = [view.scores for view in views]
     sections = [
         object_section(cloud, sources.points),
         views_section(views, held_out),
         bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
-        spectra_section(views[len(views) // 2], dataset.wavelengths_nm, dataset.uncertainty),
+        spectra_section(views[len(views) // 2], dataset.wavelengths_nm),
         *results,
         training_section(read_scalars(folder), stage_ends(folder)),
         calibration_section(dataset),
@@ -93,12 +93,11 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         poses_section(dataset),
         _settings(folder),
     ]
-    key_figures = [*metric_key_figures(scores), *_data_key_figures(dataset)]
+    key_figures = metric_key_figures(scores) | _reprojection_error(dataset)
     if comparison is not None:
-        key_figures.append(comparison_key_figure(comparison))
-    page = html_page(
-        f"{dataset.object_name}: hyperspectral 3D reconstruction", _subtitle(dataset), key_figures, sections
-    )
+        key_figures |= comparison_key_figure(comparison)
+    title = f"{dataset.object_name}: hyperspectral 3D reconstruction"
+    page = html_page(title, _subtitle(dataset), key_figures, sections)
     with atomic_write(output) as (temporary,):
         temporary.write_text(page, encoding="utf-8")
 
@@ -114,34 +113,28 @@ def object_section(cloud: SpectralCloud, points: int) -> Section:
     return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)])
 
 
-def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path | None:
-    """The given file, or the one in the run's folder if it exists."""
-    if given is None:
-        return beside if beside.is_file() else None
-    if not given.is_file():
+def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path:
+    """The given file, or else the one in the run's folder, which need not exist."""
+    if given is not None and not given.is_file():
         raise InputError(f"{given}: there is no such file; make it with `{command}`.")
-    return given
-
-
-def _opened(folder: Path) -> TrainedRun:
-    from hsi_sc_nerf.models.trained_run import open_run
-
-    return open_run(folder / "config.yml")
+    return given or beside
 
 
 def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralCloud:
-    from hsi_sc_nerf.report.held_out_views import sample_cloud
-
     path = sources.cloud or folder / "point_cloud.ply"
     if sources.cloud is not None or path.is_file():
         return read_spectral_ply(path)
-    return sample_cloud(run, sources.points)
+    from hsi_sc_nerf.export.options import CloudOptions
+    from hsi_sc_nerf.export.spectral_export import export_cloud
+
+    with tempfile.TemporaryDirectory() as temporary:
+        return read_spectral_ply(export_cloud(run, Path(temporary), CloudOptions(num_points=sources.points)))
 
 
-def _rendered(run: TrainedRun, count: int) -> Sequence[HeldOutView]:
-    """Held-out views, with a progress bar."""
-    from hsi_sc_nerf.report.held_out_views import render_held_out
-
+def _rendered(run: TrainedRun, count: int | None) -> list[HeldOutView]:
+    """``count`` held-out views (all without it), with a progress bar."""
+    held_out = len(run.manager.eval_dataset)
+    count = min(held_out, count or held_out)
     views: list[HeldOutView] = []
     with progress_bar("rendering", "held-out views", count) as done:
         for view in render_held_out(run, count):
@@ -157,11 +150,9 @@ def _subtitle(dataset: PackedDataset) -> str:
     )
 
 
-def _data_key_figures(dataset: PackedDataset) -> list[KeyFigure]:
+def _reprojection_error(dataset: PackedDataset) -> dict[str, str]:
     errors = [e for frame in dataset.frames if (e := frame.reprojection_error_px) is not None]
-    if not errors:
-        return []
-    return [KeyFigure(f"{np.sqrt(np.mean(np.square(errors))):.3f} px", "reprojection error")]
+    return {"reprojection error": f"{np.sqrt(np.mean(np.square(errors))):.3f} px"} if errors else {}
 
 
 def _settings(folder: Path) -> Section:
@@ -174,4 +165,4 @@ def _settings(folder: Path) -> Section:
     # A run may have a name of its own (--method-name); then every setting is shown.
     method = all_methods.get(config.method_name)
     defaults = {} if method is None else flat_settings(method)
-    return settings_section(flat_settings(config), defaults, describe_machine() | package_versions())
+    return settings_section(flat_settings(config), defaults, describe_machine())

@@ -57,8 +57,6 @@ class Curve:
         y: values; NaN leaves a gap.
         spread: half the height of a band around the line; None for none.
         dashed: draw it dashed.
-        colour: number of its colour; None: its position among the curves.
-        thin: draw it thin and faint.
     """
 
     name: str
@@ -66,8 +64,6 @@ class Curve:
     y: Float[np.ndarray, "n"]
     spread: Float[np.ndarray, "n"] | None = None
     dashed: bool = False
-    colour: int | None = None
-    thin: bool = False
 
 
 def line_chart(
@@ -110,7 +106,7 @@ def line_chart(
             axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(low, high)
         for index, curve in enumerate(curves):
-            colour = _SERIES[(index if curve.colour is None else curve.colour) % len(_SERIES)]
+            colour = _SERIES[index % len(_SERIES)]
             if curve.spread is not None:
                 lower, upper = (np.maximum(curve.y + side * curve.spread, low) for side in (-1.0, 1.0))
                 band = axes.fill_between(curve.x, lower, upper)
@@ -121,48 +117,17 @@ def line_chart(
                 curve.x,
                 np.maximum(curve.y, low),
                 color=colour,
-                linewidth=0.6 if curve.thin else 1.3,
+                linewidth=1.3,
                 linestyle="--" if curve.dashed else "-",
                 label=curve.name or None,
                 gid="line",
             )
         if named:
             figure.legend(loc="outside upper left", ncols=columns, fontsize=9)
-        _finish(axes, x_label, y_label, marks or {})
-        axes.margins(x=0.0)
-        return _inline_svg(figure, alt)
-
-
-def bar_chart(
-    edges: Float[np.ndarray, "n_and_1"],
-    heights: Float[np.ndarray, "n"],
-    *,
-    x_label: str,
-    y_label: str,
-    alt: str,
-    marks: Mapping[str, float] | None = None,
-) -> Markup:
-    """Bars from 0 upwards between neighbouring edges, such as a histogram, as an ``svg`` element.
-
-    Args:
-        edges: ascending.
-        heights: not negative; a bar of NaN is left out.
-        x_label: with its unit.
-        y_label: with its unit.
-        alt: description for readers who do not see the chart.
-        marks: vertical lines by name.
-    """
-    with rc_context(_STYLE):
-        figure = new_figure(_WIDTH_IN, _HEIGHT_IN)
-        axes = figure.subplots()
-        shown = np.isfinite(heights)
-        widths = 0.9 * np.diff(edges)[shown]
-        centres = (edges[:-1] + edges[1:])[shown] / 2.0
-        for bar in axes.bar(centres, heights[shown], widths, color=_SERIES[0]):
-            bar.set_gid("bar")
-        axes.set(xlim=(edges[0], edges[-1]), ylim=_value_range(heights, True, False))
+        axes.set(xlabel=x_label, ylabel=y_label)
         axes.grid(axis="x", visible=False)
-        _finish(axes, x_label, y_label, marks or {})
+        _draw_marks(axes, marks or {})
+        axes.margins(x=0.0)
         return _inline_svg(figure, alt)
 
 
@@ -180,25 +145,16 @@ def _value_range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: b
     return (low if from_zero and low == 0.0 else low - margin), high + margin
 
 
-def _finish(axes: Axes, x_label: str, y_label: str, marks: Mapping[str, float]) -> None:
-    """Labels, and the named vertical lines that lie within the axis."""
-    axes.set(xlabel=x_label, ylabel=y_label)
-    axes.grid(axis="x", visible=False)
+def _draw_marks(axes: Axes, marks: Mapping[str, float]) -> None:
+    """The named vertical lines that lie within the axis."""
     low, high = axes.get_xlim()
     for row, (name, value) in enumerate(marks.items()):
-        if not low <= value <= high:
-            continue
-        axes.axvline(value, color=_FAINT, linewidth=0.8, linestyle=(0.0, (3.0, 3.0)))
-        right = value > (low + high) / 2.0
-        axes.annotate(
-            name,
-            (value, 1.0),
-            (-3 if right else 3, -9 - 10 * row),
-            xycoords=axes.get_xaxis_transform(),
-            textcoords="offset points",
-            ha="right" if right else "left",
-            color=_FAINT,
-        )
+        if low <= value <= high:
+            axes.axvline(value, color=_FAINT, linewidth=0.8, linestyle=(0.0, (3.0, 3.0)))
+            side = "right" if value > (low + high) / 2.0 else "left"
+            offset_pt = (3 if side == "left" else -3, -9 - 10 * row)
+            top = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
+            axes.annotate(name, (value, 1.0), offset_pt, ha=side, color=_FAINT, **top)
 
 
 def _inline_svg(figure: Figure, alt: str) -> Markup:
@@ -211,7 +167,7 @@ def _inline_svg(figure: Figure, alt: str) -> Markup:
             if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}defs"):
                 parent.remove(child)
         identifier = parent.attrib.pop("id", None)
-        if identifier in ("line", "band", "bar"):
+        if identifier in ("line", "band"):
             parent.set("class", identifier)
         # Nothing is drawn beyond the axes, and identifiers would have to be unique on the page.
         parent.attrib.pop("clip-path", None)

@@ -14,9 +14,8 @@ from matplotlib import colormaps
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
 from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
-from hsi_sc_nerf.spectra.bands import covered
-from hsi_sc_nerf.spectra.composites import COMPOSITES
-from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.spectra.composites import available_composites
+from hsi_sc_nerf.spectra.indices import available_indices, index_values
 
 _INT16 = 32767
 _MISSING = 65535
@@ -46,15 +45,10 @@ class CompressedSpectra:
     largest_error: float
 
 
-def compress_spectra(
-    spectra: Float[np.ndarray, "n bands"], tolerance: float = TOLERANCE, max_rank: int = MAX_RANK
-) -> CompressedSpectra:
-    """Principal components, as many as every band's root mean square error needs to fall below ``tolerance``.
+def compress_spectra(spectra: Float[np.ndarray, "n bands"], max_rank: int = MAX_RANK) -> CompressedSpectra:
+    """Principal components of finite reflectance.
 
-    Args:
-        spectra: reflectance, finite.
-        tolerance: reflectance.
-        max_rank: largest number of components.
+    As many, up to ``max_rank``, as every band's root mean square error needs to fall below `TOLERANCE`.
     """
     mean = spectra.mean(axis=0, dtype=float)
     centred = spectra - mean
@@ -62,16 +56,14 @@ def compress_spectra(
     variances, basis = np.maximum(variances[::-1], 0.0), vectors[:, ::-1].T
     # Variance of each band that the components from each on hold together.
     held = np.cumsum((variances[:, None] * basis**2)[::-1], axis=0)[::-1]
-    good = np.flatnonzero(np.append(held, np.zeros((1, held.shape[1])), axis=0).max(axis=1) <= tolerance**2)
+    good = np.flatnonzero(np.append(held, np.zeros((1, held.shape[1])), axis=0).max(axis=1) <= TOLERANCE**2)
     rank = int(np.clip(good[0], 1, max_rank))
     basis = basis[:rank]
     coefficients = centred @ basis.T
     scale = np.maximum(np.abs(coefficients).max(axis=0), np.finfo(np.float32).tiny) / _INT16
     counts = np.rint(coefficients / scale).astype(np.int16)
     lost = (counts * scale) @ basis - centred
-    return CompressedSpectra(
-        mean, basis, scale, counts, float(np.sqrt(np.mean(lost**2))), float(np.abs(lost).max(initial=0.0))
-    )
+    return CompressedSpectra(mean, basis, scale, counts, float(np.sqrt(np.mean(lost**2))), float(np.abs(lost).max()))
 
 
 def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], float, float]:
@@ -82,7 +74,7 @@ def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], f
     return np.where(finite, np.rint(fractions * (_MISSING - 1)), _MISSING).astype(np.uint16), low, high
 
 
-def thinned(cloud: SpectralCloud, max_points: int, seed: int = 0) -> SpectralCloud:
+def thinned(cloud: SpectralCloud, max_points: int) -> SpectralCloud:
     """A random subset of at most ``max_points`` of the points with a complete spectrum.
 
     Raises:
@@ -92,15 +84,8 @@ def thinned(cloud: SpectralCloud, max_points: int, seed: int = 0) -> SpectralClo
     if not len(whole):
         raise InputError("the cloud has no point with a spectrum; export it again from the run.")
     if len(whole) > max_points:
-        whole = np.sort(np.random.default_rng(seed).choice(whole, max_points, replace=False))
-    return SpectralCloud(
-        cloud.points[whole],
-        cloud.normals[whole],
-        cloud.colours[whole],
-        cloud.spectra[whole],
-        cloud.wavelengths_nm,
-        {name: values[whole] for name, values in cloud.extra.items()},
-    )
+        whole = np.sort(np.random.default_rng(0).choice(whole, max_points, replace=False))
+    return cloud.select(whole)
 
 
 def _base64(array: np.ndarray) -> str:
@@ -111,13 +96,8 @@ def _base64(array: np.ndarray) -> str:
 def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequence[float] | None) -> dict[str, Any]:
     """A number of each point; ``drawn`` is what the ends of the colour map stand for, all of them without it."""
     counts, low, high = quantise(values)
-    return {
-        "name": name,
-        "tells": tells,
-        "data": _base64(counts),
-        "range": [low, high],
-        "drawn": drawn or [low, high],
-    }
+    ends = [low, high]
+    return {"name": name, "tells": tells, "data": _base64(counts), "range": ends, "drawn": drawn or ends}
 
 
 def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str, Any]:
@@ -138,8 +118,7 @@ def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str,
             index_values(index, cloud.spectra, cloud.wavelengths_nm),
             index.drawn_range,
         )
-        for index in INDICES.values()
-        if covered(cloud.wavelengths_nm, index.wavelengths_nm).all()
+        for index in available_indices(cloud.wavelengths_nm)
     ]
     scalars += [_scalar(name, "column of the cloud", values, None) for name, values in cloud.extra.items()]
     return {
@@ -155,8 +134,7 @@ def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str,
         "coefficients": _base64(spectra.coefficients),
         "composites": [
             {"name": c.name, "tells": c.shows, "nm": list(c.wavelengths_nm)}
-            for c in COMPOSITES.values()
-            if covered(cloud.wavelengths_nm, c.wavelengths_nm).all()
+            for c in available_composites(cloud.wavelengths_nm)
         ],
         "scalars": scalars,
         "colour_map": _base64(np.rint(255.0 * colormaps[INDEX_COLOURS](np.arange(256))[:, :3]).astype(np.uint8)),

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, Warnings, embedded_file
+from hsi_sc_nerf.report.charts import Curve, line_chart
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
 _DIRECTIONS = {"ccw": "counter-clockwise", "cw": "clockwise"}
@@ -44,26 +45,23 @@ def read_json(path: Path) -> dict[str, Any] | None:
     return content
 
 
-def _picture(dataset: PackedDataset, name: str, alt: str) -> list[Markup]:
+def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
+    """A picture of the dataset's ``report/``, which a click opens; nothing where it is missing."""
     path = dataset.root / "report" / name
-    return [embedded_file(path, alt)] if path.is_file() else []
+    return [Folded(summary, [Figure([embedded_file(path, summary)], f"{summary}.")])] if path.is_file() else []
 
 
 def calibration_section(dataset: PackedDataset) -> Section:
     """Calibration from counts to reflectance, and the uncertainty of reflectance."""
     found = read_json(dataset.root / "calibration.json")
-    blocks: list[Block] = []
     if found is None:
-        blocks.append(
-            Missing("The dataset has no calibration.json, so nothing is known of its calibration.", _PROCESS)
-        )
+        missing = Missing("The dataset has no calibration.json, so nothing is known of its calibration.", _PROCESS)
+        blocks: list[Block] = [missing]
     else:
-        blocks.append(_calibration_table(dataset, found))
-        blocks += _flagged_values(dataset, found)
+        blocks = [_calibration_table(dataset, found), *_flagged_values(dataset, found)]
     if dataset.typical_uncertainty is not None:
-        curve = Curve("", dataset.wavelengths_nm, dataset.typical_uncertainty)
         chart = line_chart(
-            [curve],
+            [Curve("", dataset.wavelengths_nm, dataset.typical_uncertainty)],
             x_label="wavelength (nm)",
             y_label="SD of reflectance",
             alt="Uncertainty of a pixel's reflectance by wavelength",
@@ -76,33 +74,26 @@ def calibration_section(dataset: PackedDataset) -> Section:
         ("lamp_drift.png", "Drift of the lamps"),
         ("uncertainty.png", "Uncertainty by reflectance and band"),
     ):
-        pictures = _picture(dataset, name, summary)
-        if pictures:
-            blocks.append(Folded(summary, [Figure(pictures, f"{summary}, as drawn when the session was processed.")]))
+        blocks += _folded_picture(dataset, name, summary)
     return Section("calibration", "Calibration", blocks)
 
 
 def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Table:
-    white, noise, drift = found.get("white"), found.get("noise"), found.get("lamp_drift") or {}
+    nm, white, noise = dataset.wavelengths_nm, found.get("white"), found.get("noise")
     source = {"tarp": "the tarp's own capture", "capture": "the WHITEREF cube of each capture"}
+    fraction = dataset.flagged_values / _values(dataset)
     rows = [
-        (
-            "bands",
-            f"{len(dataset.wavelengths_nm)}, {dataset.wavelengths_nm.min():.1f} to "
-            f"{dataset.wavelengths_nm.max():.1f} nm",
-        ),
+        ("bands", f"{len(nm)}, {nm.min():.1f} to {nm.max():.1f} nm"),
         ("excluded bands", f"{len(dataset.bad_bands_nm)}"),
         ("white reference", source.get(str(found.get("white_source")), str(found.get("white_source")))),
+        *([("pixels of the white", f"{white['pixels']}")] if white else []),
+        ("dead detector elements", f"{found.get('dead_elements', 0)}"),
+        ("values that are no measurement", f"{dataset.flagged_values} ({100.0 * fraction:.3f} %)"),
     ]
-    if white:
-        rows.append(("pixels of the white", f"{white['pixels']}"))
-    rows.append(("dead detector elements", f"{found.get('dead_elements', 0)}"))
-    fraction = dataset.flagged_values / _values(dataset)
-    rows.append(("values that are no measurement", f"{dataset.flagged_values} ({100.0 * fraction:.3f} %)"))
     if noise:
         rows.append(("read noise, median over bands", f"{np.median(noise['read_noise_counts']):.2f} counts"))
         rows.append(("counts per photo-electron", f"{noise['counts_per_electron']:.3f}"))
-    rows.append(("drift of the lamps", _drift_text(drift)))
+    rows.append(("drift of the lamps", _drift_text(found.get("lamp_drift") or {})))
     return Table("Calibration from counts to reflectance.", ("", "found"), rows)
 
 
@@ -134,7 +125,7 @@ def _flagged_values(dataset: PackedDataset, found: Mapping[str, Any]) -> list[Fi
         curves,
         x_label="wavelength (nm)",
         y_label="fraction of values (%)",
-        alt="Share of values that were clipped or flagged, by wavelength",
+        alt="Fraction of values that were clipped or flagged, by wavelength",
         from_zero=True,
     )
     return [Figure([chart], "Values of all frames that were clipped or are no measurement, per cent of each band.")]
@@ -151,23 +142,12 @@ def masks_section(dataset: PackedDataset) -> Section:
         ("smallest", f"{areas_px.min()} ({dataset.frames[int(areas_px.argmin())].capture})"),
         ("largest", f"{areas_px.max()} ({dataset.frames[int(areas_px.argmax())].capture})"),
     ]
-    chart = bar_chart(
-        np.arange(len(areas_px) + 1.0) - 0.5,
-        areas_px.astype(float),
-        x_label="frame",
-        y_label="pixels",
-        alt="Size of the object's mask by frame",
-    )
+    chart = _by_frame(areas_px, "pixels", "Size of the object's mask by frame")
     blocks: list[Block] = [
         Table("The object's masks.", ("", "found"), rows),
         Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
+        *_folded_picture(dataset, "masks.png", "All frames in pseudo-RGB with the outline of the mask in magenta"),
     ]
-    pictures = _picture(dataset, "masks.png", "Contact sheet of all frames with the outlines of their masks")
-    if pictures:
-        caption = "All frames in pseudo-RGB with the outline of the mask in magenta."
-        blocks.append(Folded("All masks", [Figure(pictures, caption)]))
-    else:
-        blocks.append(Missing("There is no picture of the masks.", _PROCESS))
     return Section("masks", "Masks", blocks)
 
 
@@ -178,41 +158,24 @@ def poses_section(dataset: PackedDataset) -> Section:
         missing = Missing("The dataset has no poses.json, so nothing is known of how its poses were found.", _PROCESS)
         return Section("poses", "Poses", [missing])
     blocks: list[Block] = [Table("The turntable and the camera.", ("", "found"), _pose_rows(found))]
-    if found.get("warnings"):
-        blocks.insert(0, Warnings(found["warnings"]))
     errors = np.array([np.nan if (e := f.reprojection_error_px) is None else e for f in dataset.frames])
     if np.isfinite(errors).any():
-        chart = bar_chart(
-            np.arange(len(errors) + 1.0) - 0.5,
-            errors,
-            x_label="frame",
-            y_label="reprojection error (px)",
-            alt="Root mean square reprojection error by frame",
-        )
+        chart = _by_frame(errors, "reprojection error (px)", "Root mean square reprojection error by frame")
         blocks.append(Figure([chart], "Root mean square reprojection error of the markers or features, pixels."))
-    angles = np.array([frame.angle_deg for frame in dataset.frames])
-    if len(angles) > 1:
-        nominal = (found.get("steps_deg") or {}).get("nominal")
-        numbers = np.arange(1.0, len(angles))
-        curves = [Curve("found", numbers, np.diff(angles))]
-        if nominal is not None:
-            size = np.copysign(float(nominal), np.median(np.diff(angles)))
-            curves.append(Curve("nominal", numbers, np.full(len(numbers), size), dashed=True))
-        chart = line_chart(
-            curves,
-            x_label="frame",
-            y_label="step (degrees)",
-            alt="Turn of the table from each frame to the next",
-        )
-        blocks.append(
-            Figure([chart], "Turn of the table since the frame before, degrees, positive counter-clockwise.")
-        )
-    pictures = _picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
-    if pictures:
-        blocks.append(
-            Folded("Cameras in the object frame", [Figure(pictures, "As drawn when the poses were found.")])
-        )
-    return Section("poses", "Poses", blocks)
+    steps_deg = np.diff([frame.angle_deg for frame in dataset.frames])
+    if len(steps_deg):
+        chart = _by_frame(np.append(np.nan, steps_deg), "step (degrees)", "Turn of the table since the frame before")
+        caption = "Turn of the table since the frame before, degrees, positive counter-clockwise."
+        blocks.append(Figure([chart], caption))
+    blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
+    warnings = [Finding("poses", "amber", sentence) for sentence in found.get("warnings", ())]
+    return Section("poses", "Poses", blocks, warnings)
+
+
+def _by_frame(values: Float[np.ndarray, "frames"], y_label: str, alt: str) -> Markup:
+    """A chart of a number of each frame, which are counted from 0; NaN is a gap."""
+    curve = Curve("", np.arange(len(values), dtype=float), values.astype(float))
+    return line_chart([curve], x_label="frame", y_label=y_label, alt=alt, from_zero=np.nanmin(values) >= 0.0)
 
 
 def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,11 +1,9 @@
-"""Held-out views of a run: rendered, scored, and with the spectra of a few places."""
+"""Held-out views of a run: rendered, scored, and with the spectra around a few points."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -21,16 +19,15 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_metrics,
     squared_error_map,
 )
-from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.packed.pixels import spread_over
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
 
-PLACES = 4
-# Radius of a place, as a fraction of a view's width: 8 pixels of the SPECIM IQ's 512.
-_PLACE_RADIUS = 1.0 / 64.0
+POINTS = 4
+# Radius of the circle around a point, as a fraction of a view's width: 8 pixels of the SPECIM IQ's 512.
+_POINT_RADIUS = 1.0 / 64.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +38,13 @@ class HeldOutView:
         scores: of the view.
         measured_rgb: pseudo-RGB.
         rendered_rgb: likewise.
-        places: spectra of some places of the object.
+        points: spectra around some points of the object.
     """
 
     scores: ViewScores
     measured_rgb: UInt8[np.ndarray, "h w 3"]
     rendered_rgb: UInt8[np.ndarray, "h w 3"]
-    places: list[PlaceSpectra]
+    points: list[PointSpectra]
 
 
 def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
@@ -61,34 +58,20 @@ def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
         with torch.no_grad():
             rendered = model.get_outputs_for_camera(camera)["spectral"].cpu()
         measured, mask = batch["spectral"].cpu(), batch["mask"].cpu()[..., 0].bool()
-        valid = batch["valid"].cpu() if "valid" in batch else None
-        radius_px = max(1.0, mask.shape[1] * _PLACE_RADIUS)
+        valid = batch["valid"].cpu() if "valid" in batch else torch.ones_like(measured, dtype=torch.bool)
+        radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
         yield HeldOutView(
             score_view(frames[index].capture, rendered, measured, mask, valid),
             to_8_bit(measured[..., model.rgb_bands].numpy()),
             to_8_bit(rendered[..., model.rgb_bands].numpy()),
-            place_spectra(
-                measured.numpy(),
+            point_spectra(
+                measured.masked_fill(~valid, torch.nan).numpy(),
                 rendered.numpy(),
                 mask.numpy(),
-                inner_places(mask.numpy(), PLACES, round(2.0 * radius_px)),
+                inner_points(mask.numpy(), POINTS, round(2.0 * radius_px)),
                 radius_px,
-                None if valid is None else valid.numpy(),
             ),
         )
-
-
-def sample_cloud(run: TrainedRun, points: int) -> SpectralCloud:
-    """Points of the object's surface with their spectra, in metres and the object frame.
-
-    Raises:
-        InputError: the model holds no object.
-    """
-    from hsi_sc_nerf.export.options import CloudOptions
-    from hsi_sc_nerf.export.spectral_export import export_cloud
-
-    with tempfile.TemporaryDirectory() as folder:
-        return read_spectral_ply(export_cloud(run, Path(folder), CloudOptions(num_points=points)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,41 +104,37 @@ def score_view(
     rendered: Float[Tensor, "h w bands"],
     measured: Float[Tensor, "h w bands"],
     mask: Bool[Tensor, "h w"],
-    valid: Bool[Tensor, "h w bands"] | None = None,
+    valid: Bool[Tensor, "h w bands"],
 ) -> ViewScores:
     """Scores of a view, with the paper's metrics (section "Evaluation Metrics")."""
-    mse = per_band_mse(rendered, measured, mask, valid).cpu().numpy()
-    if valid is not None:
-        mse = np.where(valid[mask].any(0).cpu().numpy(), mse, np.nan)
-    metrics = spectral_metrics(rendered, measured, mask, valid)
-    metrics |= {f"full_{k}": v for k, v in spectral_metrics(rendered, measured, None, valid).items()}
-    ssim = per_band_ssim(rendered, measured, mask, valid).double().cpu().numpy()
+    known = valid[mask].any(0).cpu().numpy()
+    mse = np.where(known, per_band_mse(rendered, measured, mask, valid).cpu().numpy(), np.nan)
+    whole_frame = spectral_metrics(rendered, measured, None, valid)
     return ViewScores(
         name,
-        metrics,
+        spectral_metrics(rendered, measured, mask, valid) | {f"full_{key}": v for key, v in whole_frame.items()},
         rmse=np.sqrt(mse),
         psnr_db=-10.0 * np.log10(mse + PSNR_DELTA),
-        ssim=np.where(np.isnan(mse), np.nan, ssim),
+        ssim=np.where(known, per_band_ssim(rendered, measured, mask, valid).double().cpu().numpy(), np.nan),
         angle_rad=spectral_angle_map(rendered, measured, valid).cpu().numpy(),
         error=squared_error_map(rendered, measured, valid).sqrt().cpu().numpy(),
         mask=mask.cpu().numpy(),
     )
 
 
-def over_views(
-    curves: Sequence[Float[np.ndarray, "bands"]],
+def mean_and_sd(
+    values: Float[np.ndarray, "n bands"],
 ) -> tuple[Float[np.ndarray, "bands"], Float[np.ndarray, "bands"]]:
-    """Mean and standard deviation of each band over the views that measured it; NaN where none did.
+    """Mean and standard deviation of a sample (one degree of freedom less) over the first axis, without NaN.
 
-    The deviation is that of a sample (one degree of freedom less), 0 for a single view.
+    The deviation of a single value is 0; both are NaN where there is none.
     """
-    stacked = np.stack(curves)
-    counted = np.isfinite(stacked)
-    views = counted.sum(axis=0)
+    counted = np.isfinite(values)
+    count = counted.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(counted, stacked, 0.0).sum(axis=0) / views
-        squares = np.where(counted, (stacked - mean) ** 2, 0.0).sum(axis=0)
-    return mean, np.sqrt(squares / np.maximum(views - 1, 1)) + 0.0 * mean
+        mean = np.where(counted, values, 0.0).sum(axis=0) / count
+        squares = np.where(counted, (values - mean) ** 2, 0.0).sum(axis=0)
+    return mean, np.sqrt(squares / np.maximum(count - 1, 1)) + 0.0 * mean
 
 
 def object_angles(views: Sequence[ViewScores]) -> Float[np.ndarray, "n"]:
@@ -171,15 +150,15 @@ def spread_of_views(count: int, number: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceSpectra:
-    """Spectra of the object's pixels within a circle.
+class PointSpectra:
+    """Spectra of the object's pixels within a circle around a point of a view.
 
     Attributes:
         line: of its centre.
         sample: of its centre.
-        pixels: how many pixels of the object lie in it.
+        pixels: how many pixels of the object lie in the circle.
         measured: mean reflectance a band; NaN where a band was measured in none of the pixels.
-        measured_sd: standard deviation over the pixels (one degree of freedom less), noise and texture together.
+        measured_sd: standard deviation over the pixels, noise and texture together.
         rendered: mean reflectance of the same values in the rendering.
     """
 
@@ -191,33 +170,28 @@ class PlaceSpectra:
     rendered: Float[np.ndarray, "bands"]
 
 
-def inner_places(mask: Bool[np.ndarray, "h w"], count: int, margin_px: int) -> list[tuple[int, int]]:
-    """(line, sample) of places spread over the mask, ``margin_px`` inside its edge where it is wide enough."""
+def inner_points(mask: Bool[np.ndarray, "h w"], count: int, margin_px: int) -> list[tuple[int, int]]:
+    """(line, sample) of points spread over the mask, ``margin_px`` inside its edge where it is wide enough."""
     padded = np.pad(mask.astype(np.uint8), 1)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     inside = mask & (depth >= min(margin_px, 0.8 * float(depth.max())))
     return [(line, sample) for _, line, sample in spread_over(inside[None], count).tolist()]
 
 
-def place_spectra(
+def point_spectra(
     measured: Float[np.ndarray, "h w bands"],
     rendered: Float[np.ndarray, "h w bands"],
     mask: Bool[np.ndarray, "h w"],
-    places: Sequence[tuple[int, int]],
+    points: Sequence[tuple[int, int]],
     radius_px: float,
-    valid: Bool[np.ndarray, "h w bands"] | None = None,
-) -> list[PlaceSpectra]:
-    """Spectra of the object's pixels within a circle around each place; invalid values are ignored."""
+) -> list[PointSpectra]:
+    """Spectra of the object's pixels within a circle around each point; values that are NaN in ``measured`` are
+    ignored in both."""
     lines, samples = np.indices(mask.shape)
     found = []
-    for line, sample in places:
+    for line, sample in points:
         inside = mask & ((lines - line) ** 2 + (samples - sample) ** 2 <= radius_px**2)
-        here, there = measured[inside].astype(float), rendered[inside].astype(float)
-        counts = np.ones_like(here, bool) if valid is None else valid[inside]
-        of_band = counts.sum(axis=0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean, mean_rendered = (np.where(counts, s, 0.0).sum(axis=0) / of_band for s in (here, there))
-            squares = np.where(counts, (here - mean) ** 2, 0.0).sum(axis=0)
-        sd = np.sqrt(squares / np.maximum(of_band - 1, 1)) + 0.0 * mean
-        found.append(PlaceSpectra(line, sample, int(inside.sum()), mean, sd, mean_rendered))
+        here = measured[inside].astype(float)
+        mean_rendered, _ = mean_and_sd(np.where(np.isfinite(here), rendered[inside], np.nan))
+        found.append(PointSpectra(line, sample, int(inside.sum()), *mean_and_sd(here), mean_rendered))
     return found

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,20 +17,15 @@ from markupsafe import Markup
 from PIL import Image, UnidentifiedImageError
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Finding
 
 _PACKAGE = "hsi_sc_nerf.report"
 _SCRIPTS = ("cloud_data.js", "cloud_renderer.js", "cloud_controls.js")
 WIDEST_PX = 1600
 """Wider pictures are downscaled to this."""
 _QUALITY = 82
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """A sentence or two."""
-
-    kind: ClassVar[str] = "paragraph"
-    text: str
+# Levels of findings as words, because colour alone does not tell everybody.
+_WORDS = {"green": "Good:", "amber": "Look at:", "red": "Wrong:"}
 
 
 @dataclass(frozen=True)
@@ -40,14 +35,6 @@ class Missing:
     kind: ClassVar[str] = "missing"
     text: str
     command: str
-
-
-@dataclass(frozen=True)
-class Warnings:
-    """Warnings, a sentence each."""
-
-    kind: ClassVar[str] = "warnings"
-    sentences: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -91,7 +78,8 @@ class CloudViewer:
     caption: str
 
 
-Block = Paragraph | Missing | Warnings | Table | Figure | Folded | CloudViewer
+Block = str | Missing | Table | Figure | Folded | CloudViewer
+"""What a section is made of; a text is a paragraph."""
 
 
 @dataclass(frozen=True)
@@ -102,28 +90,22 @@ class Section:
         anchor: its name in links.
         title: its heading.
         blocks: what is in it.
+        findings: what is good and what to look at, shown first.
     """
 
     anchor: str
     title: str
-    blocks: Sequence[Block] = field(default_factory=tuple)
+    blocks: Sequence[Block]
+    findings: Sequence[Finding] = ()
 
 
-@dataclass(frozen=True)
-class KeyFigure:
-    """A number at the head of the page, with its unit in the text."""
-
-    value: str
-    name: str
-
-
-def html_page(title: str, subtitle: str, key_figures: Sequence[KeyFigure], sections: Sequence[Section]) -> str:
+def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], sections: Sequence[Section]) -> str:
     """The page, with style sheet and scripts in it; every text is escaped.
 
     Args:
         title: heading.
         subtitle: a line below it.
-        key_figures: numbers to begin with.
+        key_figures: numbers with their units to begin with, by name.
         sections: in their order.
     """
     environment = Environment(
@@ -134,6 +116,7 @@ def html_page(title: str, subtitle: str, key_figures: Sequence[KeyFigure], secti
         subtitle=subtitle,
         key_figures=key_figures,
         sections=sections,
+        words=_WORDS,
         styles=_own_text("page.css"),
         scripts=Markup("\n").join(map(_own_text, _SCRIPTS)),
         footer="Made by hsi-sc-nerf report. This file is complete: it needs no network and no other file.",

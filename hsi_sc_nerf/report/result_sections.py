@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, KeyFigure, Missing, Section, Table, embedded_file
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _MM_PER_M = 1000.0
 _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
 _SCORES = {"chosen": "at the chosen threshold", "knee": "at the knee of the F-score"}
 _DISTANCES = {"cloud_to_reference": "cloud to reference", "reference_to_cloud": "reference to cloud"}
 _STATISTICS = {"mean_m": "mean", "median_m": "median", "rms_m": "RMS", "percentile_95_m": "95th percentile"}
-_COMPARE_COMMAND = "hsi-sc-nerf compare CLOUD.ply REFERENCE --output-dir RUN"
-_UNITS = {"m": "m", "m2": "m²", "l": "L", "rad": "rad", "deg": "°", "nm": "nm", "percent": "%"}
-_TRAITS_COMMAND = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
-# Keys in these are names that the user gave, not ours.
-_NAMES_IN = ("regions", "areas_m2", "mixture_areas_m2")
-_NOT_SHOWN = ("settings", "version")
-Row = tuple[str, str, str, str]
+_WRONG_CONTENT = (AttributeError, KeyError, TypeError, ValueError)
 
 
-def comparison_section(comparison: Mapping[str, Any] | None, source: Path | None = None) -> Section:
+def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Section:
     """Precision, recall and F-score over the distance threshold (paper, section "Spatial Evaluation Metrics").
 
     Args:
@@ -37,32 +31,34 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path | None
     Raises:
         InputError: the file lacks what it should hold.
     """
-    title = "Precision and recall"
+    title, blocks = "Precision and recall", list[Block]()
     if comparison is None:
-        return Section(
-            "comparison", title, [Missing("The geometry was not compared with a reference.", _COMPARE_COMMAND)]
-        )
+        command = "hsi-sc-nerf compare CLOUD.ply REFERENCE --output-dir RUN"
+        return Section("comparison", title, [Missing("The geometry was not compared with a reference.", command)])
     try:
-        blocks = _blocks(comparison)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        blocks += _comparison_blocks(comparison)
+    except _WRONG_CONTENT as error:
         raise InputError(f"{source}: is no comparison ({error}); make one with `hsi-sc-nerf compare`.") from error
-    picture = None if source is None else source.with_name("distances.png")
-    if picture is not None and picture.is_file():
+    picture = source.with_name("distances.png")
+    if picture.is_file():
         alt = "The cloud and the reference, coloured by the distance to the other"
         blocks.append(Folded("Where the distances are", [Figure([embedded_file(picture, alt)], f"{alt}.")]))
     return Section("comparison", title, blocks)
 
 
-def comparison_key_figure(comparison: Mapping[str, Any]) -> KeyFigure:
+def comparison_key_figure(comparison: Mapping[str, Any]) -> dict[str, str]:
     """The F-score at the chosen threshold, for the head of the page."""
     score = comparison["scores"]["chosen"]
-    return KeyFigure(f"{score['f_score']:.1f} %", f"F-score at {_MM_PER_M * score['threshold_m']:.1f} mm")
+    return {f"F-score at {_MM_PER_M * score['threshold_m']:.1f} mm": f"{score['f_score']:.1f} %"}
 
 
-def _blocks(comparison: Mapping[str, Any]) -> list[Block]:
+def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
     found, scores = comparison["curves"], comparison["scores"]
     thresholds_mm = _MM_PER_M * np.array(found["thresholds_m"], float)
-    curves = [Curve(name, thresholds_mm, _checked_curve(found[key], thresholds_mm)) for key, name in _CURVES.items()]
+    curves = [
+        Curve(name, thresholds_mm, np.array(found[key], float).reshape(len(thresholds_mm)))
+        for key, name in _CURVES.items()
+    ]
     marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in _SCORES}
     chart = line_chart(
         curves,
@@ -81,113 +77,31 @@ def _blocks(comparison: Mapping[str, Any]) -> list[Block]:
         for key, name in _DISTANCES.items()
         if key in comparison
     ]
+    caption = "Precision: fraction of the cloud within the threshold of the reference. Recall: the converse."
     return [
-        Table(
-            "Precision: fraction of the cloud within the threshold of the reference. Recall: the converse.",
-            ("", *_CURVES.values()),
-            score_rows,
-        ),
+        Table(caption, ("", *_CURVES.values()), score_rows),
         Figure([chart], "Precision, recall and F-score over the distance threshold, per cent."),
         Table("Distances, mm.", ("", *_STATISTICS.values()), distance_rows),
     ]
 
 
-def _checked_curve(values: Any, as_these: np.ndarray) -> np.ndarray:
-    array = np.array(values, float)
-    if array.shape != as_these.shape:
-        raise ValueError("a curve has not as many values as thresholds")
-    return array
-
-
-def traits_section(traits: Mapping[str, Any] | None, source: Path | None = None) -> Section:
-    """The object's traits.
+def traits_section(traits: Mapping[str, Any] | None, source: Path) -> Section:
+    """The object's traits, in the tables of ``traits.md``.
 
     Args:
         traits: content of ``traits.json``; None if there is none.
         source: that file, for the error's text.
 
     Raises:
-        InputError: the file holds nothing that could be shown.
+        InputError: the file holds no traits.
     """
     if traits is None:
-        return Section("traits", "Traits", [Missing("The object's traits were not measured.", _TRAITS_COMMAND)])
-    shown = {key: part for key, part in traits.items() if key not in _NOT_SHOWN}
-    everything, summary = list(trait_rows(shown)), list(trait_rows(_without_lists(shown)))
-    if not everything:
-        raise InputError(f"{source}: holds no traits; make it again with `hsi-sc-nerf traits`.")
-    caption = "±: standard deviation, over resampled points for sizes and over the surface for spectra."
-    header = ("", "value", "±", "unit")
-    blocks: list[Block] = [Table(caption, header, summary)]
-    if len(everything) > len(summary):
-        blocks.append(Folded("All entries, each region by itself", [Table(caption, header, everything)]))
-    return Section("traits", "Traits", blocks)
-
-
-def _without_lists(content: Any) -> Any:
-    """Nested mappings without lists of mappings."""
-    if not isinstance(content, Mapping):
-        return content
-    parts = {key: part for key, part in content.items() if not _lists_mappings(part)}
-    return {key: _without_lists(part) for key, part in parts.items()}
-
-
-def _lists_mappings(content: Any) -> bool:
-    return isinstance(content, list) and any(isinstance(part, Mapping) for part in content)
-
-
-def trait_rows(
-    content: Any, words: tuple[str, ...] = (), unit: str = "", spread: Any = None, named: bool = False
-) -> Iterator[Row]:
-    """Name, value, uncertainty and unit of everything in nested JSON.
-
-    An entry is a mapping with ``value`` (and perhaps ``uncertainty``, ``unit``, ``name``) or with ``mean`` and
-    ``sd``, or it is a bare value. What a mapping has under ``KEY_sd`` is the spread of what it has under ``KEY``. A
-    value's unit is the end of the innermost key that ends in one. What is null is left out.
-
-    Args:
-        content: the JSON.
-        words: that lead to it.
-        unit: of what leads to it.
-        spread: of the same shape as ``content``, or None.
-        named: whether the keys of ``content`` are names that the user gave to regions and classes.
-    """
-    if named:
-        for name, part in content.items():
-            yield from trait_rows(part, (*words, name), unit)
-    elif isinstance(content, Mapping) and content.keys() & {"value", "mean"}:
-        value, sd = content.get("value", content.get("mean")), content.get("uncertainty", content.get("sd"))
-        name = str(content.get("name", ", ".join(words)))
-        yield name, _text(value), _text(sd), str(content.get("unit", unit))
-    elif isinstance(content, Mapping):
-        for key, part in content.items():
-            if not (key.endswith("_sd") and key.removesuffix("_sd") in content):
-                inner = spread.get(key) if isinstance(spread, Mapping) else content.get(f"{key}_sd")
-                word, own = _split(key)
-                holds_names = key in _NAMES_IN and isinstance(part, Mapping)
-                yield from trait_rows(part, (*words, word), own or unit, inner, holds_names)
-    elif _lists_mappings(content):
-        for number, part in enumerate(content, start=1):
-            label = f"{part['label']} {number}" if isinstance(part, Mapping) and "label" in part else str(number)
-            yield from trait_rows(part, (*words, label), unit)
-    elif content is not None:
-        yield ", ".join(words), _text(content), _text(spread), unit
-
-
-def _split(key: str) -> tuple[str, str]:
-    """A key as words, and the unit of its ending."""
-    stem, _, end = key.rpartition("_")
-    word, unit = (stem, _UNITS[end]) if stem and end in _UNITS else (key, "")
-    return word.replace("_", " "), unit
-
-
-def _text(value: Any) -> str:
-    """Text of a value: numbers with four digits, lists with commas, nothing for None."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list):
-        return ", ".join(_text(part) for part in value)
-    if isinstance(value, float):
-        return f"{value:.4g}" if math.isfinite(value) else "-"
-    return str(value)
+        command = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
+        return Section("traits", "Traits", [Missing("The object's traits were not measured.", command)])
+    try:
+        tables = trait_tables(traits)
+    except _WRONG_CONTENT as error:
+        raise InputError(f"{source}: holds no traits ({error}); make it again with `hsi-sc-nerf traits`.") from error
+    return Section(
+        "traits", "Traits", [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
+    )

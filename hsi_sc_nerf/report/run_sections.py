@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Paragraph, Section, Table
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
 _CORRECTIONS = {
@@ -27,10 +26,6 @@ _PSNR = {
     "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
     "Eval Images Metrics/psnr": "one held-out view",
 }
-PACKAGES = (
-    *("hsi-sc-nerf", "nerfstudio", "torch", "numpy", "scipy", "spectral", "opencv-contrib-python-headless"),
-    *("open3d", "pycolmap", "numba", "matplotlib", "tyro"),
-)
 _NO_SETTINGS = ("_target",)
 Scalars = dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 """Steps and values by TensorBoard's tag."""
@@ -103,22 +98,6 @@ def flat_settings(config: Any, prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def changed_settings(settings: Mapping[str, str], defaults: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    """Settings that differ from the defaults: what they are, and the default (``-`` where there is none)."""
-    return {name: (value, defaults.get(name, "-")) for name, value in settings.items() if defaults.get(name) != value}
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on; those that are not installed are left out."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return versions
-
-
 def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], machine: Mapping[str, str]) -> Section:
     """Settings of the run, machine and package versions.
 
@@ -127,11 +106,12 @@ def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], m
         defaults: of its method.
         machine: facts of the machine that makes the report, and versions of its packages.
     """
-    changed = changed_settings(settings, defaults)
-    first: Block = Paragraph("All settings are the method's defaults.")
+    changed = [
+        (name, value, defaults.get(name, "-")) for name, value in settings.items() if defaults.get(name) != value
+    ]
+    first: Block = "All settings are the method's defaults."
     if changed:
-        rows = [(name, value, default) for name, (value, default) in changed.items()]
-        first = Table("Settings that are not the method's defaults.", ("", "this run", "default"), rows)
+        first = Table("Settings that are not the method's defaults.", ("", "this run", "default"), changed)
     everything = Table("All settings of the run.", ("", "value"), list(settings.items()))
     caption = "Machine and packages that made this report; the run itself does not record its own."
     return Section(

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from string import ascii_uppercase
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from markupsafe import Markup
 
-from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
-from hsi_sc_nerf.report.charts import Curve, bar_chart, line_chart
+from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
-    PlaceSpectra,
     ViewScores,
+    mean_and_sd,
     object_angles,
-    over_views,
     spread_of_views,
 )
-from hsi_sc_nerf.report.page import Block, Figure, KeyFigure, Paragraph, Section, Table, embedded_array
+from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 PICTURED_VIEWS = 4
@@ -38,25 +36,21 @@ _METRICS = {
     "rmse_pixel_mean": ("RMSE, mean over pixels", "{:.4f}"),
     "ssim_windowed": ("SSIM, 11 px windows", "{:.3f}"),
 }
-# Okabe and Ito's colours as the style sheet has them, to mark places in pictures.
-_PLACE_RGB = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (0, 0, 0))
+_MARK_RGB = (213, 94, 0)
 _MARKED_PX = 480
 
 
-def mean_and_sd(views: Sequence[ViewScores], metric: str) -> tuple[float, float]:
-    """Of a metric over the views; the deviation of a sample, 0 for a single view."""
-    values = np.array([view.metrics[metric] for view in views])
-    return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else 0.0
-
-
-def metric_key_figures(views: Sequence[ViewScores]) -> list[KeyFigure]:
+def metric_key_figures(views: Sequence[ViewScores]) -> dict[str, str]:
     """The paper's four metrics of the object, for the head of the page."""
-    figures = []
-    for metric in ("sam", "rmse", "ssim", "psnr"):
-        name, pattern = _METRICS[metric]
-        mean, sd = mean_and_sd(views, metric)
-        figures.append(KeyFigure(f"{pattern.format(mean)} ± {pattern.format(sd)}", name))
-    return figures
+    return {_METRICS[metric][0]: _over_views(views, metric)[0] for metric in ("sam", "rmse", "ssim", "psnr")}
+
+
+def _over_views(views: Sequence[ViewScores], metric: str) -> tuple[str, str]:
+    """Mean with standard deviation, and range, of a metric of `ViewScores.metrics` over the views."""
+    _, pattern = _METRICS[metric.removeprefix("full_")]
+    values = np.array([[view.metrics[metric]] for view in views])
+    mean, sd, low, high = (pattern.format(float(v[0])) for v in (*mean_and_sd(values), values.min(0), values.max(0)))
+    return f"{mean} ± {sd}", f"{low} to {high}"
 
 
 def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
@@ -68,13 +62,11 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
     """
     number = f"all {held_out}" if held_out == len(views) else f"{len(views)} of the {held_out}"
     blocks: list[Block] = [
-        Paragraph(f"The model has not seen these views. Scores are of {number} held-out views."),
+        f"The model has not seen these views. Scores are of {number} held-out views.",
         _metrics_table([view.scores for view in views]),
-        Paragraph(
-            f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
-            f"(light), the error, root mean square over bands, from {ERROR_DRAWN[0]:g} (dark) to "
-            f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object."
-        ),
+        f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
+        f"(light), the error, root mean square over bands, from {ERROR_DRAWN[0]:g} (dark) to "
+        f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object.",
     ]
     for index in spread_of_views(len(views), PICTURED_VIEWS):
         view = views[index]
@@ -108,19 +100,11 @@ def crop_around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
 
 
 def _metrics_table(views: Sequence[ViewScores]) -> Table:
-    rows = []
-    for metric, (name, pattern) in _METRICS.items():
-        cells = []
-        for prefix in ("", "full_"):
-            mean, sd = mean_and_sd(views, prefix + metric)
-            low, high = (f([view.metrics[prefix + metric] for view in views]) for f in (min, max))
-            cells += [f"{pattern.format(mean)} ± {pattern.format(sd)}"]
-            cells += [f"{pattern.format(low)} to {pattern.format(high)}"]
-        rows.append((name, *cells))
     header = ("", "object: mean ± SD", "object: range", "whole frame: mean ± SD", "whole frame: range")
-    return Table(
-        "Metrics over the held-out views, as the paper defines them, and other readings below.", header, rows
-    )
+    rows = [
+        (name, *_over_views(views, key), *_over_views(views, f"full_{key}")) for key, (name, _) in _METRICS.items()
+    ]
+    return Table("The paper's four metrics over the held-out views, and other readings of two.", header, rows)
 
 
 def bands_section(
@@ -130,7 +114,13 @@ def bands_section(
 ) -> Section:
     """Curves by band of the object's error, PSNR and SSIM, and the histogram of the spectral angle."""
     rmse, psnr, ssim = (
-        [Curve("mean ± SD over views", wavelengths_nm, *over_views([getattr(view, name) for view in views]))]
+        [
+            Curve(
+                "mean ± SD over views",
+                wavelengths_nm,
+                *mean_and_sd(np.stack([getattr(view, name) for view in views])),
+            )
+        ]
         for name in ("rmse", "psnr_db", "ssim")
     )
     caption = (
@@ -152,98 +142,60 @@ def bands_section(
     }
     angles = object_angles(views)
     if len(angles):
-        charts["Spectral angle"] = _angle_histogram(angles)
-        caption += f" {_angle_sentence(angles)}"
+        middle, high, top = np.percentile(angles, (50.0, 95.0, _PERCENTILE_DRAWN))
+        counts, edges = np.histogram(angles, _HISTOGRAM_BINS, (0.0, max(float(top), 1e-6)))
+        charts["Spectral angle"] = line_chart(
+            [Curve("", (edges[:-1] + edges[1:]) / 2.0, 100.0 * counts / len(angles))],
+            x_label="spectral angle (rad)",
+            y_label="fraction of pixels (%)",
+            alt="Histogram of the spectral angle over the object's pixels",
+            from_zero=True,
+        )
+        caption += (
+            f" Spectral angle between measurement and rendering, {len(angles)} pixels of the object: mean "
+            f"{angles.mean():.4f}, median {middle:.4f}, 95th percentile {high:.4f} rad. The largest "
+            f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
+        )
     figure = Figure(list(charts.values()), caption, list(charts), columns=2)
     return Section("bands", "Accuracy by band and pixel", [figure])
 
 
-def _angle_histogram(angles: Float[np.ndarray, "n"]) -> Markup:
-    top = max(float(np.percentile(angles, _PERCENTILE_DRAWN)), 1e-6)
-    counts, edges = np.histogram(angles, _HISTOGRAM_BINS, (0.0, top))
-    return bar_chart(
-        edges,
-        100.0 * counts / len(angles),
-        x_label="spectral angle (rad)",
-        y_label="fraction of pixels (%)",
-        alt="Histogram of the spectral angle over the object's pixels",
-        marks={"mean": float(angles.mean())},
-    )
-
-
-def _angle_sentence(angles: Float[np.ndarray, "n"]) -> str:
-    middle, high = np.percentile(angles, (50.0, 95.0))
-    return (
-        f"Spectral angle between measurement and rendering, {len(angles)} pixels of the object: mean "
-        f"{angles.mean():.4f}, median {middle:.4f}, 95th percentile {high:.4f} rad. The largest "
-        f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
-    )
-
-
-def spectra_section(
-    view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], uncertainty: ReflectanceUncertainty | None
-) -> Section:
-    """Measured and rendered spectra of some places of one view, with how much they vary there."""
-    picture = embedded_array(_marked(view), f"{view.scores.name} with the places marked")
-    charts = [_spectrum_chart(place, wavelengths_nm, uncertainty, i) for i, place in enumerate(view.places)]
-    titles = [
-        f"{chr(ord('A') + i)}: line {place.line}, sample {place.sample}, {place.pixels} pixels"
-        for i, place in enumerate(view.places)
-    ]
+def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"]) -> Section:
+    """Measured and rendered spectra around some points of one view, with how much they vary there."""
+    picture = embedded_array(_marked(view), f"{view.scores.name} with the points marked")
+    charts = {}
+    for letter, point in zip(ascii_uppercase, view.points, strict=False):
+        where = f"line {point.line}, sample {point.sample}"
+        charts[f"{letter}: {where}, {point.pixels} pixels"] = line_chart(
+            [
+                Curve("measured, mean ± SD", wavelengths_nm, point.measured, point.measured_sd),
+                Curve("rendered", wavelengths_nm, point.rendered, dashed=True),
+            ],
+            x_label="wavelength (nm)",
+            y_label="reflectance",
+            alt=f"Measured and rendered spectrum at {where}",
+            from_zero=True,
+        )
     caption = (
-        "Reflectance over wavelength. Solid with a band: measured, mean and standard deviation over the pixels of "
-        "the place, that is noise and texture together. Dashed: rendered, mean over the same pixels."
+        "Reflectance over wavelength. Solid with a band: measured, mean and standard deviation over the pixels "
+        "around the point, that is noise and texture together. Dashed: rendered, mean over the same pixels."
     )
-    if uncertainty is not None:
-        caption += " Thin lines: the noise that one pixel should have by the calibration, around the mean."
-    return Section(
-        "spectra",
-        "Spectra with uncertainty",
-        [
-            Figure([picture], f"Places in {view.scores.name}, as measured."),
-            Figure(charts, caption, titles, columns=2),
-        ],
-    )
-
-
-def _spectrum_chart(
-    place: PlaceSpectra,
-    wavelengths_nm: Float[np.ndarray, "bands"],
-    uncertainty: ReflectanceUncertainty | None,
-    colour: int,
-) -> Markup:
-    curves = [
-        Curve("measured, mean ± SD", wavelengths_nm, place.measured, place.measured_sd, colour=colour),
-        Curve("rendered", wavelengths_nm, place.rendered, dashed=True, colour=6),
-    ]
-    if uncertainty is not None:
-        noise = uncertainty.standard_deviation(place.measured)
-        curves += [
-            Curve(name, wavelengths_nm, place.measured + side * noise, colour=colour, thin=True)
-            for name, side in (("noise of a pixel", 1.0), ("", -1.0))
-        ]
-    return line_chart(
-        curves,
-        x_label="wavelength (nm)",
-        y_label="reflectance",
-        alt=f"Measured and rendered spectrum at line {place.line}, sample {place.sample}",
-        from_zero=True,
-    )
+    marked = Figure([picture], f"Points in {view.scores.name}, as measured.")
+    return Section("spectra", "Spectra", [marked, Figure(list(charts.values()), caption, list(charts), columns=2)])
 
 
 def _marked(view: HeldOutView) -> UInt8[np.ndarray, "h w 3"]:
-    """The measured picture round the object, enlarged, with a lettered ring at each place."""
+    """The measured picture round the object, enlarged, with a lettered ring at each point."""
     lines, samples = crop_around(view.scores.mask)
     crop = np.ascontiguousarray(view.measured_rgb[lines, samples])
     scale = max(1, round(_MARKED_PX / crop.shape[0]))
     image = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     first_line, first_sample = lines.start or 0, samples.start or 0
-    for i, place in enumerate(view.places):
-        centre = ((np.array([place.sample - first_sample, place.line - first_line]) + 0.5) * scale).astype(int)
-        radius = max(6, round(scale * np.sqrt(place.pixels / np.pi)))
-        x, y = (int(value) for value in centre)
-        letter, corner = chr(ord("A") + i), (x + radius + 3, y + 5)
-        for colour, width in (((255, 255, 255), 4), (_PLACE_RGB[i % len(_PLACE_RGB)], 2)):
+    for letter, point in zip(ascii_uppercase, view.points, strict=False):
+        x, y = (int((at + 0.5) * scale) for at in (point.sample - first_sample, point.line - first_line))
+        radius = max(6, round(scale * np.sqrt(point.pixels / np.pi)))
+        for colour, width in (((255, 255, 255), 4), (_MARK_RGB, 2)):
             cv2.circle(image, (x, y), radius, colour, width, cv2.LINE_AA)
-            cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
+            where = (x + radius + 3, y + 5)
+            cv2.putText(image, letter, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
     return image

@@ -10,18 +10,22 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.simulate import assemble, sensor
+from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
-from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
+from hsi_sc_nerf.simulate.effects import detector
 from hsi_sc_nerf.simulate.effects.detector import ExposureEffect, ReadoutContext, ReadoutEffect, SpectralSmile
-from hsi_sc_nerf.simulate.effects.illumination import IlluminationEffect
+from hsi_sc_nerf.simulate.effects.image import (
+    Drying,
+    IlluminationEffect,
+    ImageRotation,
+    LensDistortion,
+    OpticalBlur,
+    TexturedBackground,
+)
 from hsi_sc_nerf.simulate.effects.motion import OffCentre
-from hsi_sc_nerf.simulate.effects.object import Deformation, Drying
-from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
-from hsi_sc_nerf.simulate.light import Light, LightEffect, SurfaceLightEffect, colour_spectra
-from hsi_sc_nerf.simulate.lighting import Lighting, render
+from hsi_sc_nerf.simulate.light import Light, LightEffect, Lighting, SurfaceLightEffect, colour_spectra, render
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
-from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
+from hsi_sc_nerf.simulate.render import exact_weights
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_MATERIALS = ("white_tarp", "tarp_surround")
@@ -89,8 +93,6 @@ class Simulation:
         self._blur = find_effect(effects, OpticalBlur)
         self._rotation = find_effect(effects, ImageRotation)
         self._drying = find_effect(effects, Drying)
-        self._deformation = find_effect(effects, Deformation)
-        self._light = tuple(effect for effect in effects if isinstance(effect, LightEffect))
         self._illumination = of_kind(effects, IlluminationEffect)
         self._exposures = of_kind(effects, ExposureEffect)
         self._readout = of_kind(effects, ReadoutEffect)
@@ -98,8 +100,15 @@ class Simulation:
         scanned = assemble.object_part(scene)
         self.object_part = replace(scanned, mesh=scanned.mesh.moved(self.offset_m))
         background = find_effect(effects, TexturedBackground)
-        self._background_materials = background.materials if background else ()
-        self.renderer, self._lighting = self._renderer_and_light(self.object_part)
+        lights = tuple(effect for effect in effects if isinstance(effect, LightEffect))
+        self.renderer = assemble.build_renderer(
+            scene,
+            self.object_part,
+            self.offset_m,
+            background.materials if background else (),
+            LIGHT_SPACING_M if of_kind(lights, SurfaceLightEffect) else None,
+        )
+        self._lighting = Lighting(self.renderer, lights) if lights else None
         self.materials = self.renderer.materials
         self._background = None
         if background:
@@ -109,10 +118,10 @@ class Simulation:
         self._object_materials = [(MATERIALS | scene.materials)[name] for name in scanned.materials]
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
-        self.wavelengths_nm = sensor.band_centres_nm(scene.sensor.bands)
+        self.wavelengths_nm = detector.band_centres_nm(scene.sensor.bands)
         smile = find_effect(effects, SpectralSmile)
         self._detector_nm = smile.wavelengths_nm(self.wavelengths_nm, size_px) if smile else self.wavelengths_nm
-        self._signal_of_white = sensor.white_signal(scene.sensor, self._detector_nm)
+        self._signal_of_white = detector.white_signal(scene.sensor, self._detector_nm)
         self.detector_maps = {
             effect.name: effect.detector_maps(size_px, scene.sensor.bands, effect_rng(scene.seed, effect))
             for effect in self._readout
@@ -123,17 +132,17 @@ class Simulation:
     def frame(self, number: int) -> SimulatedFrame:
         """Simulate one frame of the plan."""
         elapsed = float(self.plan.elapsed[number])
-        view = (self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, self.lens)
-        renderer, lighting = self._deformed(elapsed) if self._deformation else (self.renderer, self._lighting)
-        rendering = render(renderer, *view, lighting)
+        lens = self.lens.straighten if self.lens else None
+        view = self.intrinsics, self.camera_to_world[number], self.scene.camera.supersampling, lens
+        rendering = render(self.renderer, *view, self._lighting)
         weights, light_weights = rendering.material_weights, rendering.light_weights
         if self._background is not None:
             count = len(self.materials)
-            if lighting is not None:
+            if self._lighting is not None:
                 light_weights[..., :count] += light_weights[..., count - 1, None] * self._background
             weights = exact_weights((weights + weights[..., -1:] * self._background).reshape(-1, count))
             weights = weights.reshape(*rendering.coverage.shape, count)
-            if lighting is None:
+            if self._lighting is None:
                 light_weights = weights
         spectra = self._detector_endmembers
         if self._drying:
@@ -142,7 +151,7 @@ class Simulation:
             spectra[..., of_object, :] = self._drying.spectra(
                 spectra[..., of_object, :], self._object_materials, self._detector_nm, elapsed
             )
-        light = Light(light_weights, colour_spectra(rendering.colours, spectra, self._detector_nm))
+        light = Light(light_weights, colour_spectra(rendering.colours, spectra))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
         return SimulatedFrame(
@@ -170,20 +179,6 @@ class Simulation:
     def _detector_reflectance(self, names: Sequence[str]) -> Float[np.ndarray, "*samples materials bands"]:
         """Reflectance at the detector's wavelengths: one table, or one for each sample under a spectral smile."""
         return np.moveaxis(endmembers(names, self._detector_nm, self.scene.materials), 0, -2)
-
-    def _renderer_and_light(self, scanned: Part) -> tuple[Renderer, Lighting | None]:
-        """The renderer of the object, which may be deformed, on its support, and its light; None if it is even."""
-        spacing_m = LIGHT_SPACING_M if of_kind(self._light, SurfaceLightEffect) else None
-        renderer = assemble.build_renderer(self.scene, scanned, self.offset_m, self._background_materials, spacing_m)
-        return renderer, Lighting(renderer, self._light) if self._light else None
-
-    def _deformed(self, elapsed: float) -> tuple[Renderer, Lighting | None]:
-        """The renderer of the deformed object at time ``elapsed``, and its light."""
-        assert self._deformation is not None
-        mesh = self.object_part.mesh
-        foot_m = self.offset_m + np.array([0.0, 0.0, self.scene.container.height_m])
-        deformed = replace(mesh, vertices=self._deformation.deform(mesh.vertices, foot_m, elapsed))
-        return self._renderer_and_light(replace(self.object_part, mesh=deformed))
 
     def _on_sensor(self, light: Light, elapsed: float) -> Light:
         """The light after optics and illumination at time ``elapsed``, rotated as in the file."""
@@ -218,7 +213,7 @@ class Simulation:
         """Digitised counts of a signal in counts above dark, which is overwritten."""
         counts = signal
         counts += self.scene.sensor.dark_level
-        largest = sensor.largest_count(self.scene.sensor)
+        largest = detector.largest_count(self.scene.sensor)
         for effect, rng in zip(self._readout, random, strict=True):
             context = ReadoutContext(
                 largest_count=largest,
@@ -228,7 +223,7 @@ class Simulation:
                 rng=rng,
             )
             counts = effect.read_out(counts, context)
-        return sensor.digitise(counts, self.scene.sensor)
+        return detector.digitise(counts, self.scene.sensor)
 
 
 def white_capture_weights(size_px: int) -> Float[np.ndarray, "lines samples 2"]:

@@ -1,6 +1,13 @@
 """Light as a sum of few colours: at the surface, at the points that a camera sees, and on the sensor.
 
-Radiance is relative to that of the white tarp under the lamps at the start of the session.
+Radiance is relative to that of the white tarp under the lamps at the start of the session. Without light effects
+every point has the irradiance 1, that of the white tarp, so its radiance is its reflectance. With them the light of a
+pixel is the mean over its rays of
+
+    chamber * chamber_lit + lamp * lamp_lit + mirrored
+
+where ``chamber_lit`` and ``lamp_lit`` belong to the surface (`SurfaceLight`), and the factors ``chamber`` and
+``lamp`` and the mirrored light depend on the view (`HitLight`).
 """
 
 from __future__ import annotations
@@ -12,56 +19,92 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.simulate.effect import Effect
-from hsi_sc_nerf.simulate.render import Hits, Renderer
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.simulate.effect import Effect, of_kind
+from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
 
 SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
+Colour: TypeAlias = tuple[int, ...]
+"""Materials (columns of the endmembers), ascending, whose reflectances are multiplied; white if empty."""
 
 
-def lamp_photons(wavelengths_nm: Float[np.ndarray, "*shape"], temperature_k: float) -> Float[np.ndarray, "*shape"]:
-    """Relative photon spectrum of a tungsten lamp: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
-    exponent = SECOND_RADIATION_CONSTANT_NM_K / (wavelengths_nm * temperature_k)
-    return (wavelengths_nm / 1000.0) ** -4 / np.expm1(exponent)
-
-
-@dataclass(frozen=True)
-class Colour:
-    """A spectrum: the product of the reflectances of some materials and of a factor over wavelength.
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """An image and its light.
 
     Attributes:
-        materials: columns of the endmembers whose reflectances are multiplied, ascending; white if empty.
-        bands: (wavelength in nm, factor) nodes of a polyline, constant outside its range; factor 1 if empty.
+        material_weights: fraction of each material in each pixel, summing to exactly 1.
+        coverage: fraction of each pixel that the object covers.
+        light_weights: amount of each colour in the light of each pixel; in even light ``material_weights`` itself.
+        colours: colours of the light; those of single materials come first.
     """
 
-    materials: tuple[int, ...]
-    bands: tuple[tuple[float, float], ...] = ()
-
-    def reflected_by(self, material: int) -> Colour:
-        """The colour after a reflection by one more material."""
-        return Colour(tuple(sorted((*self.materials, material))), self.bands)
-
-    def spectrum(
-        self,
-        endmembers: Float[np.ndarray, "*samples materials bands"],
-        wavelengths_nm: Float[np.ndarray, "*samples bands"],
-    ) -> Float[np.ndarray, "*samples bands"]:
-        """Radiance of the colour."""
-        spectrum = np.ones(wavelengths_nm.shape)
-        for material in self.materials:
-            spectrum = spectrum * endmembers[..., material, :]
-        if self.bands:
-            spectrum = spectrum * np.interp(wavelengths_nm, *np.transpose(self.bands))
-        return spectrum
+    material_weights: Float[np.ndarray, "h w materials"]
+    coverage: Float[np.ndarray, "h w"]
+    light_weights: Float[np.ndarray, "h w colours"]
+    colours: tuple[Colour, ...]
 
 
-def colour_spectra(
-    colours: Sequence[Colour],
-    endmembers: Float[np.ndarray, "*samples materials bands"],
-    wavelengths_nm: Float[np.ndarray, "*samples bands"],
-) -> Float[np.ndarray, "*samples colours bands"]:
-    """Spectra of several colours, stacked."""
-    return np.stack([colour.spectrum(endmembers, wavelengths_nm) for colour in colours], axis=-2)
+def render(
+    renderer: Renderer,
+    intrinsics: PinholeIntrinsics,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    supersampling: int,
+    lens: Lens | None = None,
+    lighting: Lighting | None = None,
+) -> Rendering:
+    """An image of a camera; a pixel is the mean over ``supersampling``² evenly spaced rays (a box filter).
+
+    Args:
+        renderer: the parts.
+        intrinsics: of the camera.
+        camera_to_world: pose of the camera, OpenGL axes, metres.
+        supersampling: rays per pixel along each side.
+        lens: bends the rays of the pinhole camera.
+        lighting: light on the parts of ``renderer``; even light by default.
+    """
+    size = intrinsics.h, intrinsics.w
+    weights = np.empty((*size, len(renderer.materials)), np.float32)
+    coverage = np.empty(size, np.float32)
+    colours, light_of_rows = _single_colours(renderer), []
+    for rows, hits in renderer.camera_hits(intrinsics, camera_to_world, supersampling, lens):
+        weights[rows] = renderer.material_weights(hits).reshape(-1, intrinsics.w, len(renderer.materials))
+        coverage[rows] = hits.mean(hits.is_object).reshape(-1, intrinsics.w)
+        if lighting is not None:
+            light, colours = lighting.light(hits, camera_to_world)
+            light_of_rows.append(light.reshape(-1, intrinsics.w, len(colours)))
+    return Rendering(weights, coverage, np.concatenate(light_of_rows) if lighting else weights, colours)
+
+
+class Lighting:
+    """The light on the parts of a renderer under some effects; view-independent light is computed once, here."""
+
+    def __init__(self, renderer: Renderer, effects: Sequence[LightEffect]) -> None:
+        self._on_view = of_kind(effects, ViewLightEffect)
+        self._renderer = renderer
+        self._light = even_light(Surface(self._renderer))
+        for effect in of_kind(effects, SurfaceLightEffect):
+            self._light = effect.on_surface(self._light)
+
+    def light(
+        self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
+    ) -> tuple[Float[np.ndarray, "pixels colours"], tuple[Colour, ...]]:
+        """The light of each pixel as weights of colours, and the colours."""
+        surface, count = self._light.surface, len(hits.ray)
+        chamber = len(self._renderer.materials) - 1
+        at_hits = HitLight(np.ones(count, np.float32), np.zeros(count, np.float32), None, (chamber,))
+        for effect in self._on_view:
+            at_hits = effect.at_hits(hits, at_hits, camera_to_world)
+        colours = (*self._light.colours, *(colour for colour, _ in at_hits.mirrored))
+        light = np.zeros((hits.pixels, len(colours)), np.float32)
+        for factor, lit in ((at_hits.chamber, self._light.chamber_lit), (at_hits.lamp, self._light.lamp_lit)):
+            if factor.any():
+                light[:, : lit.shape[1]] += hits.mix(surface.triangles, len(lit), factor) @ lit
+        light[:, chamber] = 1.0 - hits.mean(np.ones(count))
+        for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
+            light[:, i] = hits.mean(mirrored)
+        return light, colours
 
 
 @dataclass(frozen=True)
@@ -164,9 +207,22 @@ LightEffect: TypeAlias = SurfaceLightEffect | ViewLightEffect
 def even_light(surface: Surface) -> SurfaceLight:
     """The light of a surface under the irradiance 1 at every point."""
     materials = surface.renderer.weights[surface.vertex]
-    return SurfaceLight(surface, single_colours(surface.renderer), materials, materials)
+    return SurfaceLight(surface, _single_colours(surface.renderer), materials, materials)
 
 
-def single_colours(renderer: Renderer) -> tuple[Colour, ...]:
+def _single_colours(renderer: Renderer) -> tuple[Colour, ...]:
     """The colours of single materials, in the renderer's order."""
-    return tuple(Colour((i,)) for i in range(len(renderer.materials)))
+    return tuple((i,) for i in range(len(renderer.materials)))
+
+
+def colour_spectra(
+    colours: Sequence[Colour], endmembers: Float[np.ndarray, "*samples materials bands"]
+) -> Float[np.ndarray, "*samples colours bands"]:
+    """Radiance of several colours, stacked."""
+    return np.stack([np.prod(endmembers[..., colour, :], axis=-2) for colour in colours], axis=-2)
+
+
+def lamp_photons(wavelengths_nm: Float[np.ndarray, "*shape"], temperature_k: float) -> Float[np.ndarray, "*shape"]:
+    """Relative photon spectrum of a tungsten lamp: Planck's law in photons, 1 / (l^4 (exp(c2 / (l T)) - 1))."""
+    exponent = SECOND_RADIATION_CONSTANT_NM_K / (wavelengths_nm * temperature_k)
+    return (wavelengths_nm / 1000.0) ** -4 / np.expm1(exponent)

@@ -10,9 +10,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.simulate.materials import over, smooth_noise, smoothstep
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, revolve, steps
 from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar
-from hsi_sc_nerf.simulate.texture import over, smooth_noise, smoothstep
 
 # Profiles of (radius, height) in units of the object's height; the body is a smooth curve, the stem a polyline.
 PEAR_BODY = np.array(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -22,16 +22,9 @@ WEIGHT_STEPS = 2048
 """Weights are multiples of 1 / 2048, which float16 represents exactly, so stored weights sum to exactly 1."""
 
 
-class Lens(Protocol):
-    """A lens that bends the rays of the pinhole camera; hashable."""
-
-    def straighten(
-        self, pixels: Float[np.ndarray, "*n 2"], intrinsics: PinholeIntrinsics
-    ) -> Float[np.ndarray, "*n 2"]:
-        """Pixel coordinates in the pinhole image of what the lens images at ``pixels``."""
-
-    def __hash__(self) -> int:
-        """Rays are cached by lens."""
+Pixels = Float[np.ndarray, "*n 2"]
+Lens: TypeAlias = Callable[[Pixels, PinholeIntrinsics], Pixels]
+"""Where the pinhole image shows what the lens images at the given pixels; hashable, because rays are cached."""
 
 
 @dataclass(frozen=True)
@@ -250,5 +243,5 @@ def _camera_rays(
     y, x, sub_y, sub_x = np.meshgrid(lines, samples, offsets, offsets, indexing="ij")
     pixels = np.stack([x + sub_x, y + sub_y], axis=-1).reshape(-1, 2)
     if lens is not None:
-        pixels = lens.straighten(pixels, intrinsics)
+        pixels = lens(pixels, intrinsics)
     return pixel_rays(intrinsics, np.eye(4), pixels)[1].astype(np.float32)

@@ -19,6 +19,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 from hsi_sc_nerf.simulate.effects import read_effects
+from hsi_sc_nerf.simulate.effects.detector import SensorSettings
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 
 SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
@@ -73,8 +74,8 @@ class Cylinder:
 class OwnMesh:
     """A closed triangle mesh from a file with one or more materials.
 
-    The fractions of several materials come from ``weight_texture``, from PLY vertex properties ``weight_NAME`` (one
-    for each material), or from vertex colours (red, green and blue are the first, second and third material).
+    The fractions of several materials come from PLY vertex properties ``weight_NAME``, one for each material, or
+    from vertex colours (red, green and blue are the first, second and third material).
     """
 
     shape: Literal["mesh"]
@@ -82,19 +83,10 @@ class OwnMesh:
     """PLY, OBJ, glTF or GLB; a path relative to the scene file."""
     materials: tuple[str, ...]
     """Names of built-in materials, or of those that the scene file defines."""
-    weight_texture: Path | None = None
-    """Image, mapped by the mesh's UVs, whose channels are the fractions of at most three materials."""
     height_m: float | None = between(0.01, 0.5, default=None)
     """Height to which the mesh is scaled; without it, lengths in the file are metres."""
     up_axis: Literal["by_format", "y", "z"] = "by_format"
     """Vertical axis of the file; ``by_format`` is y for glTF and GLB, z for PLY and OBJ."""
-
-    def in_folder(self, folder: Path) -> OwnMesh:
-        """The same object with its paths taken relative to ``folder``."""
-        texture = self.weight_texture
-        return replace(
-            self, mesh_file=folder / self.mesh_file, weight_texture=None if texture is None else folder / texture
-        )
 
 
 Object: TypeAlias = Fruit | MaizeEar | Sphere | Cylinder | OwnMesh
@@ -146,21 +138,6 @@ class MarkerSettings:
 
 
 @dataclass(frozen=True)
-class SensorSettings:
-    """A perfect push-broom sensor: counts are linear in light and free of noise."""
-
-    bands: int = between(3, 2048, default=paper.BANDS)
-    bit_depth: int = between(8, 16, default=12)
-    lamp_temperature_k: float = between(1500.0, 10000.0, default=3000.0)
-    white_level: float = between(0.05, 1.0, default=0.82)
-    """Counts of the white tarp in its brightest band, as a fraction of the largest count."""
-    dark_level: int = between(0, 1000, default=120)
-    """Counts without light."""
-    full_well_electrons: float = between(100.0, 1e7, default=30_000.0)
-    """Electrons at the largest count; used by the noise effects."""
-
-
-@dataclass(frozen=True)
 class Scene:
     """The description of a simulated session; the same scene and seed give the same bytes."""
 
@@ -172,7 +149,7 @@ class Scene:
     materials: dict[str, Material] = field(default_factory=dict)
     """Materials of the scene; they replace built-in materials of the same name."""
     container: ContainerSettings = ContainerSettings()
-    sensor: SensorSettings = SensorSettings()
+    sensor: SensorSettings = field(default_factory=SensorSettings)
     effects: tuple[Any, ...] = ()
     """Effects from `effects.EFFECTS`, in the order in which they act."""
     seed: int = between(0, 2**31 - 1, default=0)
@@ -238,7 +215,7 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
         )
     _check_materials(scene, source)
     if isinstance(scene.object, OwnMesh):
-        scene = replace(scene, object=scene.object.in_folder(folder))
+        scene = replace(scene, object=replace(scene.object, mesh_file=folder / scene.object.mesh_file))
     return scene
 
 

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from hsi_sc_nerf import __version__
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import TEMPORARY_PREFIX
 from hsi_sc_nerf.simulate import truth
 from hsi_sc_nerf.simulate.effect import find_effect
-from hsi_sc_nerf.simulate.effects.optics import ImageRotation
+from hsi_sc_nerf.simulate.effects.image import ImageRotation
 from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene
 
 WHITE_REFERENCE = "white_reference"
-WORKERS = 2
-"""Number of frames that are simulated at the same time."""
+WORKERS = min(8, os.cpu_count() or 2)
+"""Number of frames that are simulated at the same time; each takes some hundred MiB at 512 x 512 pixels."""
 SENSOR = "simulated SPECIM IQ"
 METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
 <properties xmlns="http://www.specim.fi/iq">
@@ -40,8 +38,7 @@ METADATA_XML = """<?xml version="1.0" encoding="UTF-8"?>
 def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = True) -> Path:
     """Simulate a turntable session.
 
-    The session is written to a hidden sibling folder and moved into place at the end. After an interrupted run the
-    same call continues with the missing frames.
+    The session is written to a hidden sibling folder and moved into place at the end.
 
     Args:
         scene: the scene.
@@ -63,29 +60,22 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
     _check_free(session_dir)
     with Console(stderr=True, quiet=not progress).status(f"preparing {scene.name} and its light"):
         simulation = Simulation(scene)
-    building = session_dir.absolute().parent / f".partial-{_stamp(simulation)}-{session_dir.absolute().name}"
+    target = session_dir.absolute()
+    building, earlier = (target.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{kind}-{target.name}") for kind in "ab")
     try:
-        building.mkdir(parents=True, exist_ok=True)
+        building.mkdir(parents=True)
         _write(simulation, building, progress)
-        _move_into_place(building, session_dir)
+        if target.exists():
+            os.rename(target, earlier)
+        os.rename(building, target)
     except OSError as error:
-        shutil.rmtree(building, ignore_errors=True)
         raise InputError(
             f"{session_dir}: cannot be written ({error.strerror or error}); free some space or choose another folder."
         ) from error
-    except InputError:
-        shutil.rmtree(building, ignore_errors=True)
-        raise
+    finally:
+        for folder in (building, earlier):
+            shutil.rmtree(folder, ignore_errors=True)
     return session_dir
-
-
-def _stamp(simulation: Simulation) -> str:
-    """Hash of scene, mesh and version; a run continues only with frames of the same hash."""
-    stamp = hashlib.sha256(f"{__version__} {simulation.scene!r}".encode())
-    # The scene holds only the path of an own mesh.
-    for array in (simulation.object_part.mesh.vertices, simulation.object_part.weights):
-        stamp.update(np.ascontiguousarray(array).tobytes())
-    return stamp.hexdigest()[:12]
 
 
 def _check_free(session_dir: Path) -> None:
@@ -100,20 +90,6 @@ def _check_free(session_dir: Path) -> None:
         )
 
 
-def _move_into_place(building: Path, session_dir: Path) -> None:
-    if not session_dir.exists():
-        os.rename(building, session_dir)
-        return
-    earlier = building.with_name(building.name + "-earlier")
-    os.rename(session_dir, earlier)
-    try:
-        os.rename(building, session_dir)
-    except OSError:
-        os.rename(earlier, session_dir)
-        raise
-    shutil.rmtree(earlier, ignore_errors=True)
-
-
 def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     scene = simulation.scene
     truth.write_truth(session_dir, simulation)
@@ -124,17 +100,13 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     def write_frame(number: int) -> None:
         capture, frame = simulation.captures[number], simulation.frame(number)
         _write_capture(session_dir, capture, frame, simulation)
-        # Written last: a frame with truth is complete.
         truth.write_pixels(session_dir, capture, frame)
 
-    captures = simulation.captures
-    missing = [i for i in range(len(captures)) if not truth.pixels_path(session_dir, captures[i]).exists()]
     with ThreadPoolExecutor(WORKERS) as pool:
-        frames = [pool.submit(write_frame, number) for number in missing]
+        frames = [pool.submit(write_frame, number) for number in range(len(simulation.captures))]
         try:
-            for frame in track(
-                as_completed(frames), f"simulating {scene.name}", total=len(missing), disable=not progress
-            ):
+            doing = f"simulating {scene.name}"
+            for frame in track(as_completed(frames), doing, total=len(frames), disable=not progress):
                 frame.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Points on the surface of all parts: occlusion, form factors and diffusion of light."""
+"""Points on the surface of all parts: occlusion and form factors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
@@ -20,7 +19,6 @@ POINTS_AT_ONCE = 4096
 COVER_DISTANCE_M, COVER_FRACTION = 0.001, 0.6
 """A point is covered if this fraction of its rays hits a back face or, on the support, hits within the distance."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-COLUMNS_AT_ONCE = 8
 
 
 @dataclass(frozen=True)
@@ -57,34 +55,11 @@ class Surface:
         return Mesh(self.renderer.vertices[self.vertex], self.triangles)
 
     @cached_property
-    def areas_m2(self) -> Float[np.ndarray, "p"]:
-        """Area of each point: a third of the area of each of its triangles."""
-        thirds = np.repeat(self.mesh.triangle_areas_m2() / 3.0, 3)
-        return np.bincount(self.triangles.ravel(), thirds, minlength=len(self.vertex))
-
-    @cached_property
     def is_object(self) -> Bool[np.ndarray, "p"]:
         """Which points belong to the scanned object."""
         is_object = np.zeros(len(self.vertex), bool)
         is_object[self.triangles[self.renderer.is_object]] = True
         return is_object
-
-    def spread_over_object(self, values: Float[np.ndarray, "p c"], width_m: float) -> Float[np.ndarray, "p c"]:
-        """Values of the object's points, diffused over its surface (`diffused`); 0 at all other points.
-
-        Points of one vertex get the same value. The total of each column over the object stays the same.
-        """
-        points = np.flatnonzero(self.is_object)
-        vertices, vertex = np.unique(self.vertex[points], return_inverse=True)
-        local = np.zeros(len(self.renderer.vertices), np.int64)
-        local[vertices] = np.arange(len(vertices))
-        areas_m2 = self.areas_m2[points]
-        to_vertices = scipy.sparse.csr_array((areas_m2, (vertex, np.arange(len(points)))))
-        at_vertices = (to_vertices @ values[points]) / np.maximum(np.bincount(vertex, areas_m2), 1e-30)[:, None]
-        triangles = local[self.renderer.triangles[self.renderer.is_object]]
-        spread = np.zeros_like(values)
-        spread[points] = diffused(self.renderer.vertices[vertices], triangles, at_vertices, width_m)[vertex]
-        return spread
 
     def surroundings(self, directions: int) -> Surroundings:
         """What is visible from each point, sampled in so many directions; cached."""
@@ -179,49 +154,3 @@ def _frames(normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
     tangent = np.cross(helper, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-30)
     return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
-
-
-def diffused(
-    vertices: Float[np.ndarray, "v 3"],
-    triangles: Int[np.ndarray, "t 3"],
-    values: Float[np.ndarray, "v c"],
-    width_m: float,
-) -> Float[np.ndarray, "v c"]:
-    """Values at the vertices after diffusion over the surface.
-
-    Solves (1 - w² / 2 Laplacian) u = values with linear finite elements: the steady state of diffusion with
-    absorption. On a flat surface a point spreads to a spot of standard deviation w = ``width_m``. The total of each
-    column over the surface stays the same, and values stay within the range of their column.
-    """
-    laplacian, areas_m2 = cotangent_laplacian(vertices, triangles)
-    # Vertices without triangles keep their value.
-    areas_m2 = np.where(areas_m2 > 0.0, areas_m2, areas_m2.mean())
-    matrix = scipy.sparse.diags_array(areas_m2) + 0.5 * width_m**2 * laplacian
-    factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    spread = np.zeros_like(values)
-    used = np.flatnonzero(values.any(axis=0))
-    for first in range(0, len(used), COLUMNS_AT_ONCE):
-        columns = used[first : first + COLUMNS_AT_ONCE]
-        spread[:, columns] = factors.solve(areas_m2[:, None] * values[:, columns].astype(float))
-    return spread
-
-
-def cotangent_laplacian(
-    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
-) -> tuple[scipy.sparse.csr_array, Float[np.ndarray, "v"]]:
-    """Positive semidefinite stiffness matrix of linear finite elements, and the area of each vertex (m²).
-
-    Negative cotangents of obtuse triangles are set to 0, which keeps diffused values within their range.
-    """
-    size = len(vertices)
-    matrix = scipy.sparse.csr_array((size, size))
-    areas_m2 = np.zeros(size)
-    for k in range(3):
-        apex, start, end = (triangles[:, (k + i) % 3] for i in range(3))
-        u, v = vertices[start] - vertices[apex], vertices[end] - vertices[apex]
-        doubled = np.linalg.norm(np.cross(u, v), axis=1)
-        half_cotangent = 0.5 * np.maximum(np.einsum("nk,nk->n", u, v), 0.0) / np.maximum(doubled, 1e-30)
-        matrix += scipy.sparse.csr_array((half_cotangent, (start, end)), shape=(size, size))
-        areas_m2 += np.bincount(apex, doubled / 6.0, minlength=size)
-    matrix = matrix + matrix.T
-    return scipy.sparse.csr_array(scipy.sparse.diags_array(matrix.sum(axis=1)) - matrix), areas_m2

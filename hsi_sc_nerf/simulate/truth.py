@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -173,7 +172,7 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
 
 
 def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None:
-    """Write the pixels of one frame atomically.
+    """Write the pixels of one frame.
 
     Weights are multiples of 1 / 2048 and exact in float16. The light is written only if it differs from the product
     of material weights and endmembers.
@@ -189,9 +188,7 @@ def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None
     if not np.array_equal(frame.light.spectra, frame.endmembers):
         arrays["light_spectra"] = frame.light.spectra
     arrays |= {f"illumination_{i}": factor for i, factor in enumerate(frame.light.illumination)}
-    writing = path.with_suffix(".writing.npz")
-    np.savez_compressed(writing, **arrays)
-    os.replace(writing, path)
+    np.savez_compressed(path, **arrays)
 
 
 def detector_path(session_dir: Path) -> Path:

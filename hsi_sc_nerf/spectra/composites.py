@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.spectra.bands import Spectra, require_bands
+from hsi_sc_nerf.spectra.bands import Spectra, covered, require_bands
 
 
 @dataclass(frozen=True)
@@ -39,21 +39,20 @@ COMPOSITES = {
 """By name."""
 
 
+def available_composites(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Composite]:
+    """The named composites that these band centres can show."""
+    return [one for one in COMPOSITES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
+
+
 def composite(
     spectra: Float[Spectra, "*shape bands"],
     wavelengths_nm: Float[np.ndarray, "bands"],
     rgb_nm: Sequence[float],
     name: str = "the composite",
 ) -> Float[Spectra, "*shape 3"]:
-    """Reflectance at the bands nearest to three wavelengths, linear and not clipped.
-
-    Args:
-        spectra: reflectance, bands last.
-        wavelengths_nm: centres of the bands.
-        rgb_nm: what to show as red, green and blue.
-        name: of the composite, for the error's text.
+    """Reflectance at the bands nearest to the wavelengths for red, green and blue; linear and not clipped.
 
     Raises:
-        InputError: a wavelength has no band near it.
+        InputError: a wavelength has no band near it; the message names the composite.
     """
     return spectra[..., require_bands(wavelengths_nm, rgb_nm, name).tolist()]

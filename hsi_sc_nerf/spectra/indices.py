@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.spectra.bands import Spectra, require_bands
+from hsi_sc_nerf.spectra.bands import Spectra, covered, require_bands
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,6 @@ class SpectralIndex:
     drawn_range: tuple[float, float]
     """Values at the two ends of a colour map; plant tissue lies between."""
     tells: str
-    reference: str
 
 
 def ratio(numerator: Float[Spectra, "*shape"], denominator: Float[Spectra, "*shape"]) -> Float[Spectra, "*shape"]:
@@ -43,15 +42,11 @@ def normalised_difference(a: Float[Spectra, "*shape"], b: Float[Spectra, "*shape
 INDICES = {
     index.name: index
     for index in (
+        # Rouse et al. 1974, Third ERTS-1 Symposium, NASA SP-351, 309-317, with the narrow bands of spectrometers.
         SpectralIndex(
-            "NDVI",
-            "(R800 - R670) / (R800 + R670)",
-            (800.0, 670.0),
-            normalised_difference,
-            (0.0, 1.0),
-            "green tissue",
-            "Rouse et al. 1974, Third ERTS-1 Symposium, NASA SP-351, 309-317, with the narrow bands of spectrometers",
+            "NDVI", "(R800 - R670) / (R800 + R670)", (800.0, 670.0), normalised_difference, (0.0, 1.0), "green tissue"
         ),
+        # Gitelson and Merzlyak 1994, Journal of Plant Physiology 143, 286-292.
         SpectralIndex(
             "red-edge NDVI",
             "(R750 - R705) / (R750 + R705)",
@@ -59,31 +54,23 @@ INDICES = {
             normalised_difference,
             (0.0, 0.8),
             "chlorophyll, where NDVI saturates; ripening and senescence",
-            "Gitelson and Merzlyak 1994, Journal of Plant Physiology 143, 286-292",
         ),
-        SpectralIndex(
-            "water index",
-            "R900 / R970",
-            (900.0, 970.0),
-            ratio,
-            (0.9, 1.3),
-            "water in the tissue",
-            "Peñuelas et al. 1997, International Journal of Remote Sensing 18, 2869-2875",
-        ),
+        # Peñuelas et al. 1997, International Journal of Remote Sensing 18, 2869-2875.
+        SpectralIndex("water index", "R900 / R970", (900.0, 970.0), ratio, (0.9, 1.3), "water in the tissue"),
     )
 }
 """By name."""
+
+
+def available_indices(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[SpectralIndex]:
+    """The named indices that these band centres can give."""
+    return [one for one in INDICES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
 
 
 def index_values(
     index: SpectralIndex, spectra: Float[Spectra, "*shape bands"], wavelengths_nm: Float[np.ndarray, "bands"]
 ) -> Float[Spectra, "*shape"]:
     """The index of each spectrum, from the bands nearest to its wavelengths; NaN where it is undefined.
-
-    Args:
-        index: which, one of ``INDICES`` or a new one.
-        spectra: reflectance, bands last.
-        wavelengths_nm: centres of the bands.
 
     Raises:
         InputError: a wavelength of the index has no band near it.

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from hsi_sc_nerf.data.cameras import FRAME_INDEX
+from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.progress import progress_bar
-from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, MIN_OPACITY, camera_rays, model_output, surface_depth
+from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, MIN_OPACITY, camera_rays, surface_depth
 
 MAX_DEPTH_RAYS = 300_000
 """Rays of all depth maps together. If the masks hold more pixels, cells of several pixels share a ray."""
@@ -25,7 +25,7 @@ MARGIN_CELLS = 5
 """Depth maps reach this far beyond the masks: rays beside the object show that the space there is empty. Without
 them, parts thinner than the truncation distance of the fused mesh would swell."""
 _DEPTH_TOLERANCE = 0.02
-"""About 2 mm."""
+"""A point this far behind the depth map is still visible: about 2 mm."""
 _SLOPE_TOLERANCE = 0.75
 """Within a cell the depth changes by half the cell's diagonal (0.71 of its side) times the surface's slope."""
 
@@ -60,7 +60,6 @@ class DepthRenders:
         cell_px: side of the cells, pixels.
         masks: pixels in which points may be seen.
         points: hits of the rays within the masks.
-        depth_tolerance: a point this far behind the depth map is still visible.
     """
 
     camera_to_world: Float[Tensor, "frames 4 4"]
@@ -70,7 +69,6 @@ class DepthRenders:
     cell_px: int
     masks: Bool[Tensor, "frames lines samples"]
     points: Float[np.ndarray, "hits 3"]
-    depth_tolerance: float = _DEPTH_TOLERANCE
 
     def views(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Iterator[FrameView]:
         """What each frame, in order, sees of points with outward unit normals."""
@@ -85,19 +83,14 @@ class DepthRenders:
         bounded = cosines.clamp_min(MIN_COSINE)
         slope = (1.0 - bounded.square()).clamp_min(0.0).sqrt() / bounded
         cell = distance * self.cell_px / min(self.intrinsics.fl_x, self.intrinsics.fl_y)
-        tolerance = self.depth_tolerance + _SLOPE_TOLERANCE * slope * cell
+        tolerance = _DEPTH_TOLERANCE + _SLOPE_TOLERANCE * slope * cell
         visible = inside & (cosines > MIN_COSINE) & (distance <= self._depth_of(frame, pixels) + tolerance)
         return FrameView(visible, cosines, xy_px, pixels)
 
     def most_frontal(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-        """The frame that sees each point most from the front.
-
-        Returns:
-            Its index (-1 if no frame sees the point), the point's image coordinates (x, y) in it, and the cosine
-            between normal and view, at least ``MIN_COSINE``.
-        """
+        """The frame that sees each point most from the front (-1 if none), its image coordinates, the cosine."""
         best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
         frames = torch.full((len(points),), -1, device=points.device)
         xy_px = points.new_zeros(len(points), 2)
@@ -137,7 +130,6 @@ def render_depth_maps(
     cameras: Cameras,
     masks: Bool[np.ndarray, "frames lines samples"],
     rays_per_batch: int,
-    depth_output_name: str = "depth",
     max_rays: int = MAX_DEPTH_RAYS,
 ) -> DepthRenders:
     """Depth maps of training cameras in the cells that the masks touch, and ``MARGIN_CELLS`` beyond them.
@@ -147,11 +139,7 @@ def render_depth_maps(
         cameras: the training cameras.
         masks: object's pixels in each camera's frame.
         rays_per_batch: rays rendered at a time.
-        depth_output_name: output of the model around which the surface is searched.
         max_rays: more pixels than this are rendered in cells of several pixels.
-
-    Raises:
-        InputError: the model has no such output.
     """
     lines, samples = masks.shape[1:]
     cell_px = max(1, int(np.ceil(np.sqrt(masks.sum() / max_rays))))
@@ -165,8 +153,7 @@ def render_depth_maps(
             xy_px = np.minimum((np.stack([sample, line], axis=1) + 0.5) * cell_px, (samples - 0.5, lines - 0.5))
             rays = camera_rays(cameras, frame, xy_px, model.device)
             outputs = model(rays)
-            initial_depth = model_output(outputs, depth_output_name, "depth")
-            depth, _ = surface_depth(model, rays.origins, rays.directions, initial_depth)
+            depth, _ = surface_depth(model, rays.origins, rays.directions, outputs["depth"])
             hit = outputs["accumulation"][:, 0] > MIN_OPACITY
             depths[frame, line, sample] = torch.where(hit, depth[:, 0], torch.inf)
             hit &= torch.from_numpy(mask_cells[frame, line, sample]).to(hit.device)

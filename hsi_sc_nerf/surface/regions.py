@@ -33,11 +33,6 @@ class Region:
     Attributes:
         contains: which points, given with outward unit normals, lie in the region.
         bounds: minimum and maximum of a box around the region; the surface is sampled only near it.
-
-    Example:
-        >>> region = box_region(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])) & EVERYWHERE
-        >>> region.contains(np.array([[0.5, 0.5, 0.5], [2.0, 0.0, 0.0]]), np.zeros((2, 3)))
-        array([ True, False])
     """
 
     contains: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, "n"]]
@@ -52,7 +47,6 @@ class Region:
 
 
 EVERYWHERE = Region(lambda points, _: np.ones(len(points), bool))
-"""The region that contains every point."""
 
 
 def in_box(points: Float[np.ndarray, "n 3"], box: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, "n"]:
@@ -63,17 +57,6 @@ def in_box(points: Float[np.ndarray, "n 3"], box: Float[np.ndarray, "2 3"]) -> B
 def box_region(box: Float[np.ndarray, "2 3"]) -> Region:
     """A box along the axes, given by its minimum and maximum."""
     return Region(lambda points, _: in_box(points, box), box)
-
-
-def cylinder_region(box: Float[np.ndarray, "2 3"]) -> Region:
-    """The cylinder parallel to z in a box with a square base."""
-    centre, radius = box[:, :2].mean(axis=0), (box[1, 0] - box[0, 0]) / 2.0
-
-    def contains(points: np.ndarray, _: np.ndarray) -> np.ndarray:
-        in_height = (points[:, 2] >= box[0, 2]) & (points[:, 2] <= box[1, 2])
-        return in_height & (np.linalg.norm(points[:, :2] - centre, axis=1) <= radius)
-
-    return Region(contains, box)
 
 
 def oriented_box_region(centre: Vector, roll_pitch_yaw: Vector, sides: Vector) -> Region:

@@ -15,7 +15,6 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn import functional
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.numerics import safe_ratio
 
@@ -24,7 +23,7 @@ MIN_OPACITY = 0.5
 SURFACE_OPACITY = 0.07
 """Opacity that a ray along the surface's normal has collected at the surface. Density begins at the true surface, for
 other views keep the space outside empty; how deep a ray gets before it is half absorbed depends on the length of the
-training (benchmarks/surface_depth.py)."""
+training (docs/validation/surface.md)."""
 INTERIOR_OPACITY = 0.25
 """Opacity at which the density gradient is read. Further out the gradient is noise."""
 SEARCH_DEPTH = 0.1
@@ -104,14 +103,7 @@ def opacity_crossing_depth(
 def camera_rays(
     cameras: Cameras, frames: Int[np.ndarray, "n"], xy_px: Float[np.ndarray, "n 2"], device: torch.device | str
 ) -> RayBundle:
-    """Rays of the measured cameras, which the model corrects, through image points (x, y) from the upper left corner.
-
-    Args:
-        cameras: one camera a frame.
-        frames: camera of each ray.
-        xy_px: image point of each ray, pixels.
-        device: device of the rays.
-    """
+    """Rays of the measured cameras, which the model corrects, through image points from the upper left corner."""
     return cameras.generate_rays(
         camera_indices=torch.from_numpy(np.asarray(frames)[:, None]),
         coords=torch.from_numpy(np.asarray(xy_px)[:, ::-1].copy()).float(),
@@ -130,15 +122,3 @@ def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tens
     if model.background is not None:
         spectra = safe_ratio(spectra - background * (1.0 - opacity), opacity, minimum=_MIN_RATIO_OPACITY)
     return outputs, spectra.clamp(0.0, 1.0)
-
-
-def model_output(outputs: dict[str, Tensor], name: str, option: str) -> Tensor:
-    """The model's output of a name, chosen by ``--OPTION-output-name``.
-
-    Raises:
-        InputError: the model has no such output.
-    """
-    if name not in outputs:
-        known = ", ".join(sorted(key for key in outputs if torch.is_tensor(outputs[key])))
-        raise InputError(f"--{option}-output-name {name}: the model has no such output; choose one of {known}.")
-    return outputs[name]

@@ -55,16 +55,18 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.points)
 
+    def columns(self) -> list[np.ndarray]:
+        """The attributes, in their order."""
+        return [getattr(self, field.name) for field in fields(self)]
+
     def select(self, rows: np.ndarray | slice) -> SurfacePoints:
         """The points that a slice, an index or a boolean array selects."""
-        return SurfacePoints(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return SurfacePoints(*(column[rows] for column in self.columns()))
 
     @staticmethod
     def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
         """The points of all parts, in their order."""
-        return SurfacePoints(
-            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(SurfacePoints))
-        )
+        return SurfacePoints(*map(np.concatenate, zip(*(part.columns() for part in parts), strict=True)))
 
 
 def sample_surface_points(
@@ -74,7 +76,6 @@ def sample_surface_points(
     rays_per_batch: int,
     box: Float[np.ndarray, "2 3"],
     region: Region = EVERYWHERE,
-    seed: int = 0,
 ) -> SurfacePoints:
     """Points spread evenly over the surface that at least one training frame sees.
 
@@ -85,17 +86,9 @@ def sample_surface_points(
         rays_per_batch: rays searched at a time.
         box: minimum and maximum of the object, which exclude the container.
         region: the points to keep.
-        seed: of the random positions.
 
     Raises:
         InputError: the model holds no object, or the region holds none of it.
-
-    Example:
-        >>> run = open_run(Path("config.yml"))
-        >>> masks = run.manager.train_pixel_sampler.masks
-        >>> renders = render_depth_maps(run.model, run.manager.train_dataset.cameras, masks, rays_per_batch=4096)
-        >>> box = run.to_scene(run.dataset.object_box_m)
-        >>> points = sample_surface_points(run.model, renders, 100_000, rays_per_batch=4096, box=box)
     """
     mesh = tsdf_fusion(renders, box)
     if mesh is None:
@@ -119,10 +112,10 @@ def sample_surface_points(
     with progress_bar("spreading points", "points", num_points) as update:
         # An oblique ray moves a point by more than MAX_SHIFT, but no further than the surface is searched.
         triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
-        parts = even_points(mesh.vertices, triangles, num_points, keep, seed)
-    if not parts:
+        points = even_points(mesh.vertices, triangles, num_points, keep) if len(triangles) else None
+    if points is None or not len(points):
         raise InputError("no point of the object lies in the selected region; make it larger.")
-    return SurfacePoints.concatenate(parts)
+    return points
 
 
 def even_points(
@@ -130,44 +123,27 @@ def even_points(
     triangles: Int[np.ndarray, "t 3"],
     count: int,
     keep: Callable[[Float[np.ndarray, "n 3"]], SurfacePoints],
-    seed: int = 0,
-) -> list[SurfacePoints]:
+) -> SurfacePoints:
     """``count`` points spread evenly over a mesh's area, after ``keep`` has rejected some candidates.
 
-    A small first sample gives the fraction that is kept, and so the number of candidates to try. Surplus points are
-    left out at random.
+    The fraction of the candidates that are kept gives the number to try next. Surplus points are left out at random.
 
     Args:
         vertices: of the mesh.
         triangles: of the mesh.
-        count: points to return, all parts together.
+        count: points to return; there are fewer if hardly any candidate is kept.
         keep: turns candidates on the mesh into as many or fewer points.
-        seed: of the random positions.
-
-    Returns:
-        The points, in parts. They are fewer than ``count`` if hardly any candidate is kept; the list is empty if none
-        is.
     """
-    if not len(triangles):
-        return []
-    rng = np.random.default_rng(seed)
-    tried = int(np.clip(count, *_PILOT_POINTS))
-    kept = len(keep(sample_surface(vertices, triangles, tried, seed=int(rng.integers(2**31)))))
+    rng = np.random.default_rng(0)
     parts: list[SurfacePoints] = []
-    found = 0
-    limit = _MAX_CANDIDATES * max(count, _MAX_BATCH)
-    while found < count and tried < (limit if kept else _MAX_BATCH):
-        needed = (count - found) * tried / kept * _MARGIN if kept else 10 * tried
-        batch = min(int(needed) + 1, _MAX_BATCH)
-        part = keep(sample_surface(vertices, triangles, batch, seed=int(rng.integers(2**31))))
-        tried, kept = tried + batch, kept + len(part)
-        surplus = found + len(part) - count
-        if surplus > 0:
-            part = part.select(np.sort(rng.permutation(len(part))[surplus:]))
-        if len(part):
-            parts.append(part)
-        found += len(part)
-    return parts
+    found = tried = 0
+    batch = int(np.clip(count, *_PILOT_POINTS))
+    while found < count and tried < (_MAX_CANDIDATES * max(count, _MAX_BATCH) if found else _MAX_BATCH):
+        parts.append(keep(sample_surface(vertices, triangles, batch, seed=int(rng.integers(2**31)))))
+        found, tried = found + len(parts[-1]), tried + batch
+        needed = (count - found) * tried / found * _MARGIN + 1 if found else 10 * tried
+        batch = min(int(needed), _MAX_BATCH)
+    return SurfacePoints.concatenate(parts).select(np.sort(rng.permutation(found)[:count]))
 
 
 @torch.no_grad()

@@ -8,22 +8,20 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from viser import GuiMarkdownHandle, ViserServer
 
-WIDTH_PX = 240
-"""Width of images in the viewer's panel."""
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure
+
+_WIDTH_IN = 2.5  # 240 px of the viewer's panel
 _DPI = 3 * 96  # three dots a pixel, sharp on high-resolution screens
-_STYLE: Any = {"font.size": 7, "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False}
-# Blue and vermilion of Okabe and Ito, which colour-blind readers can distinguish.
-_COLOURS = ("#0072B2", "#D55E00")
+_STYLE: Any = STYLE | {"font.size": 7, "axes.titlesize": 7, "axes.linewidth": 0.6}
 
 
 @rc_context(_STYLE)
@@ -31,25 +29,23 @@ def spectra_plot(
     wavelengths_nm: Float[np.ndarray, "bands"], spectra: Mapping[str, Float[np.ndarray, "bands"]], title: str
 ) -> bytes:
     """PNG of up to two named spectra over the wavelength; NaN leaves a gap."""
-    figure = _figure(170)
+    figure = new_figure(_WIDTH_IN, 1.77)
     axes = figure.add_subplot()
-    for (name, spectrum), colour in zip(spectra.items(), _COLOURS, strict=False):
+    for (name, spectrum), colour in zip(spectra.items(), COLOURS, strict=False):
         axes.plot(wavelengths_nm, spectrum, color=colour, linewidth=1.0, label=name)
     axes.set(xlabel="Wavelength (nm)", ylabel="Reflectance", title=title)
     axes.set_xlim(wavelengths_nm.min(), wavelengths_nm.max())
     axes.set_ylim(0.0, max(0.1, 1.05 * max(float(np.nanmax(spectrum)) for spectrum in spectra.values())))
-    axes.grid(color="0.9", linewidth=0.5)
-    axes.legend(frameon=False)
+    axes.legend()
     return _png(figure)
 
 
 @rc_context(_STYLE)
 def colour_bar(drawn_range: tuple[float, float], colours: str, label: str) -> bytes:
     """PNG of a colour map with its range."""
-    figure = _figure(46)
-    mappable = matplotlib.cm.ScalarMappable(Normalize(*drawn_range), colours)
-    bar = figure.colorbar(mappable, cax=figure.add_subplot(), orientation="horizontal")
-    bar.set_label(label)
+    figure = new_figure(_WIDTH_IN, 0.48)
+    mappable = ScalarMappable(Normalize(*drawn_range), colours)
+    figure.colorbar(mappable, cax=figure.add_subplot(), orientation="horizontal", label=label)
     return _png(figure)
 
 
@@ -58,15 +54,9 @@ def inline_image(png: bytes, text: str) -> str:
     return f"![{text}](data:image/png;base64,{base64.b64encode(png).decode()})"
 
 
-def _figure(height_px: int) -> Figure:
-    figure = Figure(figsize=(WIDTH_PX / 96, height_px / 96), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _png(figure: Figure) -> bytes:
     memory = io.BytesIO()
-    figure.savefig(memory, format="png")
+    figure.savefig(memory, format="png", dpi=_DPI)
     return memory.getvalue()
 
 

@@ -24,13 +24,12 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.data.cameras import FRAME_INDEX
 from hsi_sc_nerf.data.datamanager import SpectralDataset
+from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
-from hsi_sc_nerf.spectra.bands import covered
-from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
-from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.spectra.composites import COMPOSITES, available_composites, composite
+from hsi_sc_nerf.spectra.indices import INDICES, available_indices, index_values
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
@@ -57,10 +56,6 @@ def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
 
     Returns:
         The panel. It has no parameters and leaves checkpoints unchanged.
-
-    Example:
-        >>> pipeline = config.pipeline.setup(device="cpu")
-        >>> attach_spectral_panel(pipeline)
     """
     model = cast("SpectralModel", pipeline.model)
     panel = SpectralPanel(model.wavelengths_nm, model.num_train_data)
@@ -111,12 +106,8 @@ class SpectralPanel(torch.nn.Module):
             step=1.0,
             hint="Output 'band' shows the band nearest to this wavelength",
         )
-        offered = {
-            "composite": [n for n, c in COMPOSITES.items() if covered(wavelengths_nm, c.wavelengths_nm).all()],
-            "index": [n for n, i in INDICES.items() if covered(wavelengths_nm, i.wavelengths_nm).all()],
-        }
-        self.composite = self._dropdown("Composite", "composite", offered["composite"])
-        self.index = self._dropdown("Index", "index", offered["index"])
+        self.composite = self._dropdown("Composite", [one.name for one in available_composites(wavelengths_nm)])
+        self.index = self._dropdown("Index", [one.name for one in available_indices(wavelengths_nm)])
         self.legend = ViewerMarkdown(self._legend)
         self.measured_view = ViewerSlider(
             "Training view",
@@ -186,7 +177,7 @@ class SpectralPanel(torch.nn.Module):
             if seen.item():
                 curves["measured"] = np.where(valid[0], measured[0], np.nan)
                 angle = float(spectral_angle_map(point.spectrum[None, None], measured[None], valid[None]))
-                notes.append(f"spectral angle {angle:.3f} rad to {views.name(view)}")
+                notes.append(f"spectral angle {angle:.3f} rad to {views.dataset.frames[view].capture}")
         scale, transform = _object_frame(viewer)
         millimetres = (point.position / scale - transform[:, 3]) * 1000.0
         title = "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist())
@@ -198,16 +189,13 @@ class SpectralPanel(torch.nn.Module):
         """The attached viewer; None without one."""
         return getattr(self.control, "viewer", None)
 
-    def _dropdown(self, label: str, output: str, names: list[str]) -> ViewerDropdown | None:
-        if not names:
-            return None
-        return ViewerDropdown(
-            label,
-            names[0],
-            names,
-            cb_hook=lambda _: self.legend.show(self._legend()),
-            hint=f"What output '{output}' shows",
-        )
+    def _dropdown(self, label: str, names: list[str]) -> ViewerDropdown | None:
+        """A choice of what the output of the label's name shows; None without choices."""
+        hint = f"What output '{label.lower()}' shows"
+        return ViewerDropdown(label, names[0], names, cb_hook=self._explain, hint=hint) if names else None
+
+    def _explain(self, _: ViewerDropdown) -> None:
+        self.legend.show(self._legend())
 
     def _legend(self) -> str:
         """Explanation of the colours of the selected outputs."""

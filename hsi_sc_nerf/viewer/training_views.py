@@ -35,10 +35,6 @@ class TrainingViews:
         view = int(distances.argmin())
         return view if distances[view] <= SAME_POSITION else None
 
-    def name(self, view: int) -> str:
-        """Name of the view's capture."""
-        return self.dataset.frames[view].capture
-
     def metadata(self, view: int, device: torch.device | str) -> dict[str, Float[Tensor, "1 ..."]]:
         """Metadata that assign rays to this view in the model."""
         metadata = self.dataset.cameras[view : view + 1].metadata
@@ -60,10 +56,6 @@ class TrainingViews:
         self, view: int, directions: Float[Tensor, "*rays 3"]
     ) -> tuple[Float[Tensor, "n bands"], Bool[Tensor, "n bands"], Bool[Tensor, "*rays"]]:
         """Measured spectra of a view along rays from its camera's centre.
-
-        Args:
-            view: index of the view.
-            directions: directions of the rays in the scene.
 
         Returns:
             Reflectance of the nearest pixels of the rays within the view, which of its values are valid, and which of
@@ -101,8 +93,8 @@ def frame_pixels(
         distortion: k1, k2, p1, p2 (OpenCV).
     """
     turned = in_camera_frame(directions, rotation.reshape(9).expand(*directions.shape[:-1], 9))
-    places, forward = image_coordinates(turned, intrinsics, distortion)
-    pixels = places.flip(-1).floor().long()
+    points_px, forward = image_coordinates(turned, intrinsics, distortion)
+    pixels = points_px.flip(-1).floor().long()
     size = pixels.new_tensor([intrinsics.h, intrinsics.w])
     return pixels, forward & ((pixels >= 0) & (pixels < size)).all(dim=-1)
 

@@ -173,30 +173,22 @@ def test_spread_from_halves_is_that_of_independent_clouds():
     assert 0.35 < spread.volume_l / np.std(volumes, ddof=1) < 2.2
 
 
-def test_too_few_or_flat_points_are_refused():
-    points, normals = sphere_points(10)
-    with pytest.raises(InputError, match="export more points"):
-        closed_mesh(points, normals, MeshConfig())
-    points, normals = sphere_points(1000)
-    with pytest.raises(InputError, match="export more points"):
-        closed_mesh(points * [1.0, 1.0, 0.0], normals, MeshConfig())
-    with pytest.raises(InputError, match="it is in metres"):
-        closed_mesh(points * 1e-3, normals, MeshConfig())
-
-
 @pytest.mark.parametrize(
-    ("scale", "side", "base_height_m", "says"),
+    ("count", "scale", "side", "base_height_m", "says"),
     [
-        (100.0, 1.0, None, "is it in metres"),
-        (1e8, 1.0, None, "is it in metres"),
-        (1.0, -1.0, STAND_M, "normals do not point out"),
-        (1.0, 0.0, None, "normals do not point out"),
-        (1.0, 1.0, 1000.0 * STAND_M, "below the base at 70 m"),
-        (1.0, 1.0, STAND_M + 0.02, "below the base at 0.09 m"),
+        (10, 1.0, 1.0, None, "export more points"),
+        (1000, np.array([1.0, 1.0, 0.0]), 1.0, None, "export more points"),
+        (1000, 1e-3, 1.0, None, "it is in metres"),
+        (1000, 100.0, 1.0, None, "is it in metres"),
+        (1000, 1e8, 1.0, None, "is it in metres"),
+        (3000, 1.0, -1.0, STAND_M, "normals do not point out"),
+        (3000, 1.0, 0.0, None, "normals do not point out"),
+        (3000, 1.0, 1.0, 1000.0 * STAND_M, "below the base at 70 m"),
+        (3000, 1.0, 1.0, STAND_M + 0.02, "below the base at 0.09 m"),
     ],
 )
-def test_clouds_in_other_units_inside_out_or_below_their_base_are_refused(scale, side, base_height_m, says):
-    points, normals = sphere_points(3000, above=-0.93)
+def test_clouds_that_surround_nothing_or_in_other_units_are_refused(count, scale, side, base_height_m, says):
+    points, normals = sphere_points(count, above=-0.93)
     with pytest.raises(InputError, match=says):
         closed_mesh(scale * points, side * normals, MeshConfig(base_height_m=base_height_m))
 

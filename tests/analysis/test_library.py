@@ -88,16 +88,6 @@ def test_a_spectrum_is_refused_only_where_what_it_lacks_is_needed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "wavelength_nm\n400\n", "nm,a\n400,x\n", "nm,a\n400,0.1,0.2\n", "nm,a\n400,nan\n"]
-)
-def test_unreadable_tables_are_refused(tmp_path, content):
-    path = tmp_path / "library.csv"
-    path.write_text(content)
-    with pytest.raises(InputError, match=r"library\.csv"):
-        read_library(path)
-
-
-@pytest.mark.parametrize(
     ("old", "new", "says"),
     [
         ("wavelength = ", "centres = ", "lists no wavelengths"),
@@ -114,15 +104,22 @@ def test_envi_libraries_that_cannot_be_used_are_refused(tmp_path, old, new, says
         read_library(envi_library(tmp_path, old, new)[0])
 
 
-def test_missing_or_broken_envi_libraries_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_library(tmp_path / "none.sli")
-    (tmp_path / "lonely.sli").write_bytes(b"")
-    with pytest.raises(InputError, match=r"lonely\.hdr is missing"):
-        read_library(tmp_path / "lonely.sli")
-    (tmp_path / "lonely.hdr").write_text("no header")
-    with pytest.raises(InputError, match="no readable ENVI header"):
-        read_library(tmp_path / "lonely.sli")
-    (tmp_path / "lonely.sli").unlink()
-    with pytest.raises(InputError, match=r"lonely\.sli is missing"):
-        read_library(tmp_path / "lonely.hdr")
+@pytest.mark.parametrize(
+    ("given", "files", "says"),
+    [
+        ("a.sli", {}, "no such file"),
+        ("a.sli", {"a.sli": ""}, r"a\.hdr is missing"),
+        ("a.sli", {"a.sli": "", "a.hdr": "no header"}, "no readable ENVI header"),
+        ("a.hdr", {"a.hdr": "no header"}, r"a\.sli is missing"),
+        ("a.csv", {"a.csv": ""}, r"a\.csv"),
+        ("a.csv", {"a.csv": "wavelength_nm\n400\n"}, r"a\.csv"),
+        ("a.csv", {"a.csv": "nm,a\n400,x\n"}, r"a\.csv"),
+        ("a.csv", {"a.csv": "nm,a\n400,0.1,0.2\n"}, r"a\.csv"),
+        ("a.csv", {"a.csv": "nm,a\n400,nan\n"}, r"a\.csv"),
+    ],
+)
+def test_missing_or_broken_libraries_are_refused(tmp_path, given, files, says):
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=says):
+        read_library(tmp_path / given)

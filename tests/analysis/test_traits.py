@@ -10,7 +10,6 @@ from hsi_sc_nerf.analysis.classes import (
     classify,
     connected_regions,
     spectral_angles,
-    vertex_areas_m2,
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
@@ -20,15 +19,13 @@ from hsi_sc_nerf.analysis.traits import (
     RegionOfInterest,
     analyse,
     classified,
-    read_regions,
-    region_of_interest,
-    weighted_mean_and_sd,
+    mean_and_sd,
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
-from hsi_sc_nerf.simulate.scores.traits import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 31)
 GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
@@ -50,26 +47,15 @@ def test_angles_and_classes_do_not_depend_on_brightness():
     assert classify(spectra, LIBRARY.spectra, 0.1).tolist() == [0, 1, UNCLASSIFIED, 1]
 
 
-def test_areas_of_vertices_add_up():
-    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
-    assert vertex_areas_m2(mesh).sum() == pytest.approx(mesh.area_m2())
-
-
-def test_normals_point_outwards():
-    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
-    middle = mesh.vertices - [0.0, 0.0, 0.02]
-    assert ((mesh.vertex_normals() * middle).sum(axis=1) > 0.0).all()
-
-
 def test_class_areas_and_regions_of_two_halves():
     surface = two_halves()
     classes = classified(surface, LIBRARY, 0.1, smallest_region_m2=1e-6)
     half_m2 = surface.mesh.area_m2() / 2.0
     np.testing.assert_allclose(classes.areas_m2, half_m2, rtol=0.04)
     assert classes.areas_m2.sum() + classes.unclassified_m2 == pytest.approx(surface.mesh.area_m2())
-    assert {region.label for region in classes.regions} == {0, 1}
-    assert len(classes.regions) == 2
-    assert [np.sign(region.centre_m[1]) for region in sorted(classes.regions, key=lambda r: r.label)] == [1, -1]
+    assert surface.areas_m2.sum() == pytest.approx(surface.mesh.area_m2())
+    found = sorted((region.label, np.sign(region.centre_m[1])) for region in classes.regions)
+    assert found == [(0, 1), (1, -1)]
 
 
 def test_references_of_one_name_are_one_class():
@@ -88,10 +74,11 @@ def test_regions_that_do_not_touch_are_two_and_small_ones_are_not_listed():
     )
     mesh = quads(far)
     labels = np.zeros(len(mesh.vertices), int)
-    regions = connected_regions(mesh, labels, vertex_areas_m2(mesh), smallest_m2=0.5)
+    areas_m2 = SpectralMesh(mesh, np.ones((len(labels), 1)), NM[:1], labels == 0).areas_m2
+    regions = connected_regions(mesh, labels, areas_m2, smallest_m2=0.5)
     assert [region.area_m2 for region in regions] == pytest.approx([4.0, 1.0])
     assert regions[0].centre_m == pytest.approx((4.0, 1.0, 0.0), abs=0.2)
-    assert connected_regions(mesh, np.full(len(labels), UNCLASSIFIED), vertex_areas_m2(mesh), 0.0) == []
+    assert connected_regions(mesh, np.full(len(labels), UNCLASSIFIED), areas_m2, 0.0) == []
 
 
 def test_what_was_not_seen_is_in_no_class_and_no_mean():
@@ -100,40 +87,39 @@ def test_what_was_not_seen_is_in_no_class_and_no_mean():
     classes = classified(hidden, LIBRARY, 0.1, 1e-6)
     assert classes.areas_m2[1] == 0.0
     traits = analyse(hidden, classes=classes)
-    assert [region.name for region in traits.spectra] == [WHOLE, "green"]
-    np.testing.assert_allclose(traits.spectra[0].mean, GREEN, rtol=1e-5)
-    np.testing.assert_allclose(traits.spectra[0].sd, 0.0, atol=1e-6)
+    assert [region.name for region in traits.regions] == [WHOLE, "green"]
+    np.testing.assert_allclose(traits.regions[0].spectrum.mean, GREEN, rtol=1e-5)
+    np.testing.assert_allclose(traits.regions[0].spectrum.sd, 0.0, atol=1e-6)
     assert traits.seen_m2 == pytest.approx(classes.areas_m2[0])
 
 
 def test_indices_and_composites_of_regions():
     traits = analyse(two_halves(), [RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)])
     at = {nm: GREEN[np.abs(NM - nm).argmin()] for nm in (670.0, 800.0)}
-    ndvi = traits.indices["spot"]["NDVI"]
+    whole, spot = traits.regions
+    ndvi = spot.indices["NDVI"]
     assert ndvi.mean == pytest.approx((at[800.0] - at[670.0]) / (at[800.0] + at[670.0]), rel=1e-5)
     assert ndvi.sd == pytest.approx(0.0, abs=1e-6)
-    assert traits.composites["spot"]["CIR"].mean[:2] == pytest.approx([at[800.0], at[670.0]], rel=1e-5)
-    assert traits.indices[WHOLE]["NDVI"].sd > 0.05
-    assert traits.spectra[1].area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
+    assert spot.composites["CIR"].mean[:2] == pytest.approx([at[800.0], at[670.0]], rel=1e-5)
+    assert whole.indices["NDVI"].sd > 0.05
+    assert spot.area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
 
 
 def test_means_are_weighted_by_area():
     sides = ((0.0, 1.0), (3.0, 2.0))
     corners = [[[x, 0.0, 0.0], [x + s, 0.0, 0.0], [x + s, s, 0.0], [x, s, 0.0]] for x, s in sides]
     spectra = np.repeat(np.stack([GREEN, BROWN]), 4, axis=0).astype(np.float32)
-    whole = analyse(SpectralMesh(quads(np.array(corners)), spectra, NM, np.ones(8, bool))).spectra[0]
-    np.testing.assert_allclose(whole.mean, (GREEN + 4.0 * BROWN) / 5.0, rtol=1e-5)
-    np.testing.assert_allclose(whole.sd, 0.4 * np.abs(GREEN - BROWN), atol=1e-6)
+    whole = analyse(SpectralMesh(quads(np.array(corners)), spectra, NM, np.ones(8, bool))).regions[0]
+    np.testing.assert_allclose(whole.spectrum.mean, (GREEN + 4.0 * BROWN) / 5.0, rtol=1e-5)
+    np.testing.assert_allclose(whole.spectrum.sd, 0.4 * np.abs(GREEN - BROWN), atol=1e-6)
     assert whole.area_m2 == pytest.approx(5.0)
 
 
-def test_weighted_mean_and_sd_against_repeated_values():
-    values = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]])
-    mean, sd = weighted_mean_and_sd(values, np.array([1.0, 2.0, 1.0]))
-    np.testing.assert_allclose(mean, [np.mean([1, 3, 3, 5]), 3.0])
-    np.testing.assert_allclose(sd, [np.std([1, 3, 3, 5]), 1.0])
-    nothing, _ = weighted_mean_and_sd(np.array([np.nan]), np.array([1.0]))
-    assert np.isnan(nothing)
+def test_mean_and_sd_against_repeated_values():
+    found = mean_and_sd(np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]]), np.array([1.0, 2.0, 1.0]))
+    np.testing.assert_allclose(found.mean, [np.mean([1, 3, 3, 5]), 3.0])
+    np.testing.assert_allclose(found.sd, [np.std([1, 3, 3, 5]), 1.0])
+    assert np.isnan(mean_and_sd(np.array([np.nan]), np.array([1.0])).mean)
 
 
 def test_vertices_take_the_spectra_of_points_near_them():
@@ -190,21 +176,12 @@ def test_pictures_hold_tall_and_flat_objects(width_m, height_m, columns):
         assert hit.any(axis=1).mean() == pytest.approx(height_m / width_m * columns / 420 / 1.04, rel=0.05)
 
 
-def test_regions_from_yaml(tmp_path):
-    path = tmp_path / "regions.yaml"
-    path.write_text("bruise: {centre_m: [0.03, 0, 0.1], radius_m: 0.004}\n")
-    assert read_regions(path) == [RegionOfInterest("bruise", (0.03, 0.0, 0.1), 0.004)]
-    path.write_text("bruise: {centre_m: [0.03, 0], radius_m: 0.004}\n")
-    with pytest.raises(InputError, match=r"regions\.yaml"):
-        read_regions(path)
-    with pytest.raises(InputError, match="radius above 0"):
-        region_of_interest("spot", 0.0, 0.0, 0.0, 0.0)
-
-
 def test_regions_off_the_surface_or_of_one_name_are_refused():
     surface = two_halves()
     with pytest.raises(InputError, match="no seen surface within"):
         analyse(surface, [RegionOfInterest("spot", (0.1, 0.0, 0.0), 0.005)])
+    with pytest.raises(InputError, match="radius above 0"):
+        RegionOfInterest("spot", (0.0, 0.0, 0.0), 0.0)
     spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
     with pytest.raises(InputError, match="two regions are named spot"):
         analyse(surface, [spot, spot])

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import cv2
 import pytest
 import torch
-from nerfstudio.engine.trainer import writer
 
 from hsi_sc_nerf.benchmark import results, run
 from hsi_sc_nerf.benchmark.configurations import (
@@ -164,7 +163,6 @@ def in_this_process(monkeypatch):
     """Runs in this process, which has nerfstudio imported."""
 
     def run_step(name, argv, log):
-        writer.EVENT_WRITERS.clear()  # those of earlier runs, whose folders may be gone
         run.main(Path(argv[-2]), Path(argv[-1]))
 
     monkeypatch.setattr(benchmark, "run_step", run_step)
@@ -179,11 +177,7 @@ def made_up(monkeypatch):
         ran.names.append(name)
         if name in ran.fails:
             raise InputError(f"the step '{name}' failed with status 1; what it said is above and in {log}.")
-        if name.startswith("rehearsal"):
-            found = {"iterations": 30, "iteration_seconds": 0.1}
-            Path(json.loads(Path(argv[-2]).read_text())["output_dir"]).mkdir()
-        else:
-            found = {"setup_seconds": 0.1, "checkpoints": [asdict(c) for c in made_up_run("a").checkpoints]}
+        found = {"setup_seconds": 0.1, "checkpoints": [asdict(c) for c in made_up_run("a").checkpoints]}
         Path(argv[-1]).write_text(json.dumps(found))
 
     monkeypatch.setattr(benchmark, "run_step", run_step)
@@ -229,39 +223,41 @@ def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_pat
     assert cv2.imread(str(tmp_path / "benchmark.png")).std() > 5
 
 
+@pytest.mark.slow
 def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
     job = benchmark._job(named_configuration("ours"), command(tiny_dataset, tmp_path), tiny_dataset[0])
     ends = []
     for checkpoints in ((1.0,), (0.17, 0.67, 1.0)):
-        writer.EVENT_WRITERS.clear()
         ends.append(run.train(replace(job, checkpoints=checkpoints))["checkpoints"][-1]["metrics"])
     assert ends[0] == pytest.approx(ends[1], rel=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["wall", "cpu"])
-def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, clock):
-    writer.EVENT_WRITERS.clear()
-    asked = command(tiny_dataset, tmp_path, iterations=None, train_seconds=0.3, clock=clock)
-    found = run.rehearse(benchmark._job(named_configuration("ours"), asked, tiny_dataset[0]))
-    assert found["iterations"] == max(1, round(0.3 / found["iteration_seconds"]))
+def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, in_this_process, clock):
+    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=0.5, clock=clock)
+    asked.main()
+    (run,) = json.loads((tmp_path / "benchmark.json").read_text())["runs"]
+    last = run["checkpoints"][-1]
+    assert last["iteration"] >= 2
+    assert 0.1 < last["train_seconds" if clock == "wall" else "cpu_seconds"] < 3.0
 
 
 def test_finished_runs_are_not_repeated(tiny_dataset, tmp_path, made_up):
     asked = command(tiny_dataset, tmp_path)
     asked.main()
-    assert made_up.names == ["result of ours", "result of no-normals"]
+    assert made_up.names == ["training of ours", "training of no-normals"]
     asked.main()
     assert len(made_up.names) == 2
     (tmp_path / "ours" / "result.json").unlink()
     asked.main()
-    assert made_up.names[2:] == ["result of ours"]
+    assert made_up.names[2:] == ["training of ours"]
     assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == [
         "ours",
         "no-normals",
     ]
     replace(asked, configurations=(), iterations=4).main()
-    assert made_up.names[3:] == ["result of no-normals"]
+    assert made_up.names[3:] == ["training of no-normals"]
 
 
 def test_a_run_on_another_dataset_is_another_run(tiny_dataset, tmp_path, made_up):
@@ -271,23 +267,12 @@ def test_a_run_on_another_dataset_is_another_run(tiny_dataset, tmp_path, made_up
     asked.main()
     (data / "transforms.json").write_text((data / "transforms.json").read_text() + "\n")
     asked.main()
-    assert made_up.names == ["result of ours"] * 2
-
-
-def test_a_rehearsal_comes_before_a_run_of_given_time_and_is_kept(tiny_dataset, tmp_path, made_up):
-    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=3.0)
-    made_up.fails = ("result of ours",)
-    with pytest.raises(InputError, match="result of ours"):
-        asked.main()
-    made_up.fails = ()
-    asked.main()
-    assert made_up.names == ["rehearsal of ours", "result of ours", "result of ours"]
-    assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["rehearsal.json", "result.json"]
+    assert made_up.names == ["training of ours"] * 2
 
 
 def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):
-    made_up.fails = ("result of ours",)
-    with pytest.raises(InputError, match=r"1 of 2 configurations failed.*result of ours"):
+    made_up.fails = ("training of ours",)
+    with pytest.raises(InputError, match=r"1 of 2 configurations failed.*training of ours"):
         command(tiny_dataset, tmp_path).main()
     assert list((tmp_path / "ours").iterdir()) == []
     assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
@@ -325,6 +310,7 @@ def test_table_has_a_row_for_each_stage():
     assert "GPU memory, MiB" in table([made_up_run("a", 5.0)])[0]
 
 
+@pytest.mark.slow
 def test_csv_and_picture_take_more_runs_than_there_are_colours(tmp_path):
     runs = [made_up_run(f"run-{i}") for i in range(9)]
     write_csv(tmp_path / "runs.csv", runs)

@@ -9,7 +9,7 @@ from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.effects.illumination import IlluminationFalloff
+from hsi_sc_nerf.simulate.effects.image import IlluminationFalloff
 
 SIZE, BANDS, DARK = 96, 6, 120.0
 NM = np.linspace(500.0, 800.0, BANDS)

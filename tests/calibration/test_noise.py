@@ -1,4 +1,4 @@
-"""The noise of a reading, against simulated and drawn exposures whose noise is known."""
+"""The noise of a reading and of a reflectance, against exposures whose noise is known."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from hsi_sc_nerf.calibration.noise import (
     measure_noise,
     photon_transfer_slope,
     read_noise,
+    reflectance_uncertainty,
 )
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.simulate import frames
 from hsi_sc_nerf.simulate.effects import read_effects
+from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, ReadoutContext
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
 
@@ -75,17 +77,15 @@ def dirt():
     return light
 
 
-@pytest.mark.parametrize("tarp", [weave, flicker, gradient, dirt])
+def edges():
+    return np.where(REGION, 1.0, 0.1)[..., None]
+
+
+@pytest.mark.parametrize("tarp", [weave, flicker, gradient, dirt, edges])
 def test_slope_despite_an_uneven_tarp(tarp):
     white, dark = exposures(tarp())
     noise = measure_noise(white, REGION, dark, saturation_counts=4095)
     assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
-
-
-def test_edges_outside_the_region_do_not_count():
-    light = np.where(REGION, 1.0, 0.1)[..., None]
-    white, dark = exposures(light)
-    assert measure_noise(white, REGION, dark).counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
 
 
 def test_saturated_readings_and_dead_elements_are_left_out():
@@ -102,7 +102,10 @@ def test_saturated_readings_and_dead_elements_are_left_out():
 
 
 def test_flickering_elements_do_not_count_for_the_read_noise():
-    _, dark = exposures()
+    white, dark = exposures()
+    # A dark cube of another width is not matched by sample.
+    narrow = measure_noise(white, REGION, dark[:, :20], dead=np.zeros((SAMPLES, BANDS), bool))
+    assert narrow.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
     dark[::2, :3] += 80
     np.testing.assert_allclose(read_noise(dark), np.hypot(READ_NOISE, np.sqrt(QUANTISATION_VARIANCE)), rtol=0.05)
 
@@ -135,12 +138,6 @@ def test_a_tarp_that_tells_nothing():
     assert not noise.photon_noise_measured
 
 
-def test_dark_cube_of_another_width():
-    white, dark = exposures()
-    noise = measure_noise(white, REGION, dark[:, :20], dead=np.zeros((SAMPLES, BANDS), bool))
-    assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
-
-
 def test_real_white_reference_follows_the_line():
     folder = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
     white, dark = (open_cube(folder / f"{name}_reference_crop.hdr").read() for name in ("white", "dark"))
@@ -154,3 +151,80 @@ def test_real_white_reference_follows_the_line():
 def test_variance_of_a_reading():
     noise = NoiseModel(np.array([3.0, 4.0]), 0.5, True, True)
     np.testing.assert_allclose(noise.variance(np.array([[10.0, 20.0], [-5.0, 0.0]])), [[14.0, 26.0], [9.0, 16.0]])
+
+
+# The uncertainty of a reflectance, against exposures drawn again and again with the simulator's noise.
+
+DARK_LEVEL, ELECTRONS_PER_COUNT, READ_ELECTRONS = 120.0, 7.3, 40.0
+FEW_BANDS = 12
+WHITE = np.linspace(400.0, 3300.0, FEW_BANDS)
+LEVELS = (0.03, 0.4, 0.95)
+EXPOSURES, PIXELS = 250, 40
+
+
+def read_out(signal, rng):
+    context = ReadoutContext(4095, DARK_LEVEL, ELECTRONS_PER_COUNT, {}, rng)
+    counts = (signal + DARK_LEVEL).astype(np.float32)
+    for effect in (PhotonNoise(), ReadNoise(electrons=READ_ELECTRONS)):
+        counts = effect.read_out(counts, context)
+    return np.rint(counts).astype(np.float64)
+
+
+def moving_average(spectrum, width):
+    reach = width // 2
+    return np.stack([spectrum[..., b - r : b + r + 1].mean(axis=-1) for b, r in enumerate(reach)], axis=-1)
+
+
+# The white averaged over many pixels, and over so few that its share shows; many dark lines, and few.
+@pytest.mark.slow
+@pytest.mark.parametrize(("white_lines", "columns", "dark_lines"), [(20, 20, 16), (1, 3, 2)])
+def test_agrees_with_repeated_exposures(white_lines, columns, dark_lines):
+    rng = np.random.default_rng(8)
+    panel, white_time_over_sample_time = np.linspace(0.95, 0.85, FEW_BANDS), 0.6
+    width = np.array([1, 3, *[5] * (FEW_BANDS - 4), 3, 1])
+    sample_signal = np.array(LEVELS)[:, None, None] / panel * WHITE / white_time_over_sample_time
+    reflectance = []
+    for _ in range(EXPOSURES):
+        white = read_out(np.broadcast_to(WHITE, (white_lines, columns, FEW_BANDS)), rng)
+        white_dark = read_out(np.zeros((dark_lines, columns, FEW_BANDS)), rng).mean(axis=0)
+        level = moving_average((white - white_dark).mean(axis=(0, 1)), width)
+        # A pixel a column, so that each has its own dark.
+        sample = read_out(np.broadcast_to(sample_signal, (len(LEVELS), PIXELS, FEW_BANDS)), rng)
+        sample_dark = read_out(np.zeros((dark_lines, PIXELS, FEW_BANDS)), rng).mean(axis=0)
+        reflectance.append(panel * white_time_over_sample_time * (sample - sample_dark) / level)
+    spread = np.sqrt(np.var(reflectance, axis=0, ddof=1).mean(axis=1))
+    noise = NoiseModel(
+        np.full(FEW_BANDS, np.hypot(READ_ELECTRONS / ELECTRONS_PER_COUNT, np.sqrt(1 / 12))),
+        1.0 / ELECTRONS_PER_COUNT,
+        True,
+        True,
+    )
+    uncertainty = reflectance_uncertainty(
+        noise,
+        WHITE,
+        white_pixels=white_lines * columns,
+        smoothing_bands=width,
+        frame_dark_readings=dark_lines,
+        white_dark_readings=dark_lines * columns,
+        panel_reflectance=panel,
+        integration_ratio=white_time_over_sample_time,
+    )
+    expected = uncertainty.standard_deviation(np.broadcast_to(np.array(LEVELS)[:, None], (len(LEVELS), FEW_BANDS)))
+    # What the exposures have in common is known from these alone: their number limits how well.
+    common = uncertainty.quadratic * np.array(LEVELS)[:, None] ** 2 / expected**2
+    tolerance = 0.05 if white_lines > 1 else 0.12
+    assert (common.max() > 0.3) == (white_lines == 1)
+    np.testing.assert_allclose(spread, expected, rtol=tolerance)
+    assert np.abs(np.log(spread / expected)).mean() < 0.05
+
+
+def test_without_dark_there_is_no_noise_of_it():
+    noise = NoiseModel(np.full(3, 2.0), 0.0, True, False)
+    white = np.full(3, 100.0)
+    known = {"white_pixels": 10, "smoothing_bands": np.ones(3, int)}
+    none = reflectance_uncertainty(noise, white, frame_dark_readings=0, white_dark_readings=0, **known)
+    np.testing.assert_allclose(none.constant, 4e-4)
+    np.testing.assert_allclose(none.quadratic, 0.4e-4)
+    single = reflectance_uncertainty(noise, white, frame_dark_readings=1, white_dark_readings=10, **known)
+    np.testing.assert_allclose(single.constant, 8e-4)
+    np.testing.assert_allclose(single.quadratic, 0.8e-4)

@@ -81,22 +81,12 @@ def test_the_basis_is_orthonormal_and_keeps_squared_errors():
 
 def test_a_smaller_rank_costs_accuracy_and_the_rank_above_the_noise_hardly_any():
     true, spectra, deviation = noisy(4000, 5, times=8.0)
-    subspaces = [find_subspace(spectra, deviation, rank=rank) for rank in (3, 4, None)]
+    subspaces = [find_subspace(spectra, deviation, max_rank=most) for most in (3, 4, 16)]
     assert [subspace.basis.shape[1] for subspace in subspaces] == [3, 4, 5]
     errors = [projection_error(true, subspace) for subspace in subspaces]
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.1 * np.sqrt(np.mean(deviation**2))
-
-
-def test_the_most_directions_are_bounded():
-    _, spectra, deviation = noisy(1500, 5)
-    subspace = find_subspace(spectra, deviation, max_rank=2)
-    assert subspace.basis.shape[1] == 2
-    assert find_subspace(spectra, deviation).basis.shape[1] == 5
     assert find_subspace(spectra[:, :5]).basis.shape[1] <= 5
-    for rank in (0, BANDS + 1):
-        with pytest.raises(InputError, match=f"not {rank};"):
-            find_subspace(spectra, deviation, rank=rank)
 
 
 def test_noise_is_estimated_from_the_spectra():
@@ -144,11 +134,11 @@ def test_spectra_of_a_packed_dataset_are_sampled(tmp_path):
                 camera_to_world=np.eye(4),
             )
         )
-    spectra, valid = sample_training_spectra(frames, 400, foreground_fraction=0.25, seed=1)
+    spectra, valid = sample_training_spectra(frames, 400)
     assert spectra.shape == valid.shape == (400, 3)
-    assert (spectra[:, 0] > 0.75).sum() == 100
+    assert (spectra[:, 0] > 0.75).sum() == 200
     assert 0 < (~valid).sum() == (spectra == 0).sum()
-    np.testing.assert_array_equal(sample_training_spectra(frames, 400, 0.25, 1)[0], spectra)
+    np.testing.assert_array_equal(sample_training_spectra(frames, 400)[0], spectra)
 
 
 @pytest.mark.slow
@@ -164,7 +154,7 @@ def test_noise_of_a_real_kernel_is_the_detectors_where_it_is_dark():
     np.testing.assert_allclose(ratio[:15], 1.0, atol=0.1)  # hardly any light there
     assert ratio[150:450].min() > 1.5  # where there is, it adds its own
     lit = spectra[:, 40:540]
-    basis = find_subspace(lit, rank=12).basis
+    basis = find_subspace(lit, max_rank=12).basis
     residual, noise = lit - lit @ basis @ basis.T, estimate_noise(lit)
     outside = 1.0 - np.square(basis).sum(axis=1)
     excess = (np.square(residual).sum(axis=1).mean() - noise**2 @ outside) / lit.shape[1]

@@ -5,12 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.evaluation.registration import (
-    align_by_features,
-    plane_step,
-    refine,
-    robust_radius,
-)
+from hsi_sc_nerf.evaluation.registration import align_by_features, refine, robust_radius
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.camera import Similarity
 
@@ -63,26 +58,6 @@ def test_a_robust_radius_is_the_balls_and_outliers_do_not_change_it() -> None:
     ball = surface(False, 5000, 0) + 3.0
     assert robust_radius(ball) == pytest.approx(0.04, rel=0.01)
     assert robust_radius(np.concatenate([ball, np.full((500, 3), 9.0)])) == pytest.approx(0.04, rel=0.1)
-
-
-@pytest.mark.parametrize("with_scale", [False, True])
-def test_steps_to_known_planes_find_the_motion(with_scale: bool) -> None:
-    rng = np.random.default_rng(0)
-    points, normals = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    moved = moved_by(1.1 if with_scale else 1.0, (5, -8, 3), (0.1, 0.2, -0.1))
-    found, here = Similarity(), moved(points)
-    for _ in range(15):
-        found = plane_step(found(here), points, normals, with_scale).after(found)
-    np.testing.assert_allclose(found(here), points, atol=1e-9)
-
-
-def test_what_planes_do_not_determine_stays() -> None:
-    # Points above a plane: nothing says how far to slide in it, or how far to turn.
-    rng = np.random.default_rng(0)
-    points = np.c_[rng.normal(size=(50, 2)), np.full(50, 0.5)]
-    step = plane_step(points, points * [1, 1, 0] + [3, 4, 0], np.tile([0.0, 0, 1], (50, 1)))
-    np.testing.assert_allclose(step(points), points - [0, 0, 0.5], atol=1e-9)
 
 
 @pytest.mark.parametrize(("with_scale", "scale"), [(False, 1.0), (True, 1.05)])

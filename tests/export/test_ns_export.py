@@ -1,6 +1,7 @@
 import sys
 import types
 
+import pytest
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
@@ -28,15 +29,14 @@ def config_file(folder, config):
     return path
 
 
-def spectral_calls(monkeypatch, calls):
-    spectral = types.ModuleType("hsi_sc_nerf.export.spectral_export")
-    spectral.export_spectral_point_cloud = lambda options: calls.append("spectral")
-    monkeypatch.setitem(sys.modules, "hsi_sc_nerf.export.spectral_export", spectral)
+@pytest.fixture
+def calls(monkeypatch):
+    made = []
+    monkeypatch.setattr(adapter, "_export_spectral_cloud", lambda options: made.append("spectral"))
+    return made
 
 
-def test_other_methods_keep_nerfstudios_export(tmp_path, monkeypatch):
-    calls = []
-    spectral_calls(monkeypatch, calls)
+def test_other_methods_keep_nerfstudios_export(tmp_path, calls):
     module = fake_exporter(calls)
     adapter._wrap_main(module)
     module.ExportPointCloud(config_file(tmp_path, TrainerConfig(method_name="nerfacto"))).main()
@@ -45,9 +45,7 @@ def test_other_methods_keep_nerfstudios_export(tmp_path, monkeypatch):
     assert calls == ["stock", "spectral"]
 
 
-def test_a_module_under_import_is_wrapped_once_complete(tmp_path, monkeypatch):
-    calls = []
-    spectral_calls(monkeypatch, calls)
+def test_a_module_under_import_is_wrapped_once_complete(tmp_path, monkeypatch, calls):
     complete = fake_exporter(calls)
     module = types.ModuleType(adapter._EXPORTER)
     monkeypatch.setitem(sys.modules, adapter._EXPORTER, module)
@@ -58,3 +56,8 @@ def test_a_module_under_import_is_wrapped_once_complete(tmp_path, monkeypatch):
     assert type(module) is types.ModuleType
     module.ExportPointCloud(config_file(tmp_path, hsi_sc_nerf.config)).main()
     assert calls == ["spectral"]
+
+
+def test_bad_input_ends_in_one_sentence(tmp_path):
+    with pytest.raises(SystemExit, match=r"hsi-sc-nerf: .*there is no such file"):
+        adapter._export_spectral_cloud(types.SimpleNamespace(load_config=tmp_path / "x.yml", output_dir=tmp_path))

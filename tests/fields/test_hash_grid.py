@@ -4,7 +4,14 @@ import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
-from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings, interpolate_hash_grid
+from hsi_sc_nerf.fields.hash_grid import (
+    COARSEST_GRID,
+    LEVEL_GROWTH,
+    FusedHashEncoding,
+    fuse_hash_encodings,
+    grid_for_resolution,
+    interpolate_hash_grid,
+)
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
@@ -18,23 +25,17 @@ def _pair(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_fused_grid_equals_nerfstudio(device):
-    reference, fused = _pair(device)
-    x = torch.rand(200, 3, device=device)
-    torch.testing.assert_close(fused.pytorch_fwd(x), reference.pytorch_fwd(x), rtol=1e-5, atol=1e-8)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_gradients_equal_nerfstudio(device):
+def test_features_and_gradients_equal_nerfstudios(device):
     reference, fused = _pair(device)
     upstream = torch.randn(200, reference.get_out_dim(), device=device)
-    gradients = []
+    found = []
     for encoding in (reference, fused):
         x = torch.rand(200, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
-        (encoding.pytorch_fwd(x) * upstream).sum().backward()
-        gradients.append((encoding.hash_table.grad, x.grad))
-    torch.testing.assert_close(gradients[1][0], gradients[0][0], rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(gradients[1][1], gradients[0][1], rtol=1e-3, atol=1e-5)
+        features = encoding.pytorch_fwd(x)
+        (features * upstream).sum().backward()
+        found.append((features, encoding.hash_table.grad, x.grad))
+    for ours, theirs in zip(*found[::-1], strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -98,3 +99,29 @@ def test_the_viewer_may_interpolate_while_training_does():
     with ThreadPoolExecutor(3) as threads:
         found = threads.map(lambda _: interpolate_hash_grid(points, table, scalings, 64), range(60))
         assert all(torch.equal(beside, alone) for beside in found)
+
+
+def test_half_a_pixel_is_a_cell():
+    assert grid_for_resolution(0.2, 0.002).finest == 200
+    assert grid_for_resolution(0.2, 0.0005).finest == 800
+
+
+@pytest.mark.parametrize("footprint_m", [0.003, 0.002, 0.001, 0.0004])
+def test_levels_grow_no_faster_than_they_may_and_are_not_more_than_needed(footprint_m):
+    size = grid_for_resolution(0.2, footprint_m)
+    growth = size.finest / COARSEST_GRID
+    assert growth ** (1 / (size.levels - 1)) <= LEVEL_GROWTH + 1e-9
+    assert growth ** (1 / (size.levels - 2)) > LEVEL_GROWTH
+
+
+def test_tables_hold_every_second_cell_of_a_plane_within_bounds():
+    assert 2 ** grid_for_resolution(0.2, 0.002).log2_table >= 200**2 / 2
+    assert 2 ** (grid_for_resolution(0.2, 0.002).log2_table - 1) < 200**2 / 2
+    assert grid_for_resolution(0.2, 0.05).log2_table == 14
+    assert grid_for_resolution(0.2, 0.0001).log2_table == 19
+
+
+def test_lengths_of_nothing_are_refused():
+    for lengths in ((0.0, 0.001), (0.2, 0.0), (0.2, float("nan"))):
+        with pytest.raises(ValueError, match="not both above 0"):
+            grid_for_resolution(*lengths)

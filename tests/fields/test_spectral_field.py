@@ -6,8 +6,7 @@ from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
-from hsi_sc_nerf.fields.spectral_field import BandGroupField, SpectralField, SpectralProposalField, group_sizes
-from hsi_sc_nerf.models.renderers import composite_band_groups, weights_of_depths
+from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])
 SIZE = {
@@ -40,10 +39,10 @@ def rays(count: int = 5, samples: int = 6, reach: float = 1.0, device: str = "cp
     return RaySamples(frustums, deltas=frustums.ends - frustums.starts).to(device)
 
 
-def field(kind: type[SpectralField] = SpectralField, **options) -> SpectralField:
+def field(**options) -> SpectralField:
     """A field whose hash grid is not nearly constant, as it is when it is new."""
     torch.manual_seed(0)
-    made = kind(BOX, BANDS, **{**SIZE, **options})
+    made = SpectralField(BOX, BANDS, **SIZE, **options)
     with torch.no_grad():
         made.mlp_base.model[0].hash_table *= 1e4
     return made
@@ -80,10 +79,8 @@ def test_coefficients_start_at_the_mean_and_are_not_bounded():
 
 
 @pytest.mark.parametrize("distortion", [None, contraction()])
-@pytest.mark.parametrize("kind", ["one density", "band groups"])
-def test_density_gradient_is_that_of_the_log_density(distortion, kind):
-    groups = {} if kind == "one density" else {"kind": BandGroupField, "num_groups": 3}
-    made = field(**groups, spatial_distortion=distortion).double()
+def test_density_gradient_is_that_of_the_log_density(distortion):
+    made = field(spatial_distortion=distortion).double()
     points = torch.tensor([[0.31, 0.22, -0.61], [-0.43, -0.17, 0.03], [0.52, -0.33, 0.11]], dtype=torch.double)
     if distortion is not None:
         points[0] *= 4.0  # in the contracted part
@@ -111,47 +108,6 @@ def test_the_box_ends_the_scene_unless_space_is_contracted(reach):
         arguments = (BOX, BANDS) if kind is SpectralField else (BOX,)
         assert kind(*arguments, **options).density_fn(far) == 0
         assert kind(*arguments, **options, spatial_distortion=contraction()).density_fn(far) > 0
-
-
-def test_groups_are_neighbours_and_even():
-    assert group_sizes(204, 3) == (68, 68, 68)
-    assert group_sizes(7, 3) == (2, 2, 3)
-    assert group_sizes(7, 1) == (7,)
-    for groups in (0, 8):
-        with pytest.raises(ValueError, match="7 bands"):
-            group_sizes(7, groups)
-
-
-def test_weights_are_nerfstudios():
-    samples = rays()
-    densities = torch.rand(5, 6, 1, generator=torch.Generator().manual_seed(0)) * 20
-    torch.testing.assert_close(weights_of_depths(densities * samples.deltas), samples.get_weights(densities))
-
-
-def test_one_group_is_the_usual_field():
-    usual, grouped, samples = field(), field(BandGroupField, num_groups=1), rays()
-    grouped.load_state_dict(usual.state_dict())
-    outputs, of_groups = usual(samples), grouped(samples)
-    density = outputs[FieldHeadNames.DENSITY]
-    torch.testing.assert_close(of_groups[FieldHeadNames.DENSITY], density)
-    expected = (samples.get_weights(density) * outputs[FieldHeadNames.RGB]).sum(-2)
-    spectra, opacity = composite_band_groups(of_groups[FieldHeadNames.RGB], grouped.group_sizes)
-    torch.testing.assert_close(spectra, expected)
-    torch.testing.assert_close(opacity, samples.get_weights(density).sum(-2).expand(-1, BANDS))
-
-
-def test_groups_have_their_own_densities_and_share_a_mean():
-    made, samples = field(BandGroupField, num_groups=3), rays(reach=0.3)
-    outputs = made(samples)
-    channels = outputs[FieldHeadNames.RGB]
-    depths = channels[..., BANDS:]
-    assert depths.shape == (5, 6, 3)
-    assert depths.std(dim=-1).min() > 0
-    torch.testing.assert_close((depths / samples.deltas).mean(-1, keepdim=True), outputs[FieldHeadNames.DENSITY])
-    composited, _ = composite_band_groups(channels, made.group_sizes)
-    (of_last_band,) = torch.autograd.grad(composited[:, -1].sum(), channels)
-    assert (of_last_band[..., BANDS : BANDS + 2] == 0).all()
-    assert (of_last_band[..., BANDS + 2] != 0).any()
 
 
 def test_spectra_depend_on_the_view_only_where_they_may():

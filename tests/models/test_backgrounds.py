@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, pinhole_cameras
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
-from hsi_sc_nerf.models.backgrounds import BackgroundImage, BackgroundSpectrum, interpolate_image
+from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 
 LENS = PinholeIntrinsics(60, 40, 80.0, 85.0, 31.0, 18.5)
 STRAIGHT = (0.0, 0.0, 0.0, 0.0)
@@ -30,7 +31,7 @@ def rays_of_frame(angle_deg, pixels):
 
 
 def background(image, cell_px=1, distortion=STRAIGHT):
-    return BackgroundImage(image, cell_px, LENS, distortion, SPECTRUM)
+    return Background(SPECTRUM, image, cell_px, LENS, distortion)
 
 
 def random_image(lines=LENS.h, samples=LENS.w):
@@ -59,27 +60,14 @@ def test_image_coordinates_agree_with_opencv():
 
 def test_rays_of_a_distorted_camera_find_their_own_pixel():
     """Through nerfstudio's ray generator, which takes the lens's distortion off the pixels."""
-    from nerfstudio.cameras.cameras import Cameras
-
     pose = turntable_camera_to_world(look_at([0.5, 0.1, 0.3], [0.0, 0.0, 0.05]), 40.0)
-    k1, k2, p1, p2 = CURVED
-    cameras = Cameras(
-        camera_to_worlds=torch.from_numpy(pose[None, :3]).float(),
-        fx=LENS.fl_x,
-        fy=LENS.fl_y,
-        cx=LENS.cx,
-        cy=LENS.cy,
-        width=LENS.w,
-        height=LENS.h,
-        distortion_params=torch.tensor([[k1, k2, 0.0, 0.0, p1, p2]]),
-        metadata={"camera_rotation": torch.from_numpy(pose[:3, :3].reshape(1, 9)).float()},
-    )
+    cameras = pinhole_cameras(pose[None], LENS, np.array(CURVED))
     rays = cameras.generate_rays(camera_indices=0)
-    camera_directions = in_camera_frame(rays.directions, rays.metadata["camera_rotation"])
+    camera_directions = in_camera_frame(rays.directions, rays.metadata[CAMERA_ROTATION])
     pixels, _ = image_coordinates(camera_directions, LENS, CURVED)
     np.testing.assert_allclose(pixels.numpy(), pixel_centres(), atol=2e-3)
     image = random_image()
-    seen = background(image, distortion=CURVED)(rays.directions, rays.metadata["camera_rotation"])
+    seen = background(image, distortion=CURVED)(rays.directions, rays.metadata[CAMERA_ROTATION])
     torch.testing.assert_close(seen, image, atol=2e-3, rtol=0)
 
 
@@ -116,7 +104,6 @@ def test_nothing_is_learned_and_the_picture_is_saved():
 
 
 def test_one_spectrum_behind_every_ray():
-    spectrum = torch.tensor([0.7, 0.8])
-    behind = BackgroundSpectrum(spectrum)(torch.rand(4, 6, 3), None)
-    assert behind.shape == (4, 6, 2)
-    torch.testing.assert_close(behind[3, 5], spectrum)
+    directions, rotations = rays_of_frame(30.0, pixel_centres())
+    torch.testing.assert_close(background(None)(directions, rotations), SPECTRUM.expand(40, 60, 3))
+    assert set(background(None).state_dict()) == {"spectrum"}

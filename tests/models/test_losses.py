@@ -21,25 +21,6 @@ def pair(shape: tuple[int, ...] = (5, 6, 31)) -> tuple[torch.Tensor, torch.Tenso
     return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
 
 
-def half_mask() -> torch.Tensor:
-    return (torch.arange(30) % 3 == 0).reshape(5, 6)
-
-
-@pytest.mark.parametrize("mask", [None, half_mask()], ids=["all", "masked"])
-def test_losses_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    squares, angles = [], []
-    for row in range(5):
-        for column in range(6):
-            if mask is not None and not mask[row, column]:
-                continue
-            p, t = predicted[row, column].double().numpy(), target[row, column].double().numpy()
-            squares.append(np.sum((p - t) ** 2) / 31)
-            angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
-    assert hsi_loss(predicted, target, mask).item() == pytest.approx(np.mean(squares), rel=1e-6)
-    assert angular_loss(predicted, target, mask).item() == pytest.approx(np.mean(angles), rel=1e-6)
-
-
 def test_hsi_loss_does_not_depend_on_the_number_of_bands() -> None:
     for bands in (1, 204):
         assert hsi_loss(torch.full((7, bands), 0.5), torch.full((7, bands), 0.3)).item() == pytest.approx(0.04)
@@ -52,49 +33,20 @@ def test_angular_loss_knows_shape_only() -> None:
     assert angular_loss(0.01 * predicted, target).item() == pytest.approx(angular_loss(predicted, target).item())
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_gradients_match_finite_differences(loss) -> None:
-    predicted, target = (values.double() for values in pair((2, 3, 5)))
-    mask = torch.tensor([[True, False, True], [True, True, False]])
-    assert torch.autograd.gradcheck(lambda values: loss(values, target, mask), (predicted.requires_grad_(),))
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_an_empty_mask_costs_nothing(loss) -> None:
-    predicted, target = pair()
-    predicted.requires_grad_()
-    value = loss(predicted, target, torch.zeros(5, 6, dtype=torch.bool))
-    value.backward()
-    assert value.item() == 0
-    assert not predicted.grad.any()
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_pixels_outside_the_mask_may_be_anything(loss) -> None:
-    predicted, target = pair()
-    expected = loss(predicted, target, half_mask())
-    target[~half_mask()] = float("nan")
-    predicted.requires_grad_()
-    value = loss(predicted, target, half_mask())
-    value.backward()
-    assert value.item() == expected.item()
-    assert torch.isfinite(predicted.grad).all()
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-30, 1e-6, 1.0, 6e4, 1e30, 3e38])
+@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-6, 1.0, 6e4, 3e38])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_and_gradients_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
     predicted, target = pair()
-    largest = torch.finfo(dtype).max
-    predicted = (scale * predicted.double()).clamp(max=largest).to(dtype).requires_grad_()
-    for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
-        predicted.grad = None
-        value = loss(predicted, against)
-        value.backward()
-        assert value.dtype == torch.float32
-        assert torch.isfinite(value)
-        assert torch.isfinite(predicted.grad).all()
+    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
+    for valid in (None, some_valid()):
+        for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
+            predicted.grad = None
+            value = loss(predicted, against, valid)
+            value.backward()
+            assert value.dtype == torch.float32
+            assert torch.isfinite(value)
+            assert torch.isfinite(predicted.grad).all()
 
 
 def test_a_dark_spectrum_pulls_no_harder_than_the_floor_allows() -> None:
@@ -122,36 +74,21 @@ def some_valid() -> torch.Tensor:
     return valid
 
 
-@pytest.mark.parametrize("mask", [None, half_mask()], ids=["all", "masked"])
-def test_only_valid_values_count(mask: torch.Tensor | None) -> None:
+@pytest.mark.parametrize("flagged", [False, True])
+def test_losses_are_the_papers_formulas_over_valid_values(flagged) -> None:
     predicted, target = pair()
-    valid = some_valid()
+    valid = some_valid() if flagged else torch.ones(5, 6, 31, dtype=torch.bool)
     squares, angles = [], []
-    for row in range(5):
-        for column in range(6):
-            if mask is not None and not mask[row, column]:
-                continue
-            bands = [band for band in range(31) if valid[row, column, band]]
-            p, t = predicted[row, column, bands].double().numpy(), target[row, column, bands].double().numpy()
-            squares.extend((p - t) ** 2)
-            if len(bands) >= 2:
-                angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
-    assert hsi_loss(predicted, target, mask, valid).item() == pytest.approx(np.mean(squares), rel=1e-6)
-    assert angular_loss(predicted, target, mask, valid).item() == pytest.approx(np.mean(angles), rel=1e-6)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_everything_valid_changes_nothing(loss) -> None:
-    predicted, target = (values.requires_grad_() for values in pair())
-    everything = torch.ones_like(predicted, dtype=torch.bool)
-    gradients = []
-    for valid in (None, everything):
-        predicted.grad = None
-        value = loss(predicted, target, half_mask(), valid)
-        value.backward()
-        gradients.append((value.detach(), predicted.grad))
-    for with_none, with_valid in zip(*gradients, strict=True):
-        torch.testing.assert_close(with_valid, with_none, rtol=1e-6, atol=1e-12)
+    spectra = (values.reshape(30, 31).numpy() for values in (valid, predicted.double(), target.double()))
+    for bands, p, t in zip(*spectra, strict=True):
+        p, t = p[bands], t[bands]
+        squares.extend((p - t) ** 2)
+        if bands.sum() >= 2:
+            angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
+    assert len(angles) == 30 - 2 * flagged
+    valid = valid if flagged else None
+    assert hsi_loss(predicted, target, valid).item() == pytest.approx(np.mean(squares), rel=1e-6)
+    assert angular_loss(predicted, target, valid).item() == pytest.approx(np.mean(angles), rel=1e-6)
 
 
 @pytest.mark.parametrize("anything", [0.0, 1e30, float("nan"), float("inf")])
@@ -159,10 +96,10 @@ def test_everything_valid_changes_nothing(loss) -> None:
 def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: float) -> None:
     predicted, target = pair()
     valid = some_valid()
-    expected = loss(predicted, target, None, valid)
+    expected = loss(predicted, target, valid)
     target[~valid] = predicted[~valid] = anything
     predicted.requires_grad_()
-    value = loss(predicted, target, None, valid)
+    value = loss(predicted, target, valid)
     value.backward()
     assert value.item() == expected.item()
     assert not predicted.grad[~valid].any()
@@ -174,7 +111,7 @@ def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: flo
 def test_a_batch_without_measurements_costs_nothing(loss) -> None:
     predicted, target = pair()
     predicted.requires_grad_()
-    value = loss(predicted, target * float("nan"), None, torch.zeros(5, 6, 31, dtype=torch.bool))
+    value = loss(predicted, target * float("nan"), torch.zeros(5, 6, 31, dtype=torch.bool))
     value.backward()
     assert value.item() == 0
     assert not predicted.grad.any()
@@ -189,32 +126,20 @@ def test_the_direction_floor_is_a_root_mean_square_of_the_valid_bands() -> None:
     assert angular_loss(predicted, target, valid=valid).item() == pytest.approx(alone.item(), rel=1e-6)
 
 
+@pytest.mark.parametrize("flagged", [False, True])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_gradients_over_valid_values_match_finite_differences(loss) -> None:
+def test_gradients_match_finite_differences(loss, flagged) -> None:
     predicted, target = (values.double() for values in pair((2, 3, 5)))
-    valid = some_valid()[1:3, :3, :5]
-    assert torch.autograd.gradcheck(lambda values: loss(values, target, valid=valid), (predicted.requires_grad_(),))
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-38, 1.0, 6e4, 3e38])
-@pytest.mark.parametrize("loss", LOSSES)
-def test_losses_of_valid_values_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
-    predicted, target = pair()
-    predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
-    value = loss(predicted, target.to(dtype), None, some_valid())
-    value.backward()
-    assert value.dtype == torch.float32
-    assert torch.isfinite(value)
-    assert torch.isfinite(predicted.grad).all()
+    valid = some_valid()[1:3, :3, :5] if flagged else None
+    assert torch.autograd.gradcheck(lambda values: loss(values, target, valid), (predicted.requires_grad_(),))
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_validity_that_does_not_fit_is_refused(loss) -> None:
     predicted, target = pair()
-    for valid in (half_mask(), torch.ones(5, 6, 31), torch.ones(5, 6, 30, dtype=torch.bool)):
+    for valid in (torch.ones(5, 6, dtype=torch.bool), torch.ones(5, 6, 31), torch.ones(5, 6, 30, dtype=torch.bool)):
         with pytest.raises(ValueError, match="the validity of values of shape"):
-            loss(predicted, target, None, valid)
+            loss(predicted, target, valid)
 
 
 def test_the_angle_loss_is_the_angle() -> None:

@@ -13,7 +13,6 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.packed.cube import FLAGGED
@@ -120,19 +119,14 @@ def test_weights_of_another_dataset_or_model_are_refused(pipeline, changed, told
         pipeline.load_pipeline(state, 0)
 
 
-@pytest.mark.parametrize(("groups", "told"), [(0, "take 1 at least"), (99, "has 12 bands")])
-def test_density_groups_that_there_cannot_be(flagged_dataset, groups, told):
-    config = pipeline_config(flagged_dataset)
-    config.model.head = "direct"
-    with pytest.raises((SystemExit, InputError), match=told):
-        replace(config, model=replace(config.model, density_groups=groups)).setup(device="cpu")
+def test_a_basis_has_no_spectrum_at_the_last_sample(flagged_dataset):
+    config = pipeline_config(flagged_dataset).model
+    with pytest.raises(SystemExit, match=r"--pipeline\.model\.head direct"):
+        replace(config, head="basis", background="last-sample")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("groups", [1, 2])
-def test_nerfstudios_rgba_pictures_are_opaque(flagged_dataset, groups):
-    config = pipeline_config(flagged_dataset)
-    config.model.head, config.model.density_groups = "direct", groups
+def test_nerfstudios_rgba_pictures_are_opaque(pipeline):
     rgb = torch.rand(3, 4, 3)
-    rgba = config.setup(device="cpu").model.get_rgba_image({"rgb": rgb, "accumulation": torch.zeros(3, 4, 1)})
+    rgba = pipeline.model.get_rgba_image({"rgb": rgb, "accumulation": torch.zeros(3, 4, 1)})
     torch.testing.assert_close(rgba, torch.cat([rgb, torch.ones(3, 4, 1)], -1))

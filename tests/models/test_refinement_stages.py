@@ -24,7 +24,7 @@ def held_out_positions(pipeline):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["off", "turntable", "free", "free-discarded"])
+@pytest.mark.parametrize("mode", ["off", "turntable", "free-discarded"])
 def test_a_mode_through_both_stages(tiny_dataset, tmp_path, monkeypatch, mode):
     monkeypatch.setattr(hsi_sc_nerf.config.pipeline.model.camera_optimizer, "mode", mode)
     whole = trainer(tiny_dataset, tmp_path / "whole")

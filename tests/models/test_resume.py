@@ -147,6 +147,7 @@ def test_a_second_stage_after_another_runs_first_is_resumed_where_it_was(tiny_da
     assert resumed.plan.at(resumed._start_step).config.name == "masked"
 
 
+@pytest.mark.slow
 def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, tmp_path, whole):
     """Though its last step may be where the first stage of the longer run would end."""
     made = longer(tiny_dataset, tmp_path, switch=STEPS, max_num_iterations=2 * STEPS, load_dir=whole.checkpoint_dir)
@@ -167,22 +168,8 @@ def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, 
     torch.save({"step": 3}, damaged)
     with pytest.raises(SystemExit, match="is no checkpoint that hsi-sc-nerf can go on from"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
-    state = checkpoint(whole.checkpoint_dir)
-    state["training"]["weights"] = {"a": torch.zeros(1)}
-    torch.save(state, damaged)
-    with pytest.raises(SystemExit, match="--ema-decay"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
-
-
-@pytest.mark.slow
-def test_checkpoints_of_older_versions_load_or_are_refused(tiny_dataset, tmp_path, whole):
-    older = checkpoint(whole.checkpoint_dir)
-    older["training"]["weights"] = {}  # older versions kept averaged weights here, if there were any
-    torch.save(older, tmp_path / "step-000000019.ckpt")
-    made = longer(tiny_dataset, tmp_path, load_dir=tmp_path, max_num_iterations=STEPS + 4)
-    assert differences(made.pipeline.state_dict(), older["pipeline"]) == []
-
-    older["pipeline"]["_model.background.correction"] = torch.zeros(2, 2, 12)  # of a learned image
-    torch.save(older, tmp_path / "step-000000019.ckpt")
+    other = checkpoint(whole.checkpoint_dir)
+    other["pipeline"]["_model.background.correction"] = torch.zeros(2, 2, 12)
+    torch.save(other, damaged)
     with pytest.raises(SystemExit, match="other settings of the model"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)

@@ -1,10 +1,13 @@
 """Stages, checkpoints and skipped steps of real, tiny training runs."""
 
+import copy
+
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 from small_trainer import STEPS, trainer
 
+from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
@@ -48,12 +51,12 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 
 @pytest.mark.slow
 def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path):
-    """Frozen groups, loss weights, learning rates and the paper's rays, by stage."""
+    """Frozen groups, learning rates and the paper's rays, by stage."""
     first, second = full_frame_stage(), masked_stage()
-    first.frozen_groups, first.angular_loss_mult, first.group_lr = ("proposal_networks",), 0.0, {"fields": (0.1, 0.1)}
-    second.frozen_groups, second.hsi_loss_mult, second.foreground_ray_fraction = ("camera_opt", "fields"), 9.0, 1.0
+    first.frozen_groups, first.group_lr = ("proposal_networks",), {"fields": (0.1, 0.1)}
+    second.frozen_groups, second.foreground_ray_fraction = ("camera_opt", "fields"), 1.0
     made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
-    weight, seen, changed = made.pipeline.model.config.angular_loss_mult, [], []
+    rates, changed = [], []
     original = made.train_iteration
 
     def train_iteration(step):
@@ -62,23 +65,36 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path):
         for name, group in made.optimizers.parameters.items():
             if any(not torch.equal(a, b) for a, b in zip(before[name], group, strict=True)):
                 changed.append((step, name))
-        config = made.pipeline.model.config
-        lr = made.optimizers.optimizers["fields"].param_groups[0]["lr"]
-        seen.append((config.angular_loss_mult, config.hsi_loss_mult, lr, "angular_loss" in result[1]))
+        rates.append(made.optimizers.optimizers["fields"].param_groups[0]["lr"])
         return result
 
     made.train_iteration = train_iteration
     made.train()
-    assert seen[:3] == [(0.0, 0.75, pytest.approx(1e-3), False)] * 3
-    assert [row[:2] for row in seen[3:]] == [(weight, 9.0)] * 3
+    assert rates[:3] == pytest.approx([1e-3] * 3)
     assert {name for step, name in changed if step < 3} == {"fields", "camera_opt"}
     assert {name for step, name in changed if step >= 3} == {"proposal_networks"}
-    assert made.config.pipeline.model.hsi_loss_mult == 0.75  # the run's own configuration stays as it is
 
 
-def test_impossible_settings_end_in_a_sentence(tiny_dataset, tmp_path):
-    with pytest.raises(SystemExit, match=r"hsi-sc-nerf: .*named 'x'"):
-        trainer(tiny_dataset, tmp_path, full_frame=StageConfig("a", 1.0, frozen_groups=("x",)))
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"max_num_iterations": 0}, "--max-num-iterations is 0"),
+        ({"full_frame": StageConfig("a", 1.0, frozen_groups=("x",), learn_after={})}, "group 'x'"),
+        ({"full_frame": StageConfig("a", 1.0, learn_after={"table": 0.1})}, "group 'table'"),
+        ({"full_frame": StageConfig("a", 1.0, foreground_ray_fraction=1.2)}, "--full-frame.foreground-ray-fraction"),
+        ({"masked": StageConfig("b", -0.5)}, "--masked.fraction is -0.5"),
+        ({"masked": StageConfig("b", 1.0, lr_end=0.0)}, "--masked.lr-end is 0.0"),
+    ],
+)
+def test_impossible_settings_are_one_sentence_before_anything_is_written(tmp_path, changes, told):
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.timestamp, config.experiment_name = tmp_path, "run", "x"
+    for name, value in changes.items():
+        setattr(config, name, value)
+    for refused in (config.save_config, lambda: config.setup(local_rank=0, world_size=1).setup()):
+        with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{told}[^\n]*\.$"):
+            refused()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
@@ -89,24 +105,17 @@ def test_several_devices_are_refused(tiny_dataset, tmp_path):
 
 
 @pytest.mark.slow
-def test_stage_one_alone_can_be_continued(tiny_dataset, tmp_path):
+def test_stage_one_alone_can_be_continued_and_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
     first = trainer(tiny_dataset, tmp_path / "first")
     first.train()
     kept = first.base_dir / "stage-full-frame"
     assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
-
     second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
     assert second._start_step == 3
     second.train()
     assert second.step == STEPS - 1
     assert second._stage.config.name == "masked"
-
-
-@pytest.mark.slow
-def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path)
-    made.train()
-    again = trainer(tiny_dataset, tmp_path / "again", load_dir=made.checkpoint_dir)
+    again = trainer(tiny_dataset, tmp_path / "again", load_dir=first.checkpoint_dir)
     with pytest.raises(SystemExit, match="max-num-iterations"):
         again.train()
 
@@ -135,9 +144,9 @@ def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path, max_nonfinite_steps=2)
-    poison(made, {1, 2, 3, 4, 5})
-    with pytest.raises(SystemExit, match=r"step 2 skipped.*last good checkpoint"):
+    made = trainer(tiny_dataset, tmp_path, max_num_iterations=30)
+    poison(made, range(1, 30))
+    with pytest.raises(SystemExit, match=r"step 20 skipped.*last good checkpoint"):
         made.train()
     (checkpoint,) = made.checkpoint_dir.glob("*.ckpt")
     allow_nerfstudio_checkpoints()

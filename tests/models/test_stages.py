@@ -1,15 +1,15 @@
 import pytest
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.config import hsi_sc_nerf_paper
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
-    exponential_decay,
     full_frame_stage,
     masked_stage,
-    plan_after,
     plan_stages,
-    plan_within,
+    resumed_plan,
     step_seed,
 )
 
@@ -43,11 +43,11 @@ def test_a_stage_of_no_steps_is_left_out():
 
 
 def test_impossible_plans_are_refused():
-    with pytest.raises(ValueError, match="exceed"):
+    with pytest.raises(InputError, match="exceed"):
         plan_stages((StageConfig("a", 0.5, num_iterations=10), StageConfig("b", 0.5)), 5)
-    with pytest.raises(ValueError, match="fractions add up to 0"):
+    with pytest.raises(InputError, match="fractions add up to 0"):
         plan_stages((StageConfig("a", 0.0), StageConfig("b", 0.0)), 5)
-    with pytest.raises(ValueError, match="no iterations"):
+    with pytest.raises(InputError, match="nothing to train"):
         plan_stages((StageConfig("a", 1.0),), 0)
 
 
@@ -69,11 +69,9 @@ def test_a_group_may_have_learning_rates_of_its_own():
 
 def test_released_schedule_hardly_decays_over_the_stages():
     """nerfacto's exponential decay to 1e-4 of 1e-2 over 200k steps, of which the paper runs 20k, then 20k again."""
-    ends = [exponential_decay(0.01, 200_000, step) for step in (0, 20_000, 40_000)]
-    assert ends == pytest.approx([1.0, 0.630957, 0.398107], rel=1e-5)
-    first = Stage(StageConfig("a", 1.0, lr_start=ends[0], lr_end=ends[1]), start=0, end=20_001)
-    assert first.lr_factor(7_000, "fields") == pytest.approx(exponential_decay(0.01, 200_000, 7_000))
-    assert exponential_decay(0.01, 200_000, 300_000) == 0.01
+    config = hsi_sc_nerf_paper.config
+    ends = [config.full_frame.lr_start, config.full_frame.lr_end, config.masked.lr_start, config.masked.lr_end]
+    assert ends == pytest.approx([1.0, 0.630957, 0.630957, 0.398107], rel=1e-5)
 
 
 def test_poses_move_once_the_scene_has_a_shape():
@@ -91,53 +89,31 @@ def test_any_group_can_be_frozen():
     assert Stage(masked_stage(), 0, 2).learns("camera_opt", 1) is False
 
 
-def test_a_stage_sets_the_loss_weights_that_it_names():
-    assert StageConfig("a", 1.0).loss_weights() == {}
-    assert StageConfig("a", 1.0, angular_loss_mult=0.0).loss_weights() == {"angular_loss_mult": 0.0}
+ABC = plan_stages((StageConfig("a", 1.0), StageConfig("b", 1.0), StageConfig("c", 1.0)), 30)
 
 
-@pytest.mark.parametrize(
-    ("fields", "sentence"),
-    [
-        ({"foreground_ray_fraction": 1.2}, "foreground-ray-fraction 1.2"),
-        ({"boundary_ray_fraction": -0.1}, "boundary-ray-fraction -0.1"),
-        ({"fraction": -0.5}, "fraction -0.5 is below 0"),
-        ({"lr_end": 0.0}, "lr-end 0.0 is not above 0"),
-        ({"group_lr": {"fields": (1.0, -1.0)}}, "group-lr of fields"),
-        ({"frozen_groups": ("poses",)}, "no parameter group is named 'poses'; there are fields, camera_opt"),
-        ({"learn_after": {"table": 0.1}}, "named 'table'"),
-    ],
-)
-def test_impossible_stages_are_refused(fields, sentence):
-    with pytest.raises(ValueError, match=f"late: .*{sentence}"):
-        StageConfig("late", **({"fraction": 1.0, "learn_after": {}} | fields)).check(("fields", "camera_opt"))
-    StageConfig("late", 1.0, foreground_ray_fraction=1.0).check(("fields", "camera_opt"))
+def ends(plan):
+    return [(stage.config.name, stage.end) for stage in plan.stages]
 
 
-def test_a_completed_stage_is_followed_by_the_next_however_long_it_was():
-    plan = plan_stages((StageConfig("a", 1.0), StageConfig("b", 1.0), StageConfig("c", 1.0)), 30)
-    for next_step in (4, 10, 25):
-        after = plan_after(plan, "a", next_step)
-        assert [(stage.config.name, stage.end) for stage in after.stages] == [
-            ("a", next_step),
-            ("b", next_step + 10),
-            ("c", next_step + 20),
-        ]
-        assert after.at(next_step).config.name == "b"
-    assert plan_after(plan, "a", 10) == plan
-    assert plan_after(plan, "c", 12) == plan
-    assert plan_after(plan, "gone", 12) == plan
+@pytest.mark.parametrize("next_step", [4, 25])
+def test_a_completed_stage_is_followed_by_the_next_however_long_it_was(next_step):
+    plan = resumed_plan(ABC, "a", 0, completed_at=next_step)
+    assert ends(plan) == [("a", next_step), ("b", next_step + 10), ("c", next_step + 20)]
+    assert plan.at(next_step).config.name == "b"
 
 
-def test_a_stage_that_began_elsewhere_stays_there():
-    plan = plan_stages((StageConfig("a", 1.0), StageConfig("b", 1.0), StageConfig("c", 1.0)), 30)
-    for start in (4, 25):
-        within = plan_within(plan, "b", start)
-        assert [(stage.config.name, stage.end) for stage in within.stages] == [
-            *(("a", start), ("b", start + 10), ("c", start + 20))
-        ]
-        assert within.at(start).start == start
-    assert plan_within(plan, "b", 10) == plan_within(plan, "d", 7) == plan
+@pytest.mark.parametrize("start", [4, 25])
+def test_a_stage_that_began_elsewhere_stays_there(start):
+    plan = resumed_plan(ABC, "b", start)
+    assert ends(plan) == [("a", start), ("b", start + 10), ("c", start + 20)]
+    assert plan.at(start).start == start
+
+
+def test_a_checkpoint_of_the_same_plan_changes_nothing():
+    assert resumed_plan(ABC, "a", 0) == resumed_plan(ABC, "b", 10) == ABC
+    assert resumed_plan(ABC, "a", 0, completed_at=10) == resumed_plan(ABC, "c", 20, completed_at=30) == ABC
+    assert resumed_plan(ABC, "gone", 7) == resumed_plan(ABC, "gone", 7, completed_at=12) == ABC
 
 
 def test_every_step_has_random_numbers_of_its_own():

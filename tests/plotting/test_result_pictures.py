@@ -13,7 +13,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.plotting.result_pictures import draw_cloud, draw_spectra, draw_views
 
 WAVELENGTHS = np.linspace(400.0, 1000.0, 7)
-RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (217, 217, 217)
+RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
 
 def drawn(path: Path) -> np.ndarray:
@@ -30,23 +30,14 @@ def plain(colour: tuple[int, int, int]) -> np.ndarray:
     return np.broadcast_to(np.array(colour, np.uint8), (20, 30, 3))
 
 
-def test_views_stand_above_their_renderings_and_errors(tmp_path: Path) -> None:
+def test_views_stand_above_their_renderings(tmp_path: Path) -> None:
     path = tmp_path / "views.png"
-    angles = np.full((20, 30), 0.02)
-    angles[:10] = np.nan
-    draw_views(path, [plain(RED)] * 2, [plain(GREEN) / 255.0] * 2, ["a", "b"], [angles, angles])
+    draw_views(path, [plain(RED)] * 2, [plain(GREEN) / 255.0] * 2, ["a", "b"])
     picture = drawn(path)
-    red, green, grey = (where(picture, colour) for colour in (RED, GREEN, GREY))
+    red, green = (where(picture, colour) for colour in (RED, GREEN))
     assert len(red) == pytest.approx(len(green), rel=0.05)
-    assert len(grey) == pytest.approx(len(red) / 2, rel=0.1)
-    # The smoothed edges of letters hold a few grey pixels too.
-    assert red[:, 0].max() < green[:, 0].min() < green[:, 0].max() < np.percentile(grey[:, 0], 2)
-
-
-@pytest.mark.parametrize("angles", [None, [np.full((20, 30), np.nan)], [np.zeros((20, 30))]])
-def test_a_single_view_with_and_without_angles(tmp_path: Path, angles) -> None:
-    draw_views(tmp_path / "views.png", [plain(RED)], [plain(GREEN)], ["a"], angles)
-    assert len(where(drawn(tmp_path / "views.png"), RED)) > 1000
+    assert len(red) > 2000
+    assert red[:, 0].max() < green[:, 0].min()
 
 
 def test_marked_points_lie_where_their_pixels_are(tmp_path: Path) -> None:
@@ -71,8 +62,8 @@ def test_the_nearer_side_hides_the_farther(tmp_path: Path) -> None:
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.03, 0.03, 60), np.linspace(0.0, 0.06, 60)))
     near, far = (np.stack([np.full_like(y, x), y, z], -1) for x in (0.02, -0.02))
     colours = np.concatenate([np.full((3600, 3), RED, np.uint8), np.full((3600, 3), BLUE, np.uint8)])
-    draw_cloud(tmp_path / "cloud.png", np.concatenate([near, far]), colours, views=1)
-    picture = drawn(tmp_path / "cloud.png")
+    draw_cloud(tmp_path / "cloud.png", np.concatenate([near, far]), colours)
+    picture = drawn(tmp_path / "cloud.png")[:, :580]  # the first of three sides
     assert len(where(picture, RED)) > 10_000
     assert len(where(picture, BLUE)) < 0.02 * len(where(picture, RED))
 
@@ -96,12 +87,6 @@ def test_a_stray_point_does_not_shrink_the_object(tmp_path: Path) -> None:
     colours = np.full((5001, 3), RED, np.uint8)
     draw_cloud(tmp_path / "cloud.png", np.concatenate([points, [[0.0, 9.0, 0.0]]]), colours)
     assert len(where(drawn(tmp_path / "cloud.png"), RED)) > 100_000
-
-
-@pytest.mark.slow
-def test_an_empty_cloud_is_an_empty_picture(tmp_path: Path) -> None:
-    draw_cloud(tmp_path / "cloud.png", np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert drawn(tmp_path / "cloud.png").size
 
 
 def test_a_picture_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PixelCounts
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
+from hsi_sc_nerf.processing.foreground_score import smoothed_bins
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame, read_cache
-from hsi_sc_nerf.processing.masks import foreground_score
-from hsi_sc_nerf.spectra.pseudo_rgb import bands_within, nearest_bands, to_8_bit
 
 WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
 BANDS = len(WAVELENGTHS_NM)
@@ -65,7 +64,7 @@ def test_everything_is_written_upright(cube, tmp_path):
     np.testing.assert_allclose(picture / 255.0, expected[..., [3, 2, 0]], atol=0.5 / 255 + 1e-4)
     np.testing.assert_allclose(cache.gray / 255.0, expected[..., 1:5].mean(axis=-1), atol=0.5 / 255 + 1e-4)
     bins = np.moveaxis(expected, -1, 0).astype(np.float32)
-    np.testing.assert_allclose(cache.score, foreground_score(bins), atol=1e-4)
+    np.testing.assert_allclose(cache.bins, smoothed_bins(bins), atol=1e-3)
     assert cache.pixel_counts.saturated.tolist() == [0, 0, 1, 0, 0]
     assert cache.pixel_counts.clipped_low.min() > 0
     assert not list((tmp_path / "data").rglob("*partial*"))
@@ -90,7 +89,7 @@ def test_finished_reflectance_goes_the_same_way(tmp_path):
     np.testing.assert_array_equal(valid, stored != -9999.0)
     np.testing.assert_allclose(reflectance[valid], stored[valid] / 10_000, atol=1e-5)
     assert cache.pixel_counts.no_data.tolist() == [25] * BANDS
-    assert cache.score[2, 2] < 1e-6
+    assert cache.bins[:, 2, 2].max() < 1e-6
 
 
 def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
@@ -98,7 +97,7 @@ def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
     again = read_cache(paths, "made")
     assert again.fingerprint == "made"
     np.testing.assert_array_equal(again.gray, cache.gray)
-    np.testing.assert_array_equal(again.score, cache.score)
+    np.testing.assert_array_equal(again.bins, cache.bins)
     for field in fields(PixelCounts):
         np.testing.assert_array_equal(
             getattr(again.pixel_counts, field.name), getattr(cache.pixel_counts, field.name)
@@ -106,7 +105,7 @@ def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
     assert read_cache(paths, "other files") is None
 
 
-@pytest.mark.parametrize("kind", ["image", "cube", "flags", "cache"])
+@pytest.mark.parametrize("kind", ["image", "cube", "flags", "bins", "cache"])
 def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
     paths, _ = process(cube, tmp_path / "data")
     getattr(paths, kind).unlink()
@@ -115,7 +114,7 @@ def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
 
 def test_a_cache_of_an_earlier_version_is_not_finished(cube, tmp_path):
     paths, cache = process(cube, tmp_path / "data")
-    np.savez(paths.cache, fingerprint="made", gray=cache.gray, score=cache.score)
+    np.savez(paths.cache, fingerprint="made", gray=cache.gray)
     assert read_cache(paths, "made") is None
 
 
@@ -134,12 +133,3 @@ def test_a_cache_does_not_vouch_for_a_cube_of_other_settings(cube, tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
     assert not paths.cache.exists()
-
-
-def test_pictures_of_bands():
-    reflectance = np.zeros((2, 2, BANDS), np.float32)
-    reflectance[0, 0] = [0.1, 0.2, 0.3, 0.4, -0.5, 1.5]
-    image = to_8_bit(reflectance[..., nearest_bands(WAVELENGTHS_NM, (990.0, 640.0, 490.0))])
-    assert image[0, 0].tolist() == [255, 0, round(0.2 * 255)]
-    assert bands_within(WAVELENGTHS_NM, (500.0, 700.0)).tolist() == [1, 2, 3, 4]
-    assert bands_within(WAVELENGTHS_NM, (2000.0, 2500.0)).tolist() == list(range(BANDS))

@@ -340,14 +340,3 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
     with pytest.raises(InputError, match="another kind of dataset"):
         run(session, tmp_path / "data")
     assert other.read_text() == '{"frames": []}'
-
-
-@pytest.mark.slow
-def test_object_without_contrast(tmp_path):
-    session = tmp_path / "session"
-    for name in ("a", "b", "c", "d"):
-        write_capture(session, name, expose(np.full((48, 48, len(WAVELENGTHS_NM)), 0.5)))
-    write_capture(session, "white_reference", expose(np.ones((48, 48, len(WAVELENGTHS_NM)))))
-    (session / "session.json").write_text(json.dumps(INFO))
-    with pytest.raises(InputError, match="no object can be told from the background"):
-        run(session, tmp_path / "data")

@@ -12,12 +12,15 @@ from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.scene_box import (
     DISC_OVER_CONTAINER,
     DISC_OVER_MARKERS,
+    OBJECT_MARGIN_M,
+    SCENE_MARGIN_M,
     assumed_disc,
     object_box,
     scene_box,
 )
 
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+OUTWARDS = np.array([[-1.0], [1.0]])
 
 
 def turn(count: int) -> np.ndarray:
@@ -29,15 +32,12 @@ def test_object_box_of_a_sphere():
     poses = turn(24)
     intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
     masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics, margin_m=0.0)
+    box = object_box(masks, poses, intrinsics) - OBJECT_MARGIN_M * OUTWARDS
     truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
     outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
     assert outside.min() > -0.001
     # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
     assert outside[:, :2].max() < 0.005
-    np.testing.assert_allclose(
-        object_box(masks, poses, intrinsics, margin_m=0.002)[:, :2], box[:, :2] + [[-0.002], [0.002]], atol=1e-9
-    )
     assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
 
 
@@ -48,8 +48,8 @@ def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
     poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
     intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
     masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics, margin_m=0.0)
-    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + 0.02
+    box = object_box(masks, poses, intrinsics)
+    assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + OBJECT_MARGIN_M + 0.02
 
 
 @pytest.mark.slow
@@ -69,7 +69,7 @@ def test_box_keeps_a_part_thinner_than_a_voxel():
     for mask, pose in zip(masks, poses, strict=True):
         x, y = project(stem, pose, intrinsics)[0].astype(int).T
         mask[y, x] = True
-    assert 0.17 <= object_box(masks, poses, intrinsics, margin_m=0.0)[1, 2] < 0.18
+    assert 0.17 <= object_box(masks, poses, intrinsics)[1, 2] - OBJECT_MARGIN_M < 0.18
 
 
 def test_masks_that_do_not_fit_the_poses():
@@ -79,28 +79,28 @@ def test_masks_that_do_not_fit_the_poses():
         object_box(masks, poses, INTRINSICS)
 
 
+OBJECT = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
+
+
+def box_about_the_axis(reach, lowest, highest):
+    return np.array([[-reach, -reach, lowest], [reach, reach, highest]]) + SCENE_MARGIN_M * OUTWARDS
+
+
 def test_scene_box_holds_all_that_turns():
     corners = {3: np.array([[0.1, 0.0, 0.0], [0.12, 0.0, 0.0], [0.12, 0.02, 0.0], [0.1, 0.02, 0.0]])}
-    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
     disc = DISC_OVER_MARKERS * np.hypot(0.12, 0.02)
-    reach = disc + 0.01
-    np.testing.assert_allclose(
-        scene_box(obj, corners, CONTAINER, margin_m=0.01), [[-reach, -reach, -0.01], [reach, reach, 0.21]]
-    )
+    np.testing.assert_allclose(scene_box(OBJECT, corners, CONTAINER), box_about_the_axis(disc, 0.0, 0.2))
     wide = np.array([[-0.3, -0.02, 0.07], [0.02, 0.02, 0.2]])
-    np.testing.assert_allclose(scene_box(wide, corners, None, margin_m=0.0), [[-0.3, -0.3, 0.0], [0.3, 0.3, 0.2]])
+    np.testing.assert_allclose(scene_box(wide, corners, None), box_about_the_axis(0.3, 0.0, 0.2))
 
 
 def test_without_markers_the_scene_box_holds_a_disc_as_wide_as_the_container_suggests():
-    obj = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])
     reach = DISC_OVER_CONTAINER * CONTAINER.diameter_m / 2.0
     assert reach > 0.205 / 2.0  # the simulator's disc
-    expected = [[-reach, -reach, 0.0], [reach, reach, 0.2]]
-    np.testing.assert_allclose(scene_box(obj, {}, CONTAINER, margin_m=0.0), expected)
-    np.testing.assert_allclose(
-        scene_box(obj, {}, None, margin_m=0.0, container_diameter_m=CONTAINER.diameter_m), expected
-    )
-    np.testing.assert_allclose(scene_box(obj, {}, None, margin_m=0.0), [[-0.02, -0.02, 0.0], [0.02, 0.02, 0.2]])
+    expected = box_about_the_axis(reach, 0.0, 0.2)
+    np.testing.assert_allclose(scene_box(OBJECT, {}, CONTAINER), expected)
+    np.testing.assert_allclose(scene_box(OBJECT, {}, None, CONTAINER.diameter_m), expected)
+    np.testing.assert_allclose(scene_box(OBJECT, {}, None), box_about_the_axis(0.02, 0.0, 0.2))
     assert assumed_disc(True, 0.09) is None
     assert "207 mm" in assumed_disc(False, 0.09)
     assert "masks' hull" in assumed_disc(False, None)

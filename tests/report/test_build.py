@@ -2,24 +2,24 @@
 
 import json
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
+import ball_run
+import capture_factory as factory
 import numpy as np
 import pytest
-import torch
 from headless_browser import launch, needs_browser
 
+from hsi_sc_nerf.analysis.report import trait_content
+from hsi_sc_nerf.analysis.size import Size
+from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
-from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.report import build
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.held_out_views import HeldOutView, inner_places, place_spectra, score_view
-from hsi_sc_nerf.report.result_sections import comparison_section, trait_rows, traits_section
-from hsi_sc_nerf.report.run_sections import settings_section
+from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section
+from hsi_sc_nerf.report.page import html_page
+from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 SECTIONS = ["object", "views", "bands", "spectra", "comparison", "traits", "training"]
@@ -32,30 +32,13 @@ COMPARISON = {
     "cloud_to_reference": {"mean_m": 1e-3, "median_m": 9e-4, "rms_m": 1.23e-3, "percentile_95_m": 2e-3},
     "curves": {"thresholds_m": [0, 0.002], "precision": [0, 95], "recall": [0, 97], "f_score": [0, 96]},
 }
-TRAITS = {
-    "settings": {"depth": 8},
-    "size": {"area_m2": 0.0229, "volume_l": 0.25},
-    "size_sd": {"area_m2": 0.0001, "volume_l": 0.002},
-    "watertight": True,
-    "classes": {"areas_m2": {HOSTILE: 0.0004, "rot_l": 0.0001}, "regions": [{"label": "bruise", "area_m2": 0.0004}]},
-    "regions": {
-        "whole": {"indices": {"NDVI": {"mean": 0.5, "sd": None}}},
-        "mean": {"area_m2": 0.0003, "indices": {"NDVI": {"mean": 0.4, "sd": 0.1}}},
-        "mean_sd": {"area_m2": 0.0002},
-    },
-    "firmness": {"value": 12.5, "unit": "N", "uncertainty": 0.5},
-}
-
-
-def held_out_view(dataset, index):
-    frame = dataset.frames[index]
-    measured, valid = (torch.from_numpy(part) for part in unpack(frame.cube()))
-    rendered, mask = measured + 0.01, torch.from_numpy(frame.mask())
-    places = place_spectra(
-        measured.numpy(), rendered.numpy(), frame.mask(), inner_places(frame.mask(), 4, 2), 2.0, valid.numpy()
-    )
-    rgb = frame.pseudo_rgb()
-    return HeldOutView(score_view(HOSTILE, rendered, measured, mask, valid), rgb, rgb, places)
+TRAITS = trait_content(
+    Size(0.0229, 0.25, 0.09, 0.07, 0.068, 0.078),
+    Size(0.0001, 0.002, 0.0001, 0.0001, 0.0001, 0.0001),
+    True,
+    Traits([RegionTraits(name, 0.02, None, {HOSTILE: MeanAndSd(0.5, np.nan)}, {}) for name in (WHOLE, HOSTILE)]),
+    {},
+)
 
 
 def ball(wavelengths_nm, count=4000):
@@ -68,18 +51,24 @@ def ball(wavelengths_nm, count=4000):
     return SpectralCloud(0.03 * normals, normals, colours, spectra, wavelengths_nm)
 
 
-@pytest.fixture
-def run(flagged_dataset, tmp_path, monkeypatch):
-    """A run's folder with a cloud; its model is not opened, its views are not rendered."""
-    dataset = replace(open_packed(flagged_dataset), object_name=HOSTILE)
-    write_spectral_ply(tmp_path / "point_cloud.ply", ball(dataset.wavelengths_nm))
-    views = [held_out_view(dataset, index) for index in (2, 7)]
-    opened = SimpleNamespace(dataset=dataset, manager=SimpleNamespace(eval_dataset=views))
-    monkeypatch.setattr(build, "_opened", lambda folder: opened)
-    monkeypatch.setattr(build, "_rendered", lambda run, count: views[:count])
-    settings = settings_section({"name": HOSTILE}, {"name": "default"}, {"python": "3"})
-    monkeypatch.setattr(build, "_settings", lambda folder: settings)
-    return tmp_path
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of an untrained run with the cloud of a ball, and with a name that would be markup."""
+    folder = tmp_path_factory.mktemp("report")
+    data = ball_run.write_ball_dataset(folder / "data")
+    transforms = (data / "transforms.json").read_text()
+    (data / "transforms.json").write_text(transforms.replace('"ball"', json.dumps(HOSTILE)))
+    run = ball_run.write_untrained_run(data, folder / "runs").parent
+    write_spectral_ply(run / "point_cloud.ply", ball(factory.WAVELENGTHS_NM))
+    (run / "comparison.json").write_text(json.dumps(COMPARISON))
+    (run / "traits.json").write_text(json.dumps(TRAITS))
+    return run
+
+
+@pytest.fixture(scope="module")
+def report(run):
+    write_report(run, run / "report.html", ReportSources())
+    return run / "report.html"
 
 
 class Page(HTMLParser):
@@ -97,7 +86,9 @@ class Page(HTMLParser):
         return [attrs for name, attrs in self.elements if name == tag]
 
 
-def check_page(text):
+@pytest.mark.slow
+def test_the_page_is_complete_and_names_from_outside_stay_text(report):
+    text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert [section["id"] for section in page.all("section")] == SECTIONS
     for tag, attrs in page.elements:
@@ -109,73 +100,50 @@ def check_page(text):
     assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|WebSocket", text)
     addresses = re.findall(r"[a-z]+://[^\s\"'<]+", re.sub(r"base64,[\w+/=]+", "", text))
     assert set(addresses) <= {"http://www.w3.org/2000/svg"}  # a name, which nothing fetches
-    return page
 
-
-@pytest.mark.slow
-def test_a_run_without_comparison_traits_and_logs(run):
-    write_report(run, run / "report.html", ReportSources())
-    text = (run / "report.html").read_text(encoding="utf-8")
-    check_page(text)
-    for command in ("hsi-sc-nerf compare", "hsi-sc-nerf traits", "ns-train"):
-        assert f"run <code>{command}" in text
-    assert sorted(path.name for path in run.iterdir()) == ["point_cloud.ply", "report.html"]
-
-
-@pytest.mark.slow
-def test_names_from_outside_stay_text(run):
-    (run / "comparison.json").write_text(json.dumps(COMPARISON))
-    (run / "traits.json").write_text(json.dumps(TRAITS))
-    write_report(run, run / "report.html", ReportSources())
-    text = (run / "report.html").read_text(encoding="utf-8")
-    page = check_page(text)
     assert "<img src=x" not in text
     assert text.count("{{ 7 * 7 }}") > 3
-    assert "49" not in text.split("<main>")[0].split("<body>")[1]
     assert len(page.all("script")) == 2
-    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "0.0229", "12.5"):
+    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229.0 ± 1.0", "250.0 ± 2.0", "cm²", "mL"):
         assert shown in text
+    assert "run <code>ns-train" in text  # it has no log
+    assert not list(report.parent.glob(".*")) + list(report.parent.glob("*.tmp"))
 
 
-def test_traits_are_entries_with_their_units_and_spreads():
-    rows = {row[0]: row[1:] for row in trait_rows({k: v for k, v in TRAITS.items() if k != "settings"})}
-    assert rows["size, area"] == ("0.0229", "0.0001", "m²")
-    assert rows["size, volume"] == ("0.25", "0.002", "L")
-    assert rows["watertight"] == ("yes", "", "")
-    assert rows[f"classes, areas, {HOSTILE}"] == ("0.0004", "", "m²")
-    assert rows["classes, regions, bruise 1, area"] == ("0.0004", "", "m²")
-    assert rows["regions, whole, indices, NDVI"] == ("0.5", "", "")
-    # A user's names are names, though they look like our words.
-    assert rows["classes, areas, rot_l"] == ("0.0001", "", "m²")
-    assert rows["regions, mean, area"] == ("0.0003", "", "m²")
-    assert rows["regions, mean, indices, NDVI"] == ("0.4", "0.1", "")
-    assert rows["regions, mean_sd, area"] == ("0.0002", "", "m²")
-    assert rows["firmness"] == ("12.5", "0.5", "N")
-    assert not any("size sd" in name for name in rows)
+@pytest.mark.slow
+def test_sections_on_a_processed_session(flagged_dataset):
+    dataset = open_packed(flagged_dataset)
+    sections = [make(dataset) for make in (calibration_section, masks_section, poses_section)]
+    text = html_page("a", "b", {}, sections)
+    assert "is nothing known" not in text
+    for shown in ("read noise", "values that are no measurement", "median over frames", "median step", "All frames"):
+        assert shown in text
+    assert len(Page(text).all("svg")) >= 4
 
 
-def test_files_that_are_something_else_are_refused_and_nothing_is_written(run):
+def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, tmp_path):
     with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
         traits_section({"settings": {}}, run / "traits.json")
-    (run / "traits.json").write_text("{")
+    (tmp_path / "broken.json").write_text("{")
     for sources, sentence in (
-        (ReportSources(), r"traits\.json: is no readable JSON"),
+        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no readable JSON"),
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
     ):
         with pytest.raises(InputError, match=sentence):
-            write_report(run, run / "report.html", sources)
-    assert not (run / "report.html").exists()
+            write_report(run, tmp_path / "report.html", sources)
+    with pytest.raises(InputError, match=r"config\.yml"):
+        write_report(tmp_path, tmp_path / "report.html", ReportSources())
+    assert not (tmp_path / "report.html").exists()
 
 
 @pytest.mark.slow
 @needs_browser
-def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
+def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
     """No message in the console, colours that follow from the numbers, the spectrum of the point under a click."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
-    write_report(run, run / "report.html", ReportSources())
     with sync_api.sync_playwright() as playwright:
         browser = launch(playwright)
         page = browser.new_page(viewport={"width": 700, "height": 600}, reduced_motion="reduce")
@@ -184,14 +152,14 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
         page.on("console", lambda message: messages.append(message.text))
         page.on("pageerror", lambda error: messages.append(str(error)))
         page.on("request", lambda request: requests.append(request.url))
-        page.goto((run / "report.html").as_uri())
+        page.goto(report.as_uri())
         assert page.locator("#cloud").get_attribute("data-state") == "ready"
         canvas = page.locator("#cloud canvas")
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")
 
         def colour_at(x, y):
-            """Of the drawing, at shares of its width and height."""
+            """Of the drawing, at fractions of its width and height."""
             read = """(canvas, [x, y]) => { const pixel = new Uint8Array(4), gl = canvas.getContext("webgl");
                 gl.readPixels(x * canvas.width, (1 - y) * canvas.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
                 return [...pixel]; }"""
@@ -209,9 +177,9 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
         click(0.5, 0.65)
         click(0.02, 0.02)
         assert page.locator(".picked li").count() == 1
-        place = [float(word) for word in re.findall(r"-?[\d.]+", page.locator(".picked li").inner_text())]
-        assert np.linalg.norm(place) == pytest.approx(30.0, abs=0.2)
-        assert place[2] < 0.0
+        point_mm = [float(word) for word in re.findall(r"-?[\d.]+", page.locator(".picked li").inner_text())]
+        assert np.linalg.norm(point_mm) == pytest.approx(30.0, abs=0.2)
+        assert point_mm[2] < 0.0
         with page.expect_download() as download:
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)
@@ -220,5 +188,5 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(run):
         canvas.press("ArrowUp")
         assert canvas.screenshot() != before
         assert messages == []
-        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [(run / "report.html").as_uri()]
+        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
         browser.close()

@@ -1,4 +1,4 @@
-"""Held-out views: scores, places and rendering; training curves and settings of a run."""
+"""Held-out views: scores, points and rendering; training curves and settings of a run."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.report.build import ReportSources, write_report
 from hsi_sc_nerf.report.held_out_views import (
-    PLACES,
-    inner_places,
+    POINTS,
+    inner_points,
+    mean_and_sd,
     object_angles,
-    over_views,
-    place_spectra,
+    point_spectra,
     render_held_out,
     score_view,
     spread_of_views,
 )
-from hsi_sc_nerf.report.run_sections import changed_settings, flat_settings, read_scalars, shortened, stage_ends
+from hsi_sc_nerf.report.run_sections import flat_settings, read_scalars, settings_section, shortened, stage_ends
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -50,7 +48,7 @@ def test_a_view_that_is_off_by_a_constant(device):
 
 
 def test_mean_and_deviation_over_the_views_that_have_a_band():
-    mean, sd = over_views([np.array([1.0, np.nan, 5.0]), np.array([3.0, np.nan, np.nan])])
+    mean, sd = mean_and_sd(np.array([[1.0, np.nan, 5.0], [3.0, np.nan, np.nan]]))
     np.testing.assert_allclose(mean, [2.0, np.nan, 5.0])
     np.testing.assert_allclose(sd, [np.sqrt(2.0), np.nan, 0.0])
 
@@ -60,35 +58,34 @@ def test_views_are_spread_evenly(count, wanted, expected):
     assert spread_of_views(count, wanted) == expected
 
 
-def test_spectra_of_a_place_are_those_of_its_valid_pixels():
+def test_spectra_around_a_point_are_those_of_its_valid_pixels():
     rng = np.random.default_rng(0)
     measured = 0.5 + 0.02 * rng.normal(size=(40, 40, 3))
     rendered = np.full((40, 40, 3), 0.4)
     mask = np.zeros((40, 40), bool)
     mask[:, :20] = True
     measured[~mask] = 9.0
-    valid = np.ones_like(measured, bool)
-    valid[..., 1] = False
-    valid[18, :, 2] = False
-    (place,) = place_spectra(measured, rendered, mask, [(20, 18)], 6.0, valid)
+    measured[..., 1] = np.nan
+    measured[18, :, 2] = np.nan
+    (point,) = point_spectra(measured, rendered, mask, [(20, 18)], 6.0)
     lines, samples = np.indices(mask.shape)
     inside = ((lines - 20) ** 2 + (samples - 18) ** 2 <= 36) & mask
-    assert place.pixels == inside.sum()
-    np.testing.assert_allclose(place.measured[0], measured[inside, 0].mean())
-    np.testing.assert_allclose(place.measured_sd[0], measured[inside, 0].std(ddof=1))
-    np.testing.assert_allclose(place.measured[2], measured[inside & (lines != 18), 2].mean())
-    np.testing.assert_allclose(place.rendered, [0.4, np.nan, 0.4])
-    assert np.isnan(place.measured_sd).tolist() == [False, True, False]
+    assert point.pixels == inside.sum()
+    np.testing.assert_allclose(point.measured[0], measured[inside, 0].mean())
+    np.testing.assert_allclose(point.measured_sd[0], measured[inside, 0].std(ddof=1))
+    np.testing.assert_allclose(point.measured[2], measured[inside & (lines != 18), 2].mean())
+    np.testing.assert_allclose(point.rendered, [0.4, np.nan, 0.4])
+    assert np.isnan(point.measured_sd).tolist() == [False, True, False]
 
 
-def test_places_lie_well_inside_the_object():
+def test_points_lie_well_inside_the_object():
     mask = np.zeros((60, 60), bool)
     mask[10:50, 20:45] = True
-    places = inner_places(mask, 4, 5)
-    assert len(set(places)) == 4
-    assert all(14 <= line < 46 and 24 <= sample < 41 for line, sample in places)
-    assert len(inner_places(np.pad(np.ones((1, 3), bool), 4), 2, 5)) == 2
-    assert inner_places(np.zeros((5, 5), bool), 3, 2) == []
+    points = inner_points(mask, 4, 5)
+    assert len(set(points)) == 4
+    assert all(14 <= line < 46 and 24 <= sample < 41 for line, sample in points)
+    assert len(inner_points(np.pad(np.ones((1, 3), bool), 4), 2, 5)) == 2
+    assert inner_points(np.zeros((5, 5), bool), 3, 2) == []
 
 
 def test_curves_of_a_resumed_run_have_one_value_a_step(tmp_path):
@@ -135,10 +132,8 @@ class Outer:
 def test_settings_by_their_dotted_names_and_those_that_were_changed():
     settings = flat_settings(Outer(inner=Inner(rate=0.2)))
     assert settings == {"inner.rate": "0.2", "groups.fields.rate": "0.1", "empty": "{}"}
-    assert changed_settings(settings | {"new": "1"}, flat_settings(Outer())) == {
-        "inner.rate": ("0.2", "0.1"),
-        "new": ("1", "-"),
-    }
+    first, *_ = settings_section(settings | {"new": "1"}, flat_settings(Outer()), {}).blocks
+    assert first.rows == [("inner.rate", "0.2", "0.1"), ("new", "1", "-")]
 
 
 @pytest.fixture(scope="module")
@@ -166,13 +161,8 @@ def test_views_are_scored_as_the_model_scores_them(run, flagged_dataset):
 
     frame = next(f for f in open_packed(flagged_dataset).frames if f.capture == view.scores.name)
     measured, valid = unpack(frame.cube())
-    assert len(view.places) == PLACES
-    place = view.places[0]
-    here = frame.mask() & (np.hypot(*(np.indices(frame.mask().shape).T - [place.line, place.sample]).T) <= 1.75)
+    assert len(view.points) == POINTS
+    point = view.points[0]
+    here = frame.mask() & (np.hypot(*(np.indices(frame.mask().shape).T - [point.line, point.sample]).T) <= 1.75)
     here_valid = valid[here].sum(0)
-    np.testing.assert_allclose(place.measured, measured[here].sum(0) / here_valid, rtol=1e-5)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"config\.yml"):
-        write_report(tmp_path, tmp_path / "report.html", ReportSources())
+    np.testing.assert_allclose(point.measured, measured[here].sum(0) / here_valid, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Effects of light against closed forms: form factors, cosines, shadow edges, Fresnel, diffusion; energy is kept."""
+"""Effects of light against closed forms: form factors, cosines, shadow edges, Fresnel; energy is kept."""
 
 from itertools import combinations
 
@@ -7,16 +7,13 @@ import pytest
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection
-from hsi_sc_nerf.simulate.effects.illumination import Lamp
-from hsi_sc_nerf.simulate.effects.object import Gloss, Translucency, fresnel, mean_fresnel
+from hsi_sc_nerf.simulate.effects.light import ChamberShading, Gloss, InterReflection, Lamp, fresnel, mean_fresnel
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.light import Colour, LightEffect, colour_spectra, even_light
-from hsi_sc_nerf.simulate.lighting import Lighting, render
+from hsi_sc_nerf.simulate.light import Lighting, colour_spectra, even_light, render
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, diffused, split_at_creases
+from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, split_at_creases
 
 RADIUS_M = 0.03
 CAMERA = PinholeIntrinsics(24, 24, 60.0, 60.0, 12.0, 12.0)
@@ -52,9 +49,8 @@ def picture(renderer, effects, camera_to_world=None):
 
 
 def if_white(light, colours):
-    """Radiance where all materials are white, at wavelengths from end to end."""
-    wavelengths_nm = np.linspace(397.0, 1003.0, 7)
-    return light @ colour_spectra(colours, np.ones((9, 7)), wavelengths_nm)
+    """Radiance where all materials are white, in two bands."""
+    return light @ colour_spectra(colours, np.ones((9, 2)))
 
 
 def light_below(lighting, points, camera_to_world=None):
@@ -63,29 +59,6 @@ def light_below(lighting, points, camera_to_world=None):
     hits = lighting._renderer.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
     weights, colours = lighting.light(hits, np.eye(4) if camera_to_world is None else camera_to_world)
     return dict(zip(colours, weights.T, strict=True))
-
-
-# Off is off
-
-
-def test_without_effects_of_light_none_of_their_code_runs(monkeypatch):
-    def never(*args, **kwargs):
-        raise AssertionError("runs without being named")
-
-    monkeypatch.setattr(Lighting, "__init__", never)
-    monkeypatch.setattr(Surface, "__init__", never)
-    for effect in (ChamberShading, InterReflection, Translucency, Lamp, Gloss):
-        monkeypatch.setattr(effect, "on_surface" if hasattr(effect, "on_surface") else "at_hits", never)
-    frame = Simulation(override(load_scene("sphere"), size_px=16, bands=4, frames=2, effects=[])).frame(0)
-    assert frame.light.weights is frame.material_weights
-    np.testing.assert_array_equal(frame.light.spectra, frame.endmembers)
-
-
-def test_every_effect_of_light_can_be_named():
-    named = ["chamber_shading", "inter_reflection", "translucency", "lamp", "gloss"]
-    scene = override(load_scene("sphere"), effects=named)
-    assert [effect.name for effect in scene.effects] == named
-    assert all(isinstance(effect, LightEffect) for effect in scene.effects)
 
 
 @pytest.mark.slow
@@ -112,18 +85,18 @@ def test_what_stands_before_the_chamber_is_seen_through_the_light_as_well():
 def test_white_furnace(still_life):
     """A white ball in a white chamber cannot be seen; as it is convex, no ray is lost to chance."""
     renderer = Renderer([part(ball(), "white", True)])
-    seen = if_white(*picture(renderer, [ChamberShading(), InterReflection(), Translucency(), Gloss()]))
+    seen = if_white(*picture(renderer, [ChamberShading(), InterReflection(), Gloss()]))
     np.testing.assert_allclose(seen, 1.0, atol=2e-6)
     # Neighbours that are evenly lit and as white as the chamber cannot be seen either.
     np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16)])), 1.0, atol=2e-3)
 
 
-ALL = (ChamberShading(16), InterReflection(16), Translucency(5.0), Lamp(), Gloss(roughness=1.0))
+ALL = (ChamberShading(16), InterReflection(16), Lamp(), Gloss(roughness=1.0))
 
 
 @pytest.mark.parametrize(
     "effects",
-    [some for n in (1, 2, 3, 4, 5) for some in combinations(ALL, n)],
+    [some for n in (1, 2, 3, 4) for some in combinations(ALL, n)],
     ids=lambda some: "+".join(effect.name for effect in some),
 )
 def test_energy_is_never_created(still_life, effects):
@@ -199,11 +172,11 @@ def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
     of_wall = 0.5 if is_shaded else 1.0
     np.testing.assert_allclose(light.chamber_lit[on_wall, 1], of_wall, atol=5e-3)
     light = InterReflection(2048).on_surface(light)
-    both = light.colours.index(Colour((0, 1)))
+    both = light.colours.index((0, 1))
     np.testing.assert_allclose(light.chamber_lit[on_floor, both], hidden * of_wall, atol=5e-3)
     np.testing.assert_allclose(light.chamber_lit[on_floor, 0], 1.0 - hidden, atol=5e-3)
-    assert Colour((0, 0)) not in light.colours
-    spectra = colour_spectra(light.colours, np.array([[0.5, 0.2], [0.9, 0.1], [1.0, 1.0]]), np.array([500.0, 900.0]))
+    assert (0, 0) not in light.colours
+    spectra = colour_spectra(light.colours, np.array([[0.5, 0.2], [0.9, 0.1], [1.0, 1.0]]))
     np.testing.assert_allclose(spectra[both], [0.45, 0.02])
 
 
@@ -218,7 +191,7 @@ def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     azimuth = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     places = (radius_m + distance_m)[:, None, None] * around
-    light = light_below(lighting, places.reshape(-1, 2))[Colour((1,))].reshape(len(distance_m), -1).mean(axis=1)
+    light = light_below(lighting, places.reshape(-1, 2))[(1,)].reshape(len(distance_m), -1).mean(axis=1)
 
     rays = cosine_directions(100_000, np.zeros(1))[0]
     slow = []
@@ -251,7 +224,7 @@ def test_lambert_cosine_on_a_ball():
         Renderer([part(ball(336), "white", True)]), [Lamp(fraction=1.0, azimuth_deg=40.0, elevation_deg=0)]
     )
     x = np.linspace(-0.95, 0.95, 41)
-    seen = light_below(lighting, RADIUS_M * np.column_stack([x, np.zeros(41)]))[Colour((0,))]
+    seen = light_below(lighting, RADIUS_M * np.column_stack([x, np.zeros(41)]))[(0,)]
     lamp = np.deg2rad(40.0)
     cosine = x * np.sin(lamp) + np.sqrt(1.0 - x**2) * np.cos(lamp)
     np.testing.assert_allclose(seen, np.maximum(cosine, 0.0), atol=0.015)
@@ -265,7 +238,7 @@ def test_shadow_of_a_post_ends_where_geometry_says(fraction):
     lighting = Lighting(Renderer([post, floor]), [Lamp(fraction, azimuth_deg, 0.0)])
     end_m = 0.005 + height_m * np.tan(np.deg2rad(azimuth_deg))
     x = -np.array([0.02, end_m - 5e-4, end_m + 5e-4, 0.2])
-    light = light_below(lighting, np.column_stack([x, np.zeros(4)]))[Colour((1,))]
+    light = light_below(lighting, np.column_stack([x, np.zeros(4)]))[(1,)]
     lit = 1.0 - fraction + fraction * np.cos(np.deg2rad(azimuth_deg))
     np.testing.assert_allclose(light, [1 - fraction, 1 - fraction, lit, lit], atol=1e-5)
 
@@ -292,7 +265,7 @@ def test_fresnel_at_known_angles():
 
 
 def test_gloss_mirrors_the_chamber_but_not_what_hides_it(still_life):
-    black = Colour((still_life.materials.index("chamber"),))
+    black = (still_life.materials.index("chamber"),)
     lighting = Lighting(still_life, [Gloss()])
     origins = np.array([[0.3, 0.0, 0.05 + RADIUS_M], [0.3, 0.0, 0.05 + 0.3 * RADIUS_M], [0.3, 0, 0.02]], np.float32)
     hits = lighting._renderer.cast(origins, np.broadcast_to([-1.0, 0.0, 0.0], (3, 3)).astype(np.float32), 1)
@@ -307,38 +280,6 @@ def test_gloss_mirrors_the_chamber_but_not_what_hides_it(still_life):
     assert (body[2], mirrored[2]) == (1.0, 0.0)
 
 
-# Translucency
-
-
-def test_diffusion_of_a_spherical_harmonic():
-    """cos(polar angle) is an eigenfunction of the sphere's Laplacian: -2 / r²."""
-    mesh, width_m = ball(160), 0.01
-    cosine = mesh.vertices[:, 2:] / RADIUS_M
-    expected = cosine / (1.0 + width_m**2 / RADIUS_M**2)
-    np.testing.assert_allclose(diffused(mesh.vertices, mesh.triangles, cosine, width_m), expected, atol=3e-3)
-
-
-def test_translucency_keeps_totals_and_softens_more_the_longer_the_wavelength(still_life):
-    light = Translucency(6.0).on_surface(even_light(Surface(still_life)))
-    surface = light.surface
-    wavelengths_nm = np.array([397.0, 450.0, 600.0, 700.0, 850.0, 1003.0])
-    totals, contrasts = [], []
-    for material in range(2):
-        only = np.zeros((len(still_life.materials), len(wavelengths_nm)))
-        only[material] = 1.0
-        fraction = light.chamber_lit @ colour_spectra(light.colours, only, wavelengths_nm)
-        on_object = fraction[surface.is_object]
-        areas = surface.areas_m2[surface.is_object, None]
-        totals.append((areas * on_object).sum(axis=0))
-        contrasts.append((areas * on_object**2).sum(axis=0))
-        np.testing.assert_allclose(fraction[~surface.is_object], 0.0)
-    for total, contrast in zip(totals, contrasts, strict=True):
-        np.testing.assert_allclose(total, total[0], rtol=1e-5)
-        assert (np.diff(contrast[1:]) < 0).all()
-        np.testing.assert_allclose(contrast[0], total[0] * 1.0, rtol=0.2)
-    np.testing.assert_array_equal(light.chamber_lit, light.lamp_lit)
-
-
 # Two effects together are what their definitions say
 
 
@@ -347,35 +288,24 @@ def by_colour(renderer, effects):
     return dict(zip(colours, np.moveaxis(light, -1, 0), strict=True))
 
 
-@pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16), Translucency(5.0)], ids=lambda e: e.name)
+@pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16)], ids=lambda e: e.name)
 def test_lamp_with_an_effect_of_the_chamber_is_the_sum_of_both_lights(still_life, baked):
     """(1 - fraction) of what the chamber gives with its effect, and the lamp's light, which that does not change."""
     lamp, only_lamp = Lamp(0.4), Lamp(1.0)
     both = by_colour(still_life, [baked, lamp])
     chamber = by_colour(still_life, [baked])
     direct = by_colour(still_life, [baked, only_lamp])
-    wall = Colour((still_life.materials.index("chamber"),))
+    wall = (still_life.materials.index("chamber"),)
     for colour, light in both.items():
         if colour == wall:
             np.testing.assert_allclose(light, chamber[colour], atol=1e-6)
         else:
             np.testing.assert_allclose(light, 0.6 * chamber[colour] + 0.4 * direct[colour], atol=1e-5)
-    if not isinstance(baked, Translucency):
-        plain = by_colour(still_life, [only_lamp])
-        for colour, light in plain.items():
-            np.testing.assert_allclose(direct[colour], light, atol=1e-6)
+    for colour, light in by_colour(still_life, [only_lamp]).items():
+        np.testing.assert_allclose(direct[colour], light, atol=1e-6)
 
 
-def test_shading_and_softening_together_soften_the_shading(still_life):
-    light = even_light(Surface(still_life))
-    shaded = ChamberShading(16).on_surface(light)
-    both = Translucency(5.0).on_surface(shaded)
-    red = both.colours.index(Colour((0,), ((400.0, 0.0), (700.0, 0.0), (1000.0, 1.0))))
-    softened = light.surface.spread_over_object(shaded.chamber_lit[:, :1], 0.005)[:, 0]
-    np.testing.assert_allclose(both.chamber_lit[:, red], softened, atol=1e-6)
-
-
-@pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16), Translucency(5.0)], ids=lambda e: e.name)
+@pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16)], ids=lambda e: e.name)
 def test_gloss_dims_what_the_chamber_effects_give_and_adds_the_same_mirror(still_life, baked):
     place = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05])
 
@@ -388,7 +318,7 @@ def test_gloss_dims_what_the_chamber_effects_give_and_adds_the_same_mirror(still
     gloss = render(still_life, CAMERA, place, 1, lighting=Lighting(still_life, [Gloss()])).light_weights
     body = gloss[..., : len(still_life.materials) - 1].sum(axis=-1)
     object_only = rendering.coverage > 0.0
-    wall = Colour((len(still_life.materials) - 1,))
+    wall = (len(still_life.materials) - 1,)
     for colour in set(both) - {wall}:
         np.testing.assert_allclose(both[colour], np.where(object_only, body, 1.0) * alone[colour], atol=1e-5)
     np.testing.assert_allclose(both[wall], gloss[..., -1], atol=1e-6)

@@ -1,9 +1,7 @@
 """Effects of the sensor: each against its closed form, any two against their definitions, and none unless named."""
 
 import dataclasses
-import functools
 import itertools
-import json
 
 import cv2
 import numpy as np
@@ -15,13 +13,14 @@ from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate import assemble, frames, sensor
+from hsi_sc_nerf.simulate import assemble, frames
 from hsi_sc_nerf.simulate.effect import effect_rng
-from hsi_sc_nerf.simulate.effects import EFFECTS, read_effects
+from hsi_sc_nerf.simulate.effects import detector as sensor
+from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
-from hsi_sc_nerf.simulate.effects.optics import LensDistortion, OpticalBlur, distort, gaussian_kernel, undistort
+from hsi_sc_nerf.simulate.effects.image import OpticalBlur, distort, gaussian_kernel, undistort
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.lighting import render
+from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.materials import Measured, endmembers
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -66,14 +65,6 @@ def test_photon_transfer_curve():
     read_noise = (60.0 / ELECTRONS_PER_COUNT) ** 2 + 1.0 / 12.0
     assert line[1] == pytest.approx(read_noise, abs=ALL_BUT_A_MILLIONTH * offset_error)
     assert offset_error < 0.03 * read_noise
-
-
-def test_noise_keeps_the_mean():
-    quiet = tarp(Simulation(scene(size_px=96)).white().counts)[0]
-    noisy = tarp(Simulation(scene(size_px=96, photon_noise={}, read_noise={"electrons": 60.0})).white().counts)
-    standard_error = noisy.std(axis=0) / np.sqrt(len(noisy))
-    # Half a count is what the quiet one may be rounded by.
-    assert (np.abs(noisy.mean(axis=0) - quiet) < 0.5 + ALL_BUT_A_MILLIONTH * standard_error).all()
 
 
 def test_photon_noise_is_only_in_light_and_read_noise_everywhere():
@@ -199,12 +190,6 @@ def test_saturation_clips_exactly_where_truth_says(tmp_path):
     np.testing.assert_array_equal(simulation.frame(0).dark, quiet.frame(0).dark)
 
 
-def test_integration_time_is_the_papers_without_saturation(tmp_path):
-    session_dir = simulate_session(scene(frames=1), tmp_path / "s", False)
-    metadata = (session_dir / "white_reference" / "metadata" / "white_reference.xml").read_text()
-    assert f'<key field="integration_time" unit="ms">{paper.INTEGRATION_TIME_MS}</key>' in metadata
-
-
 def test_a_sharp_edge_of_a_spectrum_shifts_by_the_smiles_parabola():
     edge = Measured((300.0, 690.0, 710.0, 1100.0), (0.1, 0.1, 0.9, 0.9))
     changed = dataclasses.replace(
@@ -228,6 +213,47 @@ def test_smile_leaves_the_middle_of_the_line_as_it_is():
     for with_smile, without in ((smile.frame(0), quiet.frame(0)), (smile.white(), quiet.white())):
         np.testing.assert_array_equal(with_smile.counts[:, 16], without.counts[:, 16])
         assert (with_smile.counts[:, 0] != without.counts[:, 0]).any()
+
+
+# Exposure
+
+
+def test_tarp_of_its_own_integration_time():
+    usual, changed = Simulation(scene()), Simulation(scene(tarp_exposure={"exposure_factor": 0.4}))
+    assert usual.white().integration_time_ms == usual.frame(0).integration_time_ms == paper.INTEGRATION_TIME_MS
+    white, frame = changed.white(), changed.frame(1)
+    assert white.integration_time_ms == pytest.approx(0.4 * paper.INTEGRATION_TIME_MS)
+    assert frame.integration_time_ms == paper.INTEGRATION_TIME_MS
+    np.testing.assert_array_equal(frame.counts, usual.frame(1).counts)
+    signal, expected = white.counts - float(DARK), 0.4 * (usual.white().counts - float(DARK))
+    # Each rounded on its own.
+    assert np.abs(signal - expected).max() <= 0.5 + 0.4 * 0.5 + 1e-3
+    np.testing.assert_array_equal(white.dark, usual.white().dark)
+
+
+@pytest.mark.slow
+def test_both_exposures_multiply():
+    both = Simulation(scene(saturation={"exposure_factor": 2.0}, tarp_exposure={"exposure_factor": 0.5}))
+    np.testing.assert_array_equal(both.white().counts, Simulation(scene()).white().counts)
+    longer = Simulation(scene(saturation={"exposure_factor": 2.0}))
+    np.testing.assert_array_equal(both.frame(0).counts, longer.frame(0).counts)
+    assert both.white().integration_time_ms == paper.INTEGRATION_TIME_MS
+    assert both.frame(0).integration_time_ms == longer.white().integration_time_ms == 2.0 * paper.INTEGRATION_TIME_MS
+
+
+def test_dead_bands_come_on_top_of_the_other_bad_pixels():
+    strengths = {"dead_fraction": 0.05, "hot_fraction": 0.05}
+    without = Simulation(scene(bad_pixels=strengths)).detector_maps["bad_pixels"]
+    changed = Simulation(scene(bad_pixels={**strengths, "dead_bands": 3}))
+    maps = changed.detector_maps["bad_pixels"]
+    dead_bands = maps["dead"].all(axis=0)
+    assert dead_bands.sum() == 3
+    assert not maps["hot"][:, dead_bands].any()
+    for name in ("dead", "hot"):
+        np.testing.assert_array_equal(maps[name][:, ~dead_bands], without[name][:, ~dead_bands])
+    for capture in (changed.white(), changed.frame(0)):
+        assert (capture.counts[..., dead_bands] == DARK).all()
+        assert (capture.dark[..., dead_bands] == DARK).all()
 
 
 # Optics
@@ -254,10 +280,6 @@ def test_blur_loses_nothing_at_the_border_and_twice_is_once_wider():
     np.testing.assert_allclose(OpticalBlur(3.0).image(np.ones((9, 9, 1))), 1.0, rtol=1e-12)
 
 
-def test_wide_kernel_is_a_gaussian():
-    np.testing.assert_allclose(gaussian_kernel(6.0), stats.norm.pdf(np.arange(-48, 49), scale=6.0), atol=3e-4)
-
-
 LENS = {"k1": -0.35, "k2": 0.2, "p1": 0.004, "p2": -0.006}
 
 
@@ -271,54 +293,9 @@ def test_distortion_is_opencvs_and_comes_undone():
     np.testing.assert_allclose(undistort(distort(points, coefficients), coefficients), points, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_markers_are_seen_where_opencv_projects_them(one_renderer):
-    strong = {"k1": -0.9, "k2": 0.5, "p1": 0.01, "p2": -0.015}
-    changed = scene("pear", size_px=256, bands=3, frames=9, lens_distortion=strong)
-    simulation = Simulation(changed)
-    camera = np.diag([1.0, -1.0, -1.0, 1.0])
-    layout = assemble.target.marker_layout(changed.markers, changed.container, changed.turntable)
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), parameters)
-    errors, moved = [], []
-    for number in (0, 5):
-        green = endmembers(simulation.materials, np.array([548.0]))[:, 0]
-        image = simulation.frame(number).material_weights @ green
-        enlarged = cv2.resize(
-            np.clip(255.0 * image, 0, 255).astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC
-        )
-        corners, ids, _ = detector.detectMarkers(enlarged)
-        world_to_camera = np.linalg.inv(simulation.camera_to_world[number] @ camera)
-        pose = cv2.Rodrigues(world_to_camera[:3, :3])[0], world_to_camera[:3, 3], simulation.intrinsics.matrix()
-        for marker, seen in zip(ids.ravel(), corners, strict=True):
-            lens, pinhole = (
-                cv2.projectPoints(layout[marker], *pose, np.array(c))[0][:, 0]
-                for c in (simulation.lens.coefficients(), (0.0,) * 4)
-            )
-            errors.append((seen[0] + 0.5) / 2.0 - lens)
-            moved.append(lens - pinhole)
-    assert len(errors) >= 10
-    assert np.median(np.linalg.norm(moved, axis=-1)) > 1.5
-    # What remains is the detector's own error, which is as large without a lens.
-    assert np.median(np.linalg.norm(errors, axis=-1)) < 0.35
-    assert np.abs(np.median(errors, axis=(0, 1))).max() < 0.1
-
-
 def test_a_lens_that_folds_the_image_is_refused():
     with pytest.raises(InputError, match=r"lens_distortion.*fold the image"):
         Simulation(scene(lens_distortion={"k1": -2.0, "k2": -2.0})).frame(0)
-
-
-@pytest.mark.slow
-def test_truth_carries_the_distortion_and_zeros_without(tmp_path):
-    with_lens = load_truth(simulate_session(scene(lens_distortion=LENS, frames=1), tmp_path / "lens", False))
-    without = load_truth(simulate_session(scene(frames=1), tmp_path / "none", False))
-    assert with_lens.distortion == tuple(LENS.values())
-    assert without.distortion == (0.0, 0.0, 0.0, 0.0)
-    assert "distortion" not in json.loads((tmp_path / "none" / "truth" / "truth.json").read_text())
-    assert with_lens.intrinsics == without.intrinsics
-    np.testing.assert_array_equal(with_lens.camera_to_world, without.camera_to_world)
 
 
 # Orientation
@@ -364,26 +341,12 @@ STRENGTHS = {
 }
 
 
-@pytest.fixture
-def one_renderer(monkeypatch):
-    """The same scene is built again and again here."""
-    thing, renderer = pear()
-    monkeypatch.setattr(frames.assemble, "object_part", lambda _: thing)
-    monkeypatch.setattr(frames.assemble, "build_renderer", lambda *_: renderer)
-    return renderer
-
-
-@functools.cache
-def pear():
-    thing = assemble.object_part(scene("pear"))
-    return thing, assemble.build_renderer(scene("pear"), thing)
-
-
 def by_definition(changed, renderer, exposure):
     """Counts of a frame from what each effect says it is, written down once more without the stages."""
     on = {effect.name: effect for effect in changed.effects}
     camera = assemble.intrinsics(changed.camera), assemble.first_camera(changed.camera)
-    view = *camera, changed.camera.supersampling, on.get("lens_distortion")
+    lens = on.get("lens_distortion")
+    view = *camera, changed.camera.supersampling, lens and lens.straighten
     weights = render(renderer, *view).material_weights
     if "optical_blur" in on:
         kernel = gaussian_kernel(on["optical_blur"].sigma_px)
@@ -425,39 +388,13 @@ def by_definition(changed, renderer, exposure):
     return np.clip(np.rint(counts), 0, LARGEST)
 
 
-def test_any_two_effects_together_are_what_their_definitions_say(one_renderer):
-    for pair in [(), *itertools.combinations(STRENGTHS, 2), tuple(STRENGTHS)]:
+def test_effects_together_are_what_their_definitions_say():
+    renderer = assemble.build_renderer(scene(), assemble.object_part(scene()))
+    for pair in [*itertools.pairwise(STRENGTHS), tuple(STRENGTHS)]:
         # Named in the wrong order: what counts is the order of EFFECTS.
-        changed = scene("pear", **{name: STRENGTHS[name] for name in reversed(pair)})
+        changed = scene(**{name: STRENGTHS[name] for name in reversed(pair)})
         counts = Simulation(changed).frame(0).counts
-        off = np.abs(counts - by_definition(changed, one_renderer, exposure=1))
+        off = np.abs(counts - by_definition(changed, renderer, exposure=1))
         # Sums in another order round a few numbers, and electrons, to the other side.
         assert off.max() <= 1.0, pair
         assert (off > 0).mean() < 0.005, pair
-
-
-@pytest.mark.parametrize("name", STRENGTHS)
-def test_off_is_off(name, monkeypatch, one_renderer):
-    def run(**effects):
-        # A size of its own, because rays are kept from frame to frame.
-        simulation = Simulation(scene("pear", size_px=20, **effects))
-        return [array for c in (simulation.frame(1), simulation.white()) for array in (c.counts, c.dark)]
-
-    def stop(*_):
-        raise AssertionError(f"{name} runs")
-
-    without = run()
-    for method in vars(EFFECTS[name]):
-        if callable(getattr(EFFECTS[name], method)) and not method.startswith("__"):
-            monkeypatch.setattr(EFFECTS[name], method, stop)
-    for array, again in zip(without, run(), strict=True):
-        np.testing.assert_array_equal(array, again)
-    with pytest.raises(AssertionError, match=f"{name} runs"):
-        run(**{name: STRENGTHS[name]})
-
-
-def test_random_numbers_of_a_session_are_not_those_of_an_exposure():
-    effect = LensDistortion()
-    keys = [(), (0,), (0, 0), (0, 1), (1, 0)]
-    drawn = {effect_rng(0, effect, *key).integers(2**60) for key in keys}
-    assert len(drawn) == len(keys)

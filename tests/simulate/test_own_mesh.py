@@ -4,14 +4,12 @@ import numpy as np
 import pepper_mesh
 import pytest
 import trimesh
-from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.meshes.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
-from hsi_sc_nerf.simulate.own_mesh import padded_fractions, sampled
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
 
 RADIUS_M = 0.03
@@ -54,40 +52,6 @@ def save_ply(path, vertices, triangles, columns):
     face = np.empty(len(triangles), [("vertex_indices", "<i4", (3,))])
     face["vertex_indices"] = triangles
     PlyData([PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]).write(path)
-
-
-def ramp(path, axis):
-    """Red falls and green rises linearly along one axis of the image, from texel centre to texel centre."""
-    size = 256
-    rise = (np.arange(size) + 0.5) / size
-    green = np.broadcast_to(rise if axis == 1 else rise[::-1, None], (size, size))
-    image = np.stack([1.0 - green, green, np.zeros_like(green)], axis=-1)
-    Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".gltf"])
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_texture_lies_where_the_uvs_say(tmp_path, suffix, axis):
-    save(tmp_path / f"ball{suffix}", *uv_sphere())
-    ramp(tmp_path / "fractions.png", axis)
-    mesh, weights = own_mesh.load(
-        OwnMesh("mesh", tmp_path / f"ball{suffix}", TWO, weight_texture=tmp_path / "fractions.png")
-    )
-    assert mesh.is_watertight()
-    edges = mesh.vertices[mesh.triangles] - mesh.vertices[np.roll(mesh.triangles, 1, axis=1)]
-    assert np.linalg.norm(edges, axis=-1).max() <= own_mesh.TEXTURE_SPACING_M
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-12)
-    x, y, z = mesh.vertices.T
-    if axis == 0:
-        # UVs are linear within the flat triangles of the coarse sphere, whose rings are at even latitudes.
-        expected = np.arcsin(np.clip((z - RADIUS_M) / RADIUS_M, -1, 1)) / np.pi + 0.5
-        chosen = (expected > 0.15) & (expected < 0.85)
-    else:
-        expected = np.arctan2(y, x) / (2 * np.pi) % 1.0
-        chosen = (expected > 0.05) & (expected < 0.95) & (np.abs(z - RADIUS_M) < 0.7 * RADIUS_M)
-    assert chosen.sum() > 5000
-    np.testing.assert_allclose(weights[chosen, 1], expected[chosen], atol=0.006)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
@@ -171,9 +135,7 @@ def test_a_seam_that_an_exporter_rounded_is_closed(tmp_path):
     save(
         tmp_path / "ball.obj", vertices + np.random.default_rng(0).uniform(-1e-9, 1e-9, vertices.shape), triangles, uv
     )
-    ramp(tmp_path / "fractions.png", 0)
-    texture = tmp_path / "fractions.png"
-    mesh, _ = own_mesh.load(OwnMesh("mesh", tmp_path / "ball.obj", TWO, weight_texture=texture))
+    mesh, _ = own_mesh.load(OwnMesh("mesh", tmp_path / "ball.obj", ("a",)))
     assert mesh.is_watertight()
 
 
@@ -187,20 +149,6 @@ def test_welding_averages_columns_and_drops_empty_triangles():
 def test_snapping_moves_near_vertices_to_one_place():
     vertices = np.array([[0.1, 0.2, 0.3], [0.1 + 1e-9, 0.2, 0.3], [0.5, 0.2, 0.3]])
     np.testing.assert_array_equal(snapped(vertices, 1e-6), vertices[[0, 0, 2]])
-
-
-def test_sampling_is_bilinear_with_v_upwards_and_repeats():
-    image = np.array([[[0.0], [1.0]], [[2.0], [5.0]]])
-    uv = np.array([[0.25, 0.75], [0.75, 0.25], [0.5, 0.5], [1.25, -0.25], [0.0, 0.75]])
-    np.testing.assert_allclose(sampled(image, uv).ravel(), [0.0, 5.0, 2.0, 0.0, 0.5])
-
-
-def test_paint_is_grown_a_little_beyond_its_islands():
-    image = np.zeros((20, 20, 2))
-    image[:, 0] = [0.5, 1.5]
-    fractions = padded_fractions(image)
-    np.testing.assert_allclose(fractions[:, :9], np.broadcast_to([0.25, 0.75], (20, 9, 2)))
-    assert not fractions[:, 9:].any()
 
 
 def test_the_shipped_pepper_is_what_its_script_makes(tmp_path):
@@ -262,20 +210,3 @@ def test_bad_weights_get_one_sentence(tmp_path):
     refused(tmp_path, "are 0 for every material")
     save_ply(tmp_path / "ball.ply", vertices, triangles, {"weight_a": uv[:, 0], "weight_b": -1 - uv[:, 0]})
     refused(tmp_path, "are negative")
-
-
-def test_bad_textures_get_one_sentence(tmp_path):
-    surface = uv_sphere()
-    texture = {"weight_texture": tmp_path / "fractions.png"}
-    save(tmp_path / "ball.obj", *surface)
-    refused(tmp_path, "cannot be read as an image", "ball.obj", **texture)
-    (tmp_path / "fractions.png").write_text("no image")
-    refused(tmp_path, "cannot be read as an image", "ball.obj", **texture)
-    Image.new("L", (8, 8), 255).save(tmp_path / "fractions.png")
-    refused(tmp_path, "is grey", "ball.obj", **texture)
-    Image.new("RGB", (64, 64)).save(tmp_path / "fractions.png")
-    refused(tmp_path, "are 0 for every material", "ball.obj", **texture)
-    ramp(tmp_path / "fractions.png", 0)
-    refused(tmp_path, "can represent 3 materials", "ball.obj", ("a", "b", "c", "d"), **texture)
-    save_ply(tmp_path / "ball.ply", *surface[:2], {})
-    refused(tmp_path, "has no UVs", **texture)

@@ -5,9 +5,15 @@ import pytest
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.effects.detector import (
+    band_centres_nm,
+    digitise,
+    lamp_photons,
+    quantum_efficiency,
+    white_signal,
+)
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.scene import SensorSettings
-from hsi_sc_nerf.simulate.sensor import band_centres_nm, digitise, lamp_photons, quantum_efficiency, white_signal
 
 WAVELENGTHS_NM = band_centres_nm(204)
 

@@ -1,7 +1,5 @@
 """Objects of scenes: the solids' closed forms, a scene's own materials, and what is refused."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.materials import MATERIALS, Measured, Plain, PlantTissue, endmembers
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
-from hsi_sc_nerf.simulate.scene import Cylinder, Fruit, OwnMesh, Sphere, load_scene, override, parse_scene
+from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override, parse_scene
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -45,12 +43,6 @@ def test_cylinder_has_its_closed_forms(diameter_m, height_m):
     radius = np.hypot(*mesh.vertices[:, :2].T)
     on_side = (mesh.vertices[:, 2] > 1e-9) & (mesh.vertices[:, 2] < height_m - 1e-9)
     np.testing.assert_allclose(radius[on_side], diameter_m / 2, rtol=1e-12)
-
-
-def test_white_reflects_all_and_grey_half_in_every_band():
-    white, grey = endmembers(["matte_white", "matte_grey"], np.linspace(397, 1004, 50))
-    np.testing.assert_array_equal(white, 1.0)
-    np.testing.assert_array_equal(grey, 0.5)
 
 
 @pytest.mark.slow
@@ -95,32 +87,15 @@ def test_a_scene_defines_its_own_materials_in_three_ways(tmp_path):
     assert "skin" not in MATERIALS
 
 
-def test_own_materials_reach_the_counts(tmp_path):
-    black = parse(SCENE + "materials: {matte_white: {plain: {level: 0.1}}}\n", tmp_path)
-    truth = load_truth(simulate_session(override(black, **SMALL), tmp_path / "s", False))
-    inside = truth.object_coverage("scene_000") == 1.0
-    np.testing.assert_allclose(truth.reflectance("scene_000")[inside], 0.1, rtol=1e-6)
-
-
 def test_paths_are_relative_to_the_scene_file(tmp_path):
     (tmp_path / "mine.yaml").write_text(
         SCENE.replace("{shape: sphere, height_m: 0.07, material: matte_white}",
-                      "{shape: mesh, mesh_file: parts/a.ply, materials: [matte_grey], weight_texture: a.png}")
+                      "{shape: mesh, mesh_file: parts/a.ply, materials: [matte_grey]}")
     )  # fmt: skip
     thing = load_scene(tmp_path / "mine.yaml").object
     assert isinstance(thing, OwnMesh)
-    assert (thing.mesh_file, thing.weight_texture) == (tmp_path / "parts" / "a.ply", tmp_path / "a.png")
+    assert thing.mesh_file == tmp_path / "parts" / "a.ply"
     assert thing.height_m is None
-
-
-def test_each_shape_has_its_own_keys(tmp_path):
-    assert isinstance(load_scene("apple").object, Fruit)
-    assert isinstance(load_scene("sphere").object, Sphere)
-    assert isinstance(load_scene("cylinder").object, Cylinder)
-    with pytest.raises(
-        InputError, match=r"object\.blush is not a known key; known here are shape, height_m, material"
-    ):
-        parse(SCENE.replace("material: matte_white", "blush: 1"), tmp_path)
 
 
 @pytest.mark.slow
@@ -205,9 +180,3 @@ def test_bad_spectra_get_one_sentence(tmp_path, content, sentence):
     (tmp_path / "leaf.csv").write_text(content)
     with pytest.raises(InputError, match=rf"leaf\.csv: .*({sentence})"):
         parse(SCENE + "materials: {disc: {csv: leaf.csv}}\n", tmp_path)
-
-
-def test_an_override_keeps_the_materials():
-    scene = load_scene("pepper")
-    assert override(scene, bands=8).materials == scene.materials
-    assert dataclasses.replace(scene, seed=3).object == scene.object

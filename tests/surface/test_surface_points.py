@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.surface import surface_points
-from hsi_sc_nerf.surface.regions import EVERYWHERE, box_region, cylinder_region
+from hsi_sc_nerf.surface.regions import EVERYWHERE, box_region
 from hsi_sc_nerf.surface.surface_points import SurfacePoints, even_points
 from hsi_sc_nerf.surface.tsdf_fusion import SurfaceMesh
 
@@ -15,25 +14,15 @@ def at(points: np.ndarray) -> SurfacePoints:
     return SurfacePoints(points, points, np.zeros(len(points), int), points[:, :2], np.zeros(len(points)))
 
 
-def test_box_and_cylinder() -> None:
-    points = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 1.0], [0.4, 0.4, 0.5], [0.0, 0.0, 1.1]])
-    box = box_region(np.array([[0.0, 0.0, 0.0], [0.45, 0.5, 1.0]]))
-    wide = cylinder_region(np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]]))
-    narrow = cylinder_region(np.array([[0.3, 0.3, 0.0], [0.5, 0.5, 1.0]]))
-    np.testing.assert_array_equal(box.contains(points, points), [True, False, True, True, False])
-    np.testing.assert_array_equal(wide.contains(points, points), [True, True, True, False, False])
-    np.testing.assert_array_equal(narrow.contains(points, points), [False, False, False, True, False])
-    np.testing.assert_array_equal(narrow.bounds, [[0.3, 0.3, 0.0], [0.5, 0.5, 1.0]])
-
-
 def test_the_intersection_of_two_boxes_is_a_box() -> None:
     points = np.random.default_rng(0).random((50, 3))
     first = box_region(np.array([[0.0, 0.2, 0.0], [0.8, 1.0, 1.0]]))
     second = box_region(np.array([[0.1, 0.0, 0.5], [1.0, 0.7, 1.0]]))
     both = EVERYWHERE & first & second
     np.testing.assert_array_equal(both.bounds, [[0.1, 0.2, 0.5], [0.8, 0.7, 1.0]])
-    np.testing.assert_array_equal(both.contains(points, points), box_region(both.bounds).contains(points, points))
-    assert EVERYWHERE.contains(points, points).all()
+    inside = ((points >= both.bounds[0]) & (points <= both.bounds[1])).all(axis=1)
+    np.testing.assert_array_equal(both.contains(points, points), inside)
+    assert 0 < inside.sum() < 50
 
 
 # Two squares in the plane, the second of nine times the area, cut unevenly into triangles.
@@ -44,8 +33,7 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 8], [5, 6, 8], [6, 7, 8], [7,
 
 
 def test_as_many_points_as_asked_for_evenly_over_what_is_kept() -> None:
-    parts = even_points(VERTICES, TRIANGLES, 9000, lambda p: at(p[(p[:, 0] < 0.5) | (p[:, 0] > 2.0)]))
-    points = np.concatenate([part.points for part in parts])
+    points = even_points(VERTICES, TRIANGLES, 9000, lambda p: at(p[(p[:, 0] < 0.5) | (p[:, 0] > 2.0)])).points
     assert len(points) == 9000
     assert not ((points[:, 0] > 0.5) & (points[:, 0] < 2.0)).any()
     # 9.5 units of area in squares of a quarter unit: 38 squares with 237 points each.
@@ -53,12 +41,6 @@ def test_as_many_points_as_asked_for_evenly_over_what_is_kept() -> None:
     counts = np.unique(squares, axis=0, return_counts=True)[1]
     assert len(counts) == 38
     assert counts.std() / counts.mean() < 1.2 / np.sqrt(237)
-
-
-def test_nothing_kept_is_nothing_found(monkeypatch) -> None:
-    monkeypatch.setattr(surface_points, "_MAX_BATCH", 200_000)
-    assert even_points(VERTICES, TRIANGLES, 100, lambda p: at(p[:0])) == []
-    assert even_points(VERTICES, TRIANGLES[:0], 100, at) == []
 
 
 @pytest.mark.slow
@@ -72,9 +54,7 @@ def test_a_narrow_region_is_searched_in_pieces(monkeypatch, width: float) -> Non
         tried.append(len(points))
         return at(points[(points[:, 1] > 1.0) & (points[:, 1] < 1.2) & (np.abs(points[:, 0] - 3.0) < width / 2)])
 
-    found, again = (
-        np.concatenate([part.points for part in even_points(VERTICES, TRIANGLES, 50, keep)]) for _ in "ab"
-    )
+    found, again = (even_points(VERTICES, TRIANGLES, 50, keep).points for _ in "ab")
     assert len(found) == 50
     np.testing.assert_array_equal(found, again)
     assert np.std(found[:, 1]) == pytest.approx(0.2 / np.sqrt(12), rel=0.25)
@@ -84,8 +64,9 @@ def test_a_narrow_region_is_searched_in_pieces(monkeypatch, width: float) -> Non
 def test_the_search_ends_with_what_was_found(monkeypatch) -> None:
     monkeypatch.setattr(surface_points, "_MAX_BATCH", 10_000)
     monkeypatch.setattr(surface_points, "_MAX_CANDIDATES", 3)
-    parts = even_points(VERTICES, TRIANGLES, 5000, lambda p: at(p[p[:, 0] < 0.5]))
-    assert sum(map(len, parts)) == pytest.approx(1500, rel=0.1)  # a 20th of three attempts
+    found = even_points(VERTICES, TRIANGLES, 5000, lambda p: at(p[p[:, 0] < 0.5]))
+    assert len(found) == pytest.approx(35_000 / 20, rel=0.1)  # the first sample and three batches
+    assert len(even_points(VERTICES, TRIANGLES, 100, lambda p: at(p[:0]))) == 0
 
 
 def test_triangles_near_a_box_are_those_that_may_reach_it() -> None:
@@ -106,5 +87,4 @@ def test_candidates_are_in_proportion_to_the_fraction_kept() -> None:
         return at(points[points[:, 0] < 1.5])
 
     even_points(VERTICES, TRIANGLES, 5000, keep)
-    assert sum(tried[1:]) < 1.1 * 50_000
-    assert len(sample_surface(VERTICES, TRIANGLES, 10)) == 10
+    assert sum(tried) < 1.1 * 50_000

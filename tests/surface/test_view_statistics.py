@@ -8,29 +8,9 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, write_packed_cube
 from hsi_sc_nerf.packed.pixels import PixelReader
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
-from hsi_sc_nerf.surface.view_statistics import RunningStd, view_statistics
+from hsi_sc_nerf.surface.view_statistics import view_statistics
 
 LENS = PinholeIntrinsics(8, 6, 20.0, 20.0, 4.0, 3.0)
-
-
-def test_the_running_standard_deviation_is_numpys() -> None:
-    rng = np.random.default_rng(0)
-    spectra = 0.5 + 0.001 * rng.standard_normal((7, 30, 5)).astype(np.float32)
-    valid = rng.random(spectra.shape) < 0.7
-    seen = rng.random((7, 30)) < 0.6
-    seen[:, 0] = False
-    std = RunningStd(np.full((30, 5), 0.49, np.float32))
-    for view in range(7):
-        points = np.flatnonzero(seen[view])
-        std.add(points, spectra[view, points], valid[view, points])
-    measured = np.where(valid & seen[..., None], spectra, np.nan).astype(float)
-    with np.errstate(invalid="ignore"):
-        counts = np.isfinite(measured).sum(axis=0)
-        deviations = np.nan_to_num(measured - np.nansum(measured, axis=0) / counts)
-        by_band = np.where(counts > 1, np.sqrt((deviations**2).sum(axis=0) / (counts - 1)), np.nan)
-    expected = [np.nanmean(row) if np.isfinite(row).any() else np.nan for row in by_band]
-    assert np.isnan(expected[0])
-    np.testing.assert_allclose(std.mean_std(), expected, rtol=1e-3)
 
 
 def frames(folder, levels, bands: int = 3):
@@ -49,7 +29,6 @@ def frames(folder, levels, bands: int = 3):
         cell_px=1,
         masks=torch.ones(len(levels), LENS.h, LENS.w, dtype=torch.bool),
         points=np.zeros((0, 3)),
-        depth_tolerance=0.01,
     )
     return renders, cubes
 

@@ -12,7 +12,7 @@ from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerControl, ViewerElement
 from viser.transforms import SO3
 
-from hsi_sc_nerf.data.cameras import CAMERA_ROTATION, FRAME_INDEX
+from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.plotting.false_colour import BLANK, coloured

@@ -1,8 +1,8 @@
 """The effects that a scene can name: departures from a matte object, even light and a perfect sensor.
 
-Effects act in the order of `EFFECTS`, whatever their order in the scene file: motion of the turntable, shape of the
-object, light, background, reflectance, lamps, optics, detector. Effects of one base class change the same thing in
-turn; `frames.Simulation` applies the others where they act. A scene without effects runs no code of any effect.
+Effects act in the order of `EFFECTS`, whatever their order in the scene file: motion of the turntable, light,
+background, reflectance, lamps, optics, detector. Effects of one base class change the same thing in turn;
+`frames.Simulation` applies the others where they act. A scene without effects runs no code of any effect.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_ranges, read_dataclass
 from hsi_sc_nerf.simulate.effect import Effect
-from hsi_sc_nerf.simulate.effects.chamber import ChamberShading, InterReflection, TexturedBackground
 from hsi_sc_nerf.simulate.effects.detector import (
     BadPixels,
     DarkPattern,
@@ -23,7 +22,16 @@ from hsi_sc_nerf.simulate.effects.detector import (
     SpectralSmile,
     TarpExposure,
 )
-from hsi_sc_nerf.simulate.effects.illumination import DriftingLamps, IlluminationFalloff, Lamp
+from hsi_sc_nerf.simulate.effects.image import (
+    DriftingLamps,
+    Drying,
+    IlluminationFalloff,
+    ImageRotation,
+    LensDistortion,
+    OpticalBlur,
+    TexturedBackground,
+)
+from hsi_sc_nerf.simulate.effects.light import ChamberShading, Gloss, InterReflection, Lamp
 from hsi_sc_nerf.simulate.effects.motion import (
     AngleJitter,
     AxisTilt,
@@ -34,8 +42,6 @@ from hsi_sc_nerf.simulate.effects.motion import (
     RepeatedFrames,
     Wobble,
 )
-from hsi_sc_nerf.simulate.effects.object import Deformation, Drying, Gloss, Translucency
-from hsi_sc_nerf.simulate.effects.optics import ImageRotation, LensDistortion, OpticalBlur
 
 _ORDER: tuple[type[Effect], ...] = (
     PartialTurn,
@@ -46,10 +52,8 @@ _ORDER: tuple[type[Effect], ...] = (
     RepeatedFrames,
     MissingFrames,
     OffCentre,
-    Deformation,
     ChamberShading,
     InterReflection,
-    Translucency,
     Lamp,
     Gloss,
     TexturedBackground,

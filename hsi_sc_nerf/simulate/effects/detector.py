@@ -1,4 +1,4 @@
-"""Effects of the detector: spectral smile, exposure, fixed patterns, bad pixels and noise.
+"""The sensor, and its effects: spectral smile, exposure, fixed patterns, bad pixels and noise.
 
 With `PhotonNoise` and `ReadNoise` the variance of a pixel's counts is linear in its mean, the photon transfer curve
 (Janesick, "Photon Transfer", SPIE 2007): ``variance = (mean - dark) / g + (electrons / g)^2``, where g is the number
@@ -9,17 +9,86 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import resources
 from typing import ClassVar, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt16
 
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.light import lamp_photons
 
 Counts: TypeAlias = Float[np.ndarray, "lines samples bands"]
 FEW_ELECTRONS = 50.0
 """Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """A perfect push-broom sensor: counts are linear in light and free of noise."""
+
+    bands: int = between(3, 2048, default=paper.BANDS)
+    bit_depth: int = between(8, 16, default=12)
+    lamp_temperature_k: float = between(1500.0, 10000.0, default=3000.0)
+    white_level: float = between(0.05, 1.0, default=0.82)
+    """Counts of the white tarp in its brightest band, as a fraction of the largest count."""
+    dark_level: int = between(0, 1000, default=120)
+    """Counts without light."""
+    full_well_electrons: float = between(100.0, 1e7, default=30_000.0)
+    """Electrons at the largest count; used by the noise effects."""
+
+
+def band_centres_nm(bands: int) -> Float[np.ndarray, "bands"]:
+    """The 204 band centres of a SPECIM IQ as it exports them, or ``bands`` centres interpolated between them."""
+    table = resources.files("hsi_sc_nerf.simulate").joinpath("specim_iq_band_centres_nm.csv")
+    centres = np.array(table.read_text(encoding="utf-8").split()[1:], float)
+    if bands == len(centres):
+        return centres
+    positions = np.linspace(0.0, len(centres) - 1.0, bands)
+    return np.round(np.interp(positions, np.arange(len(centres)), centres), 2)
+
+
+def quantum_efficiency(wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
+    """Electrons per photon of a silicon sensor behind its grating, in [0, 1]."""
+    nodes_nm = [390.0, 420.0, 470.0, 530.0, 600.0, 680.0, 760.0, 840.0, 920.0, 980.0, 1010.0]
+    values = [0.36, 0.44, 0.55, 0.63, 0.67, 0.62, 0.52, 0.39, 0.25, 0.14, 0.09]
+    return np.interp(wavelengths_nm, nodes_nm, values)
+
+
+def white_signal(
+    sensor: SensorSettings, wavelengths_nm: Float[np.ndarray, "*samples bands"]
+) -> Float[np.ndarray, "*samples bands"]:
+    """Counts above dark of a reflectance of 1; its peak with dark is ``white_level`` of the largest count.
+
+    Raises:
+        InputError: the dark counts leave no room for it.
+    """
+    white = sensor.white_level * largest_count(sensor)
+    if white <= sensor.dark_level:
+        raise InputError(
+            f"sensor.dark_level is {sensor.dark_level}, but the white counts no more than {white:g} (white_level of "
+            f"the largest count {largest_count(sensor)}); lower it, or take a larger bit_depth."
+        )
+    # The peak is that of the header's bands, also under a spectral smile.
+    electrons, at_centres = (
+        lamp_photons(nm, sensor.lamp_temperature_k) * quantum_efficiency(nm)
+        for nm in (wavelengths_nm, band_centres_nm(sensor.bands))
+    )
+    return electrons / at_centres.max() * (white - sensor.dark_level)
+
+
+def largest_count(sensor: SensorSettings) -> int:
+    """Largest count of the digitiser."""
+    return 2**sensor.bit_depth - 1
+
+
+def digitise(counts: Float[np.ndarray, "*n"], sensor: SensorSettings) -> UInt16[np.ndarray, "*n"]:
+    """Integer counts from 0 to the largest; overwrites ``counts``."""
+    np.rint(counts, out=counts)
+    return np.clip(counts, 0, largest_count(sensor), out=counts).astype(np.uint16)
 
 
 class ExposureEffect(Effect):

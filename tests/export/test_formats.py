@@ -5,36 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from random_cloud import BAND_NAMES, WAVELENGTHS_NM, random_cloud
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, stream
+from hsi_sc_nerf.export.cloud import CloudStream, stream
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 
-WAVELENGTHS_NM = np.array([397.32, 400.2, 650.0, 1003.58])
 COUNT = 50
-
-
-def cloud(count: int = COUNT, bands: int = 4) -> SpectralCloud:
-    random = np.random.default_rng(0)
-    return SpectralCloud(
-        random.normal(0, 0.05, (count, 3)).astype(np.float32),
-        random.normal(size=(count, 3)).astype(np.float32),
-        random.integers(0, 256, (count, 3), dtype=np.uint8),
-        random.random((count, bands), dtype=np.float32),
-        np.linspace(400.0, 1000.0, bands) if bands != 4 else WAVELENGTHS_NM,
-        {"opacity": random.random(count, dtype=np.float32), "views": np.arange(count, dtype=np.float32)},
-    )
 
 
 def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
-    written = cloud()
+    written = random_cloud(COUNT)
     path = write_cloud(tmp_path / "cloud", stream(written, 7), "las")
     read = laspy.read(path)
     assert path.name == "cloud.las"
     np.testing.assert_allclose(read.xyz, written.points, atol=1e-6)
     np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], 1) // 257, written.colours)
-    for band, name in enumerate(("397.32nm", "400.20nm", "650.00nm", "1003.58nm")):
+    for band, name in enumerate(BAND_NAMES):
         np.testing.assert_array_equal(read[name], written.spectra[:, band])
     np.testing.assert_array_equal(read["NormalY"], written.normals[:, 1])
     np.testing.assert_array_equal(read["views"], np.arange(COUNT))
@@ -43,12 +31,8 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
 
 def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
-    fits = cloud(2, 336)
-    write_cloud(tmp_path / "fits", stream(fits), "las")
-    with pytest.raises(InputError, match=r"room for 336 bands and the cloud has 337.*--bands"):
-        write_cloud(tmp_path / "cloud", stream(cloud(2, 337)), "las")
-    require_format(tmp_path / "cloud", "las", 336, 2)
-    with pytest.raises(InputError, match=r"cloud\.las: LAS has room for 336 bands"):
+    write_cloud(tmp_path / "fits", stream(random_cloud(2, np.linspace(400.0, 1000.0, 336))), "las")
+    with pytest.raises(InputError, match=r"cloud\.las: LAS has room for 336 bands and the cloud has 337.*--bands"):
         require_format(tmp_path / "cloud", "las", 337, 2)
 
 
@@ -57,7 +41,7 @@ def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
 def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, file_format, name: str) -> None:
     xarray = pytest.importorskip("xarray")
     pytest.importorskip({"netcdf": "h5netcdf", "zarr": "zarr"}[file_format])
-    written = cloud()
+    written = random_cloud(COUNT)
     for _ in range(2):  # the second replaces the first
         path = write_cloud(tmp_path / "cloud", stream(written, 7), file_format)
     assert [file.name for file in tmp_path.iterdir()] == [name]
@@ -79,19 +63,24 @@ def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, fil
 def test_a_missing_package_is_one_sentence(tmp_path: Path, monkeypatch, file_format, package: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=rf"needs the package {package}.*pip install 'hsi-sc-nerf\[formats\]'"):
-        write_cloud(tmp_path / "cloud", stream(cloud()), file_format)
+        write_cloud(tmp_path / "cloud", stream(random_cloud()), file_format)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file_format", ["ply", "las", "netcdf", "zarr"])
 def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> None:
-    before = write_cloud(tmp_path / "cloud", stream(cloud()), file_format)
+    before = write_cloud(tmp_path / "cloud", stream(random_cloud(COUNT)), file_format)
     size = sum(file.stat().st_size for file in tmp_path.rglob("*"))
-    pieces = stream(cloud(), 20)
-    short = CloudStream(COUNT + 1, pieces.wavelengths_nm, pieces.extra_names, pieces.chunks)
-    with pytest.raises(ValueError, match="hold 50 points, not 51"):
-        write_cloud(tmp_path / "cloud", short, file_format)
+
+    def breaking_off():
+        yield random_cloud(20)
+        raise RuntimeError("broken off")
+
+    with pytest.raises(RuntimeError, match="broken off"):
+        write_cloud(
+            tmp_path / "cloud", CloudStream(40, WAVELENGTHS_NM, ("opacity", "views"), breaking_off()), file_format
+        )
     assert list(tmp_path.iterdir()) == [before]
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
 
@@ -100,15 +89,6 @@ def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     (tmp_path / "cloud.zarr").mkdir()
     (tmp_path / "cloud.zarr" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="is no Zarr folder"):
-        write_cloud(tmp_path / "cloud", stream(cloud()), "zarr")
     with pytest.raises(InputError, match=r"cloud\.zarr: is no Zarr folder"):
-        require_format(tmp_path / "cloud", "zarr", 4, 2)
+        write_cloud(tmp_path / "cloud", stream(random_cloud()), "zarr")
     assert (tmp_path / "cloud.zarr" / "notes.txt").read_text() == "mine"
-
-
-def test_pieces_with_other_columns_are_refused(tmp_path: Path) -> None:
-    pieces = stream(cloud())
-    other = CloudStream(COUNT, pieces.wavelengths_nm, ("opacity",), pieces.chunks)
-    with pytest.raises(ValueError, match="other columns"):
-        write_cloud(tmp_path / "cloud", other, "ply")

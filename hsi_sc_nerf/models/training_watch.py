@@ -1,13 +1,28 @@
-"""Training steps with non-finite losses or gradients are skipped; too many in a row stop the run."""
+"""What is watched while a run trains: steps that are not finite, the progress, the results of its stages.
+
+Steps with non-finite losses or gradients are skipped; too many in a row stop the run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
+
+from hsi_sc_nerf.models.stages import Stage
+from hsi_sc_nerf.progress import timed_progress
+
+# Metrics of the paper's table.
+_SUMMARY = {"sam": "SAM {:.4f} rad", "rmse": "RMSE {:.4f}", "ssim": "SSIM {:.3f}", "psnr": "PSNR {:.1f} dB"}
+
+MAX_SKIPPED_IN_A_ROW = 20
+"""Skipped steps that end a run: single ones come from damaged values, so many from weights that are lost."""
 
 
 class TrainingDivergedError(RuntimeError):
@@ -31,18 +46,10 @@ class GuardedOptimizers(Optimizers):
     """
 
     skipped_groups: tuple[str, ...] = ()
-    _scale: float = 1.0
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Step the optimisers of ``param_groups``, or none of them.
-
-        With mixed precision, the gradient scaler skips steps and halves its scale, as designed while the scale is
-        large. Once it is below 1, such a step counts as skipped, at the step after it.
-        """
+        """Step the optimisers of ``param_groups``, or none of them. A gradient scaler skips such steps itself."""
         if grad_scaler.is_enabled():
-            scale = grad_scaler.get_scale()
-            self.skipped_groups = tuple(param_groups) if scale < min(1.0, self._scale) else ()
-            self._scale = scale
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
         gradients = {
@@ -57,15 +64,9 @@ class GuardedOptimizers(Optimizers):
 
 
 class NonFiniteGuard:
-    """Counter of consecutive skipped steps.
+    """Counter of consecutive skipped steps."""
 
-    Args:
-        limit: number of consecutive skipped steps that ends the run.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.in_a_row = 0
+    in_a_row = 0
 
     def record(self, step: int, losses: Iterable[str], groups: Iterable[str]) -> str | None:
         """Record a step; returns a sentence to print if it was skipped, else None.
@@ -76,7 +77,7 @@ class NonFiniteGuard:
             groups: names of the parameter groups whose gradient was not finite.
 
         Raises:
-            TrainingDivergedError: this was the last of ``limit`` skipped steps in a row.
+            TrainingDivergedError: this was the last of `MAX_SKIPPED_IN_A_ROW`.
         """
         causes = [f"loss {name}" for name in losses] or [f"gradient of {name}" for name in groups]
         if not causes:
@@ -84,9 +85,37 @@ class NonFiniteGuard:
             return None
         self.in_a_row += 1
         sentence = f"step {step} skipped: {', '.join(causes)} not finite"
-        if self.in_a_row >= self.limit:
+        if self.in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingDivergedError(
                 f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate, or look for "
                 "damaged frames"
             )
         return sentence
+
+
+def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
+    """One line with a stage's metrics of the held-out views, inside the masks and (``full_``) of whole frames."""
+    masked, full = (
+        ", ".join(text.format(metrics[prefix + key]) for key, text in _SUMMARY.items()) for prefix in ("", "full_")
+    )
+    return f"{name} stage, held-out views: object {masked}; whole frame {full}"
+
+
+@contextmanager
+def training_progress(total_steps: int, first_step: int) -> Iterator[Callable[[int, Stage, float], None]]:
+    """Progress bar with stage, steps, smoothed PSNR of the batches and time left.
+
+    The context gives a function that shows that a step of a stage is done, and the PSNR of its batch (dB).
+    """
+    smoothed_db = math.nan
+
+    def update(step: int, stage: Stage, psnr_db: float) -> None:
+        nonlocal smoothed_db
+        if math.isfinite(psnr_db):  # not so in a skipped step
+            smoothed_db = psnr_db if math.isnan(smoothed_db) else 0.95 * smoothed_db + 0.05 * psnr_db
+        quality = "" if math.isnan(smoothed_db) else f"PSNR {smoothed_db:.1f} dB"
+        bar.update(task, completed=step + 1, description=f"training, {stage.config.name} stage", quality=quality)
+
+    with timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}")) as bar:
+        task = bar.add_task("training", total=total_steps, completed=first_step, quality="")
+        yield update

@@ -1,20 +1,27 @@
-"""The parts of a simulated object that are visible in at least one view, and so can be reconstructed."""
+"""The true surface of a simulated object: what views see of it, ideal clouds, true spectra, material fractions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from plyfile import PlyData
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
-from hsi_sc_nerf.meshes.mesh import ray_scene
+from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
+from hsi_sc_nerf.spectra.composites import composite
+from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -23,6 +30,8 @@ COVERED = 0.5
 """Smallest fraction of an object pixel that the object covers."""
 LIFT_M = 1e-5
 """Offset of the origin of a line of sight from the surface."""
+FACET_LIFT_M = 0.0001
+"""The same where the facets of a concave surface must not hide each other."""
 
 
 def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:
@@ -119,3 +128,86 @@ def _in_object_pixels(
     shown = np.zeros(len(points_m), bool)
     shown[inside] = coverage[lines[inside], columns[inside]] >= COVERED
     return shown
+
+
+@dataclass(frozen=True)
+class TrueSurface:
+    """A closed mesh with known materials.
+
+    Attributes:
+        materials: names.
+        mesh: metres, object frame.
+        weights: fraction of each material at each vertex.
+        endmembers: reflectance of each material.
+        wavelengths_nm: band centres.
+    """
+
+    materials: tuple[str, ...]
+    mesh: Mesh
+    weights: Float[np.ndarray, "v materials"]
+    endmembers: Float[np.ndarray, "materials bands"]
+    wavelengths_nm: Float[np.ndarray, "bands"]
+
+    @classmethod
+    def of(cls, truth: Truth) -> TrueSurface:
+        """The true surface of a simulated session."""
+        vertex = PlyData.read(str(truth.mesh_path))["vertex"]
+        columns = {p.name.removeprefix("weight_"): vertex[p.name] for p in vertex.properties if "weight_" in p.name}
+        endmembers = truth.endmembers[[truth.materials.index(name) for name in columns]]
+        return cls(
+            tuple(columns), truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm
+        )
+
+    def reflectance(self, chosen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "n bands"]:
+        """True spectra of the chosen vertices."""
+        return (self.weights[chosen] @ self.endmembers).astype(np.float32)
+
+    def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit normal, material fractions and distance (m) of the nearest surface point of each point."""
+        found = self._scene().compute_closest_points(np.asarray(points_m, np.float32))
+        triangle, uv = found["primitive_ids"].numpy().astype(np.int64), found["primitive_uvs"].numpy()
+        barycentric = np.concatenate([1.0 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+        weights = np.einsum("nc,ncm->nm", barycentric, self.weights[self.mesh.triangles[triangle]])
+        normals = found["primitive_normals"].numpy().astype(float)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return normals, weights, np.linalg.norm(found["points"].numpy() - points_m, axis=1)
+
+    def seen(
+        self, points_m: Float[np.ndarray, "n 3"], eyes_m: Float[np.ndarray, "cameras 3"]
+    ) -> Bool[np.ndarray, "n"]:
+        """Which points of the surface are visible from at least one camera position, occluded by the object only."""
+        scene = self._scene()
+        return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
+
+    def cloud(
+        self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0
+    ) -> SpectralCloud:
+        """The cloud of an ideal reconstruction: uniform, visible points with true spectra.
+
+        Args:
+            count: number of points on the whole surface, invisible ones included.
+            eyes_m: positions of the cameras.
+            noise_m: standard deviation of the position in each direction; if positive, normals scatter by 0.3 rad.
+            seed: seed of positions and noise.
+        """
+        rng = np.random.default_rng(seed)
+        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count, seed)
+        points = points[self.seen(points, eyes_m)]
+        normals, weights, _ = self.nearest(points)
+        spectra = (weights @ self.endmembers).astype(np.float32)
+        colours = to_8_bit(composite(spectra, self.wavelengths_nm, paper.PSEUDO_RGB_NM))
+        if noise_m > 0.0:
+            points = points + noise_m * rng.standard_normal(points.shape)
+            normals = normals + 0.3 * rng.standard_normal(points.shape)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return SpectralCloud(
+            points.astype(np.float32), normals.astype(np.float32), colours, spectra, self.wavelengths_nm
+        )
+
+    def _scene(self) -> RaycastingScene:
+        return ray_scene(self.mesh.vertices, self.mesh.triangles)
+
+
+def relative_rms(measured: Float[np.ndarray, "bands"], true: Float[np.ndarray, "bands"]) -> float:
+    """Root mean square error of a spectrum relative to the root mean square of the true spectrum."""
+    return float(np.sqrt(np.mean(np.square(measured - true)) / np.mean(np.square(true))))

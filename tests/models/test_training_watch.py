@@ -1,12 +1,67 @@
-"""What TensorBoard is given, read back with its own reader; the picture of spectra."""
+"""Steps that are not finite; what TensorBoard is given, read back with its own reader."""
 
-import numpy as np
 import pytest
 import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from small_trainer import STEPS, trainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.amp.grad_scaler import GradScaler
 
-from hsi_sc_nerf.models.training_log import draw_spectra, stage_summary
+from hsi_sc_nerf.models.training_watch import (
+    MAX_SKIPPED_IN_A_ROW,
+    GuardedOptimizers,
+    NonFiniteGuard,
+    TrainingDivergedError,
+    non_finite_names,
+    stage_summary,
+)
+
+
+def optimizers():
+    groups = {name: [torch.nn.Parameter(torch.ones(3))] for name in ("fields", "camera_opt")}
+    config = {name: {"optimizer": AdamOptimizerConfig(lr=0.1), "scheduler": None} for name in groups}
+    return GuardedOptimizers(config, groups), groups
+
+
+def step(optimizers, groups):
+    optimizers.optimizer_scaler_step_some(GradScaler("cpu", enabled=False), list(groups))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_non_finite_gradient_changes_no_group(bad):
+    guarded, groups = optimizers()
+    groups["fields"][0].grad = torch.ones(3)
+    groups["camera_opt"][0].grad = torch.tensor([0.0, bad, 0.0])
+    step(guarded, groups)
+    assert guarded.skipped_groups == ("camera_opt",)
+    assert all((parameters[0] == 1.0).all() for parameters in groups.values())
+
+
+def test_finite_gradients_step():
+    guarded, groups = optimizers()
+    groups["fields"][0].grad = torch.ones(3)
+    step(guarded, groups)
+    assert guarded.skipped_groups == ()
+    assert (groups["fields"][0] < 1.0).all()
+    assert (groups["camera_opt"][0] == 1.0).all()
+
+
+def test_names_of_non_finite_terms():
+    losses = {"hsi_loss": torch.tensor(1.0), "angular_loss": torch.tensor(float("nan"))}
+    assert non_finite_names(losses) == ["angular_loss"]
+    assert non_finite_names({}) == []
+
+
+def test_guard_names_the_step_and_stops_after_the_limit_in_a_row():
+    guard = NonFiniteGuard()
+    assert guard.record(0, [], []) is None
+    assert "step 1 skipped: loss hsi_loss" in guard.record(1, ["hsi_loss"], ["fields"])
+    assert "gradient of fields" in guard.record(2, [], ["fields"])
+    assert guard.record(3, [], []) is None
+    for number in range(1, MAX_SKIPPED_IN_A_ROW):
+        guard.record(number, ["hsi_loss"], [])
+    with pytest.raises(TrainingDivergedError, match="step 99"):
+        guard.record(99, ["hsi_loss"], [])
 
 
 @pytest.fixture
@@ -35,31 +90,13 @@ def test_events_of_a_run(events):
         *("Eval Images Metrics Dict (all images)/sam", "Eval Metrics Dict/psnr", "Train Rays / Sec"),
     }
     assert expected <= set(tags["scalars"])
-    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error", "spectra")} <= set(tags["images"])
+    assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error")} <= set(tags["images"])
 
     rates = [event.value for event in events.Scalars("learning_rate/fields")]
     assert rates == pytest.approx([1e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
     assert [event.step for event in events.Scalars("Train Loss")] == list(range(STEPS))
     ends = [event.step for event in events.Scalars("Eval Images Metrics Dict (all images)/sam")]
     assert ends == [STEPS // 2 - 1, STEPS - 1]
-
-
-@pytest.mark.slow
-def test_picture_of_spectra():
-    wavelengths_nm = np.linspace(400, 1000, 20)
-    measured, rendered = torch.zeros(2, 20), torch.full((2, 20), 0.5)
-    picture = draw_spectra(wavelengths_nm, measured, rendered, ["line 3, sample 5", "line 4, sample 5"])
-    assert picture.ndim == 3
-    assert 0.0 <= float(picture.min()) < 0.2
-    assert float(picture.max()) == 1.0
-    # Values that are no measurements are not drawn, whatever number stands there.
-    measured[:, 10:] = 7.0
-    valid = torch.ones(2, 20, dtype=torch.bool)
-    valid[:, 10:] = False
-    shorter = draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"], valid)
-    measured[:, 10:] = 0.3
-    assert torch.equal(shorter, draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"], valid))
-    assert not torch.equal(shorter, draw_spectra(wavelengths_nm, measured, rendered, ["a", "b"]))
 
 
 def test_summary_names_both_readings():
