@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,11 @@ from hsi_sc_nerf.capture.envi import write_cube
 WAVELENGTHS_NM = np.linspace(420.0, 900.0, 9)
 LAMP = 1500.0 + 200.0 * np.arange(9)
 DARK = 100
-SIZE_PX = 160
+SIZE_PX = 128
 
 
 def frame_picture(
-    gray: np.ndarray, radius_px: float = 30.0, spot_px: float = 0.0, angle_deg: float = 0.0
+    gray: np.ndarray, radius_px: float = 24.0, spot_px: float = 0.0, angle_deg: float = 0.0
 ) -> np.ndarray:
     """Reflectance: the turntable, and a fruit on it whose dark spot turns with it."""
     y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
@@ -47,14 +48,24 @@ def write_one(folder: Path, name: str, reflectance: np.ndarray, *, seed: int = 0
 
 
 def write_turntable(
-    folder: Path, frames: int = 12, *, info: dict | None = None, quarter_turns: int = 0, **scene
+    folder: Path, frames: int = 12, *, info: dict | None = None, quarter_turns: int = 0, clockwise: bool = False
 ) -> Path:
     """Frames ``fruit_00`` ..., turned by ``np.rot90``'s ``quarter_turns`` from upright, and the tarp."""
-    turntable = MarkerScene(size_px=SIZE_PX, frames=frames, target_height_m=0.08, **scene)
-    for number, gray in enumerate(turntable.render()):
-        image = frame_picture(gray, spot_px=9.0, angle_deg=turntable.angles_deg[number])
+    pictures = rendered(frames)[:: -1 if clockwise else 1]
+    for number, image in enumerate(pictures):
         write_one(folder, f"fruit_{number:02d}", np.rot90(image, quarter_turns))
     write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), 0.98))
     if info is not None:
         (folder / "session.json").write_text(json.dumps(info))
     return folder
+
+
+@lru_cache(maxsize=2)
+def rendered(frames: int) -> list[np.ndarray]:
+    """Reflectance of the frames of a whole turn, counter-clockwise."""
+    turntable = MarkerScene(size_px=SIZE_PX, frames=frames, target_height_m=0.08)
+    angles_deg = turntable.angles_deg
+    return [
+        frame_picture(gray, spot_px=7.0, angle_deg=angle)
+        for gray, angle in zip(turntable.render(), angles_deg, strict=True)
+    ]

@@ -52,7 +52,7 @@ def names_in_short(names: Sequence[str], most: int = 6) -> str:
 
 def leave_out(names: Sequence[str]) -> str:
     """The options that leave captures out."""
-    return "--exclude " + " ".join(names)
+    return " ".join(f"--exclude {name}" for name in names)
 
 
 def _binning(capture: Capture) -> str | None:

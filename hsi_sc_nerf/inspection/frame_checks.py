@@ -14,10 +14,10 @@ from hsi_sc_nerf.inspection.file_checks import leave_out, names_in_short
 from hsi_sc_nerf.inspection.look import Look, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
-SATURATED_AMBER, SATURATED_RED = 0.005, 0.1
+SATURATED_AMBER, SATURATED_RED = 0.005, 0.25
 """Fractions of a frame's values: highlights are flagged value by value; from the red one the exposure is wrong."""
-DARK_AMBER, DARK_RED = 0.2, 0.7
-"""Fractions of a frame's values without light; the outermost bands of a good session have some."""
+DARK_AMBER, DARK_RED = 0.2, 0.95
+"""Fractions of a frame's values without light: a good session has some in its outermost bands, a covered lens all."""
 BLURRED = 0.6
 """A frame is less sharp than the others if its edges have this fraction of their slope."""
 COMPARED_PX = 40

@@ -208,7 +208,7 @@ def _checked(session: Session, config: ProcessConfig, console: Console) -> Sessi
         console.print(f"Left out: {name} ({reason.split('; ')[0]}).", highlight=False)
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
-        inspection = inspect_session(session, config.poses, scale_known)
+        inspection = inspect_session(session, config.poses, scale_known, config.calibration.white_source)
     findings = [finding for finding in inspection.findings if finding.name != "damaged"]
     for finding in findings:
         if finding.level == "amber" or finding.name in config.accept:

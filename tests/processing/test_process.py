@@ -306,7 +306,7 @@ def test_no_worker_is_refused(session, tmp_path):
 
 def test_marker_size_is_needed(tmp_path):
     session = write_session(tmp_path / "session", info=None)
-    with pytest.raises(InputError, match=r"session\.json: does not give marker_side_m"):
+    with pytest.raises(InputError, match=r"nothing gives a scale; state marker_side_m"):
         run(session, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
