@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import signal
+
 import numpy as np
+import pytest
 from inspection_session import SIZE_PX, frame_picture, write_one
 
+from hsi_sc_nerf.cli.inspect import InspectCommand
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.watch import Watch
 
 IMAGE = frame_picture(np.full((SIZE_PX, SIZE_PX), 90.0))
@@ -46,3 +51,19 @@ def test_what_is_wrong_is_flagged_at_once(tmp_path):
     assert "SIZE" in small
     assert watch.flagged == ["fruit_3", "fruit_4", "fruit_5"]
     assert watch.captures == 6
+
+
+def test_ctrl_c_ends_in_one_line(tmp_path, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    write_one(tmp_path, "fruit_0", IMAGE)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    try:
+        InspectCommand(tmp_path, watch=True).main()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert capsys.readouterr().out.splitlines()[-1].endswith(".")
+    with pytest.raises(InputError, match="no such folder"):
+        InspectCommand(tmp_path / "absent", watch=True).main()

@@ -281,7 +281,12 @@ def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
     session = write_session(tmp_path / "session", angles_deg)
     write_capture(session, "ball_7", expose(np.full((48, 48, len(WAVELENGTHS_NM)), BACKGROUND)))
     with caplog.at_level(logging.WARNING):
-        output = run(session, tmp_path / "data", poses=partial(true_poses, angles_deg=angles_deg))
+        output = run(
+            session,
+            tmp_path / "data",
+            ProcessConfig(accept=("other-object",)),
+            poses=partial(true_poses, angles_deg=angles_deg),
+        )
     assert [record.getMessage().split(":")[0] for record in caplog.records] == ["ball_7"]
     assert [frame.capture for frame in open_packed(output).frames if not frame.mask().any()] == ["ball_7"]
 
@@ -328,7 +333,7 @@ def test_marker_size_as_an_option_goes_before_the_sessions(tmp_path):
 
 def test_bad_tarp_writes_nothing(session, tmp_path):
     write_capture(session, "white_reference", np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16))
-    with pytest.raises(InputError, match="no usable region"):
+    with pytest.raises(InputError, match="white_reference is dark"):
         run(session, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
