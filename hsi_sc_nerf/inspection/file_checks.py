@@ -109,7 +109,7 @@ def _same(
         return Finding(name, "green", f"All frames have the same {what}: {usual}.", {"usual": usual})
     differing = ", ".join(sorted({str(values[frame]) for frame in others}))
     sentence = (
-        f"{session.path}: {names_in_short(others)} differ from the other frames in their {what} ({differing}, not "
+        f"{session.path}: the {what} of {names_in_short(others)} differ from the other frames' ({differing}, not "
         f"{usual}): {advice}"
     )
     sentence += f" with {leave_out(others)}." if level == "red" else "."

@@ -15,7 +15,7 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
 from hsi_sc_nerf.inspection.picture import draw_inspection
 
-INFO = {"object": "fruit", "marker_side_m": 0.03}
+INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from hsi_sc_nerf.cli.inspect import InspectCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
-INFO = {"object": "fruit", "marker_side_m": 0.03}
+INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,7 @@ def process(session: Path, output: Path, **settings) -> None:
     process_session(session, output, ProcessConfig(**settings), progress=False, estimate_poses=reached)
 
 
+@pytest.mark.slow
 def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left_out(session, tmp_path):
     image = frame_picture(np.full((SIZE_PX, SIZE_PX), 90.0))
     write_one(session, "fruit_05", image, **{"acquisition date": "15-02-2021"})
@@ -47,6 +48,7 @@ def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left
         process(session, tmp_path / "data", exclude=("fruit_05",))
 
 
+@pytest.mark.slow
 def test_all_damaged_captures_are_named_or_left_out(session, tmp_path):
     (session / "fruit_02" / "capture" / "fruit_02.raw").write_bytes(b"")
     shutil.rmtree(session / "fruit_08" / "capture")
