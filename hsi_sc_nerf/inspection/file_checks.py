@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.capture.session import Capture, Session, in_short
 from hsi_sc_nerf.findings import Finding, Level
 
 _DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}")
@@ -83,10 +83,9 @@ def _frames(session: Session) -> Finding:
 def _damaged(session: Session) -> list[Finding]:
     if not session.damaged:
         return []
-    names = list(session.damaged)
     sentence = (
-        f"{session.path}: {len(names)} captures cannot be used: {names_in_short(names)}; copy them again or leave "
-        f"them out with --skip-damaged ({'; '.join(reason.split('; ')[0] for reason in session.damaged.values())})."
+        f"{session.path}: {in_short(session.damaged)} cannot be used; copy the captures again, or leave them out "
+        "with --skip-damaged."
     )
     return [Finding("damaged", "red", sentence, dict(session.damaged))]
 
