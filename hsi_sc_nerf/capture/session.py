@@ -189,7 +189,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     captures = open_captures(kept, info, path, damaged)
     white_name = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
-    if broken_white is None and not captures:  # all for the same reason, most likely
+    if broken_white is None and damaged and not captures:  # all for the same reason, most likely
         broken_white = next(iter(damaged.values()))
     if broken_white is not None:
         raise InputError(f"{broken_white}.")

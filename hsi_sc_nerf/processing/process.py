@@ -160,6 +160,7 @@ def process_session(
         console,
         estimate_poses,
         config.marker_range_nm,
+        config.accept,
     )
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
