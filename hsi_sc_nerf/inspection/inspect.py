@@ -20,6 +20,7 @@ from hsi_sc_nerf.inspection.session_json import check_scale, filled_in
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.upright import rotation_from_corners
 
+INSPECTION_NAME = "inspection.json"
 UPRIGHT_FRAMES = 6
 """Frames from whose markers the upright direction is measured."""
 FEWEST_SIGHTINGS = 4

@@ -24,9 +24,9 @@ from hsi_sc_nerf.calibration.report import (
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, in_short, open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.files import write_json, write_png
 from hsi_sc_nerf.findings import refuse_red
-from hsi_sc_nerf.inspection.inspect import inspect_session
+from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, inspect_session
 from hsi_sc_nerf.inspection.session_json import suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
@@ -135,8 +135,10 @@ def process_session(
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    session = _checked(session, config, console)
+    inspection = _checked(session, config, console)
+    session = inspection.session
     _remove_transforms(output_dir)
+    write_json(output_dir / INSPECTION_NAME, inspection.report())
 
     calibration = _calibrate(session, config, output_dir, console)
     caches = pack_frames(
@@ -200,8 +202,8 @@ def process_session(
     return output_dir
 
 
-def _checked(session: Session, config: ProcessConfig, console: Console) -> Session:
-    """The session, upright, after the checks of `inspect_session`.
+def _checked(session: Session, config: ProcessConfig, console: Console) -> Inspection:
+    """The checks of `inspect_session`, with the session upright.
 
     Raises:
         InputError: a finding is red and not accepted.
@@ -218,7 +220,7 @@ def _checked(session: Session, config: ProcessConfig, console: Console) -> Sessi
         if finding.name == "scale" and finding.level == "red" and not session.info_path.is_file():
             console.print(suggestion(session, inspection.session_json), highlight=False)
     refuse_red(findings, config.accept)
-    return inspection.session
+    return inspection
 
 
 def _named_files(config: ProcessConfig) -> list[Path]:
