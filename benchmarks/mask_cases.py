@@ -18,13 +18,13 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import tyro
-from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from jaxtyping import Float
 from results_table import RESULTS, write_results
 from rich.progress import track
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
 from hsi_sc_nerf.simulate.scene import Scene, Sphere, load_scene, override
 from hsi_sc_nerf.simulate.scores.processing import COVERED
