@@ -22,7 +22,7 @@ from hsi_sc_nerf.calibration.report import (
     write_calibration,
 )
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
-from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session import Session, in_short, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.findings import refuse_red
@@ -206,11 +206,11 @@ def _checked(session: Session, config: ProcessConfig, console: Console) -> Sessi
     Raises:
         InputError: a finding is red and not accepted.
     """
-    for name, reason in session.damaged.items():
-        console.print(f"Left out: {name} ({reason.split('; ')[0]}).", highlight=False)
+    if session.damaged:
+        console.print(f"Left out: {in_short(session.damaged)}.", highlight=False)
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
-        inspection = inspect_session(session, config.poses, scale_known)
+        inspection = inspect_session(session, config.poses, scale_known, config.calibration.white_source)
     findings = [finding for finding in inspection.findings if finding.name != "damaged"]
     for finding in findings:
         if finding.level == "amber" or finding.name in config.accept:

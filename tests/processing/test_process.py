@@ -297,14 +297,14 @@ def test_no_worker_is_refused(session, tmp_path):
 
 def test_marker_size_is_needed(tmp_path):
     session = write_session(tmp_path / "session", info=None)
-    with pytest.raises(InputError, match=r"session\.json: does not give marker_side_m"):
+    with pytest.raises(InputError, match=r"nothing gives a scale; state marker_side_m"):
         run(session, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
 
 def test_bad_tarp_writes_nothing(session, tmp_path):
     write_capture(session, "white_reference", np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16))
-    with pytest.raises(InputError, match="no usable region"):
+    with pytest.raises(InputError, match="white_reference is dark"):
         run(session, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
