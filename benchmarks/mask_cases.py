@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from hsi_sc_nerf.simulate.effects.chamber import TexturedBackground
+from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from jaxtyping import Float
 
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
