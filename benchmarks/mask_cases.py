@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from jaxtyping import Float
 
+from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
 from hsi_sc_nerf.simulate.scene import Scene, Sphere, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
