@@ -22,11 +22,8 @@ from jaxtyping import Float
 from results_table import RESULTS, write_results
 from rich.progress import track
 
-<<<<<<< HEAD
-=======
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
->>>>>>> main
 from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
 from hsi_sc_nerf.simulate.scene import Scene, Sphere, load_scene, override
