@@ -4,8 +4,7 @@
     uv run python benchmarks/pose_hard_cases.py --method colmap
 
 Each case is a simulated session with one thing that makes it hard; errors are those against its true poses, over the
-used frames. Poses from features have no scale and no axes of their own: they are compared after the best similarity.
-COLMAP is not told the nominal angles, so that it cannot fall back to them.
+used frames, beside the standard deviations that are stated. Poses from features are told the camera's distance.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from results_table import RESULTS, write_results
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -43,7 +43,18 @@ COLUMNS = (
     "time, s",
     "model; warnings",
 )
-FEATURE_COLUMNS = ("session", "rotation, deg", "position, mm")
+FEATURE_COLUMNS = (
+    "session",
+    "rotation, deg",
+    "stated, deg",
+    "position, mm",
+    "stated, mm",
+    "focal, %",
+    "stated focal, %",
+    "size, %",
+    "stated size, %",
+    "findings",
+)
 WORKERS = 2
 Images = list[UInt8[np.ndarray, "h w"]]
 
@@ -66,6 +77,8 @@ class Case:
     """A wobbling table has no axis but a mean one, and the truth's is another: compare after a rigid alignment."""
     any_height: bool = False
     """Without markers on the disc the origin's height is arbitrary."""
+    knows_camera: bool = False
+    """Give the camera of an earlier session."""
 
 
 def blur_some(images: Images) -> Images:
@@ -124,12 +137,17 @@ CASES = {
 
 WALL = ("textured_background",)
 NO_MARKERS: dict[str, dict[str, float]] = {"markers": {"on_container": 0, "on_disc": 0}}
+LIGHT = (*WALL, "photon_noise", "lamp", "gloss")
 FEATURE_CASES = {
-    "pear, textured wall": Case(WALL, frames=60, changes=NO_MARKERS),
-    "apple, textured wall, photon noise": Case((*WALL, "photon_noise"), "apple", 60, changes=NO_MARKERS),
-    "pear, 20 frames": Case(WALL, frames=20, changes=NO_MARKERS),
-    "pear, 200 degrees": Case((*WALL, "{partial_turn: {span_deg: 200}}"), frames=60, changes=NO_MARKERS),
-    "maize ear": Case(WALL, "maize", 60, changes=NO_MARKERS),
+    "pear": Case(WALL, frames=36, changes=NO_MARKERS, any_height=True),
+    "pear, gloss": Case(LIGHT, frames=36, changes=NO_MARKERS, any_height=True),
+    "pear, gloss, earlier camera": Case(LIGHT, frames=36, changes=NO_MARKERS, any_height=True, knows_camera=True),
+    "pear, gloss, two markers": Case(LIGHT, frames=36, changes={"markers": {"on_container": 0, "on_disc": 2}}),
+    "pear, gloss, 200 degrees": Case(
+        (*LIGHT, "{partial_turn: {span_deg: 200}}"), frames=36, changes=NO_MARKERS, any_height=True
+    ),
+    "apple, gloss": Case(LIGHT, "apple", 36, changes=NO_MARKERS, any_height=True),
+    "maize ear": Case(WALL, "maize", 36, changes=NO_MARKERS, any_height=True),
 }
 
 
@@ -198,20 +216,19 @@ def pose(
     images = grey_images(simulation)
     if case.alter is not None:
         images = case.alter(images)
-    info = marker_info(simulation) if method == "markers" else SessionInfo()
+    info, camera = known_info(simulation, method), None
+    if case.knows_camera:
+        camera = KnownCamera(simulation.intrinsics, (0.0, 0.0, 0.0, 0.0), simulation.camera_to_world[0])
     started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, info, method, progress=False)
+    poses = find_poses(images, simulation.captures, info, method, camera=camera, progress=False)
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
-    if method == "colmap":
-        found = transformed_poses(align_poses(found, truth), found)
-    else:
-        azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
-        truth = rotation_about_z(-azimuth) @ truth  # x points to the first used frame's camera
-        if case.any_axis:
-            truth = transformed_poses(align_poses(truth, found, rigid=True), truth)
-        if case.any_height:
-            truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
+    azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
+    truth = rotation_about_z(-azimuth) @ truth  # x points to the first used frame's camera
+    if case.any_axis:
+        truth = transformed_poses(align_poses(truth, found), truth)
+    if case.any_height:
+        truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
     return Posed(simulation, info, poses, *pose_errors(found, truth), seconds)
 
 
@@ -223,22 +240,17 @@ def pose_errors(
     return degrees, 1e3 * np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=-1)
 
 
-def align_poses(
-    poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], rigid: bool = False
-) -> Similarity:
-    """The similarity that brings poses closest to a reference: first their orientations, then their positions.
+def align_poses(poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
+    """The rigid motion that brings poses closest to a reference: first their orientations, then their positions.
 
     Args:
         poses: camera-to-world, metres.
         reference: likewise.
-        rigid: keep the scale.
     """
     left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], poses[:, :3, :3]))
     rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    turned, target = poses[:, :3, 3] @ rotation.T, reference[:, :3, 3]
-    centred = turned - turned.mean(axis=0)
-    scale = 1.0 if rigid else float(np.sum(centred * target) / np.sum(centred**2))
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * turned.mean(axis=0))
+    shift = (reference[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(axis=0)
+    return Similarity(1.0, rotation, shift)
 
 
 def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
@@ -249,9 +261,11 @@ def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"])
     return moved
 
 
-def marker_info(simulation: Simulation) -> SessionInfo:
-    """What a laboratory would note of a session with markers."""
+def known_info(simulation: Simulation, method: Literal["markers", "colmap"]) -> SessionInfo:
+    """What a laboratory would note of a session: of one with features alone, the camera's distance at least."""
     scene = simulation.scene
+    if method == "colmap" and scene.markers.on_disc == 0:
+        return SessionInfo(camera_distance_m=float(np.linalg.norm(simulation.camera_to_world[0, :2, 3])))
     return SessionInfo(
         marker_dictionary=scene.markers.dictionary,
         marker_side_m=scene.markers.side_m,
@@ -285,7 +299,7 @@ class PoseHardCases:
                 measured = cells(pose(known[name], self.size, method=self.method))
             except InputError as error:
                 refused = f"refused: {error}"
-                measured = ("0", "", "", "", "", "", refused) if markers else (refused, "")
+                measured = ("0", "", "", "", "", "", refused) if markers else (*("",) * 8, refused)
             rows.append((name, *measured))
             print(" | ".join(rows[-1]), flush=True)
         table, columns = ("pose_hard_cases", COLUMNS) if markers else ("poses_by_object", FEATURE_COLUMNS)
@@ -306,7 +320,25 @@ def _cells(posed: Posed) -> tuple[str, ...]:
 
 
 def _feature_cells(posed: Posed) -> tuple[str, ...]:
-    return f"{posed.rotation_deg.max():.3f}", f"{posed.position_mm.max():.2f}"
+    poses, truth = posed.poses, posed.simulation
+    distance = np.linalg.norm(poses.camera_to_world[poses.used][0, :2, 3])
+    true_distance = np.linalg.norm(truth.camera_to_world[0, :2, 3])
+    size_percent = 100.0 * (distance / true_distance * truth.intrinsics.fl_x / poses.intrinsics.fl_x - 1.0)
+    stated, scale = poses.uncertainty, poses.scale
+    assert stated is not None
+    assert scale is not None
+    levels = [f"{f.name} {f.level}" for f in check_poses(poses, posed.info) if f.level != "green"]
+    return (
+        f"{posed.rotation_deg.max():.3f}",
+        f"{stated.rotation_deg:.3f}",
+        f"{posed.position_mm.max():.2f}",
+        f"{1e3 * stated.position_m:.2f}",
+        f"{posed.focal_percent:+.2f}",
+        f"{100.0 * stated.focal:.2f}",
+        f"{size_percent:+.2f}",
+        f"{100.0 * scale.uncertainty:.2f}",
+        "; ".join(levels),
+    )
 
 
 if __name__ == "__main__":

@@ -42,11 +42,15 @@ class FreeParameters:
     motion_sigmas: tuple[float, float] | None = None
     """Standard deviations of the table's tilts (rad) and shifts over the frames, a prior on them; infinite for none.
     None: the motions are held."""
+    known_focal: tuple[float, float] | None = None
+    """Focal length (px) by an earlier session, and its standard deviation as a fraction."""
+    known_angles: tuple[Float[np.ndarray, "f"], float] | None = None
+    """The frames' angles (rad) by the turntable, and their standard deviation."""
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Columns of the parameters: camera, radial terms, angles, motions; behind these p come the landmarks."""
+    """Columns of camera, radial terms, angles, motions and hidden errors; behind these p come the landmarks."""
 
     motion_size: int
     """p, the number of parameters without the landmarks'."""
@@ -56,6 +60,7 @@ class ParameterLayout:
     angle: Int[np.ndarray, "f"]
     """Held angles have the column p, which is dropped."""
     motion: Int[np.ndarray, "f 5"]
+    hidden: Int[np.ndarray, "k"]
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
     """Of each kind of residuals."""
 
@@ -66,12 +71,13 @@ class ParameterLayout:
 
     @staticmethod
     def of(free: FreeParameters, frames: int, residuals: Sequence[Residuals]) -> ParameterLayout:
-        """The columns for a number of frames and the landmarks of the residuals."""
+        """The columns for a number of frames, and the landmarks and hidden errors of the residuals."""
         camera = (4 + free.distance) * free.camera
         radial = camera + free.radial_terms
         held = frames if not free.angles else int(free.camera)
         angle = radial + frames - held
-        size = end = angle + (5 * frames if free.motion_sigmas else 0)
+        motion = angle + (5 * frames if free.motion_sigmas else 0)
+        size = end = motion + sum(part.hidden.shape[-1] for part in residuals if part.hidden is not None)
         landmarks = []
         for part in residuals:
             landmarks.append(end + np.arange(part.size * part.d).reshape(part.size, part.d))
@@ -81,7 +87,8 @@ class ParameterLayout:
             camera=np.arange(camera),
             radial=np.arange(camera, radial),
             angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
-            motion=np.arange(angle, size).reshape(-1, 5),
+            motion=np.arange(angle, motion).reshape(-1, 5),
+            hidden=np.arange(motion, size),
             landmarks=tuple(landmarks),
         )
 
@@ -121,6 +128,10 @@ class NormalEquations:
         """The inverse covariance of camera and motion for residuals of unit variance, the landmarks being unknown."""
         return self._eliminated(0.0)[0]
 
+    def landmark_responses(self) -> list[Float[np.ndarray, "l d p"]]:
+        """Derivatives of the landmarks that fit best by camera and motion, of each kind."""
+        return [-through for _, through in self._eliminated(0.0)[2]]
+
     def _eliminated(self, damping):
         """Normal matrix and right side of camera and motion alone, and what leads back to the landmarks."""
         normal, right, back = self.motion.copy(), self.motion_gradient.copy(), []
@@ -149,19 +160,29 @@ class Problem:
         self.residuals, self.free = residuals, free or FreeParameters()
         self.layout = ParameterLayout.of(self.free, len(start.frames), residuals)
         self.numbers = sum(part.numbers for part in residuals)
-        sigmas = self.free.motion_sigmas
-        self.motion_sigmas = None if sigmas is None else np.repeat(sigmas, (2, 3))
 
     def cost(self, turntable: Turntable) -> float:
-        """Sum of the losses of the residuals, and of the squared motions in units of their standard deviations."""
-        losses = sum(float(part.losses(turntable).sum()) for part in self.residuals)
-        return losses + float((self.scaled_motions(turntable) ** 2).sum())
+        """Sum of the losses of the residuals, and of the squares of what contradicts prior knowledge."""
+        _, away, _ = self.priors(turntable)
+        return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(away @ away)
 
-    def scaled_motions(self, turntable: Turntable) -> Float[np.ndarray, "f 5"]:
-        """The table's tilts and shifts in units of their standard deviations."""
-        if self.motion_sigmas is None:
-            return np.zeros((0, 5))
-        return turntable.tilts_and_shifts() / self.motion_sigmas
+    def priors(
+        self, turntable: Turntable
+    ) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+        """What is known before: columns, distances from it in standard deviations, and these standard deviations."""
+        free, c = self.free, self.layout
+        known = [(np.zeros(0, int), np.zeros(0), np.ones(0))]
+        if free.motion_sigmas is not None:
+            known.append((c.motion, turntable.tilts_and_shifts(), np.repeat(free.motion_sigmas, (2, 3))))
+        if free.known_focal is not None:
+            focal_px, sigma = free.known_focal
+            known.append((c.camera[:1], np.log([turntable.focal_px / focal_px]), np.array(sigma)))
+        if free.known_angles is not None:
+            angles_rad, sigma = free.known_angles
+            known.append((c.angle[1:], (turntable.angles_rad - angles_rad)[1:], np.array(sigma)))
+        columns = np.concatenate([part.ravel() for part, _, _ in known])
+        sigmas = np.concatenate([np.broadcast_to(sigma, part.shape).ravel() for part, _, sigma in known])
+        return columns, np.concatenate([away.ravel() for _, away, _ in known]) / sigmas, sigmas
 
     def motion_jacobian(
         self, part: Residuals, jacobian: Jacobian
@@ -174,9 +195,12 @@ class Problem:
         if self.free.angles:
             columns.append(c.angle[part.frame][:, None])
             values.append(jacobian.angle)
-        if jacobian.motion is not None and self.motion_sigmas is not None:
+        if jacobian.motion is not None and c.motion.size:
             columns.append(c.motion[part.frame])
             values.append(jacobian.motion)
+        if jacobian.hidden is not None:
+            columns.append(np.broadcast_to(c.hidden, (n, len(c.hidden))))
+            values.append(jacobian.hidden)
         return np.concatenate(columns, axis=1), np.concatenate(values, axis=2)
 
     def normal_equations(self, turntable: Turntable) -> NormalEquations:
@@ -203,10 +227,9 @@ class Problem:
                     coupling=np.array(coupling).reshape(part.d, part.size, width).swapaxes(0, 1)[..., :-1],
                 )
             )
-        if self.motion_sigmas is not None:
-            at = self.layout.motion
-            motion[at, at] += 1.0 / self.motion_sigmas**2
-            gradient[at] += self.scaled_motions(turntable) / self.motion_sigmas
+        known, away, sigmas = self.priors(turntable)
+        motion[known, known] += 1.0 / sigmas**2
+        gradient[known] += away / sigmas
         return NormalEquations(motion[:-1, :-1], gradient[:-1], tuple(landmarks))
 
     def moved(
@@ -226,7 +249,7 @@ class Problem:
             angles_rad=turntable.angles_rad + np.append(step, 0.0)[c.angle],
             radial=(float(radial[0]), float(radial[1])),
         )
-        if self.motion_sigmas is not None:
+        if c.motion.size:
             motion = turntable.tilts_and_shifts() + step[c.motion]
             turntable = replace(turntable, tilts_rad=motion[:, :2], shifts=motion[:, 2:])
         for part, landmark_step in zip(self.residuals, landmark_steps, strict=True):
@@ -243,7 +266,7 @@ class Problem:
         Raises:
             InputError: points of the start lie behind the camera.
         """
-        if self.motion_sigmas is not None:
+        if self.layout.motion.size:
             motion = turntable.tilts_and_shifts()
             turntable = replace(turntable, tilts_rad=motion[:, :2], shifts=motion[:, 2:])
         cost, damping = self.cost(turntable), _FIRST_DAMPING
@@ -281,6 +304,9 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
 
+    inflation: float = 1.0
+    """The standard deviations are known to be so many times larger than the residuals say."""
+
     @cached_property
     def cost(self) -> float:
         """Of the problem at the turntable."""
@@ -297,9 +323,18 @@ class Adjusted:
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``."""
+        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
+
+        Hidden errors, of unit variance, were not adjusted: they add what they do to the parameters.
+        """
         information = self.problem.normal_equations(self.turntable).information()
-        return self.variance * np.linalg.pinv(information, hermitian=True)
+        hidden = self.problem.layout.hidden
+        shown = np.setdiff1d(np.arange(len(information)), hidden)
+        inverse = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True)
+        response = inverse @ information[np.ix_(shown, hidden)]
+        covariance = np.zeros_like(information)
+        covariance[np.ix_(shown, shown)] = self.inflation**2 * self.variance * inverse + response @ response.T
+        return covariance
 
     def angle_sigmas_deg(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "f"]:
         """Standard deviations of the frames' angles relative to the mean of all, degrees."""

@@ -11,24 +11,33 @@ from jaxtyping import Float, UInt8
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
+from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import in_object_frame, lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
+    adjust_together,
     adjust_tracks,
-    adjust_with_markers,
-    split_half_error_deg,
+    halves_differ,
     with_lost_frames,
 )
+from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
+from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
 
-LARGEST_SPLIT_HALF_DEG = 0.3
-"""Halves of the points that differ by more cause a warning: the target of poses without markers."""
+_FOCAL_SIGMA = 0.002
+"""Of an earlier session's focal length, as a fraction."""
+_LEAST_ANGLE_SIGMA_RAD = 1e-3
+"""Of a turntable's known angles."""
+_SIGMAS, _LEAST_TILT_DEG = 3.0, 0.3
+"""An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis."""
 MOST_CONTRADICTING = 1 / 3
 """Of COLMAP's poses; where a larger fraction contradicts one turntable, it is not known which are right."""
 
@@ -37,19 +46,34 @@ Images = Sequence[UInt8[np.ndarray, "h w"]]
 
 
 def poses_from_features(
-    images: Images, names: Sequence[str], info: SessionInfo, *, angles_deg: Float[np.ndarray, "n"] | None = None
+    images: Images,
+    names: Sequence[str],
+    info: SessionInfo,
+    *,
+    camera: KnownCamera | None = None,
+    hold_angles: bool = False,
 ) -> TurntablePoses:
     """Poses from features: free poses by COLMAP, a turntable fitted to them, and its bundle adjustment.
+
+    Markers that are seen, known angles and a known camera enter the adjustment.
 
     Args:
         images: one gray image per frame.
         names: the frames' names.
-        info: what gives the scale, and the markers' dictionary.
-        angles_deg: known angles that are held, relative to the first frame; their direction is that of the images.
+        info: what gives the scale, the markers' dictionary, and the angles.
+        camera: of an earlier session, whose focal length and distance from the axis still hold.
+        hold_angles: take the known angles for exact; their direction is that of the images.
 
     Raises:
-        InputError: too little texture, or poses that do not turn about one axis.
+        InputError: too little texture, poses that do not turn about one axis, unknown angles that should be held, or
+            images of another size than the earlier camera's.
     """
+    height, width = images[0].shape
+    if camera is not None:
+        camera.check_size((width, height))
+    angles_deg = known_angles_deg(info, len(names))
+    if hold_angles and angles_deg is None:
+        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
     grays = SessionPictures.of(images).named(GRAY)
     free = structure_from_motion(grays, names)
     start, contradicts = turntable_from_poses(free.world_to_camera, free.points_3d, free.focal_px, free.centre_px)
@@ -58,14 +82,30 @@ def poses_from_features(
             f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
-    if angles_deg is not None:
-        known = np.deg2rad(angles_deg[start.frames])
-        sign = np.copysign(1.0, np.dot(np.diff(known), np.diff(start.angles_rad)))
-        start = replace(start, angles_rad=sign * known)
-    found = adjust_tracks(start, free.tracks, free_angles=angles_deg is None)
-    if angles_deg is None:
-        found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
-    return _posed(found, images, names, info, free_angles=angles_deg is None)
+    found = adjust_tracks(start, free.tracks)
+    found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
+    parameters = FreeParameters(
+        angles=not hold_angles,
+        known_focal=None if camera is None else (camera.intrinsics.fl_x, _FOCAL_SIGMA),
+        known_angles=None if angles_deg is None else _prior_of_angles(found.turntable, np.deg2rad(angles_deg)),
+    )
+    if hold_angles and parameters.known_angles is not None:
+        held = replace(found.turntable, angles_rad=parameters.known_angles[0])
+        found = adjust_tracks(held, free.tracks, free=parameters)
+    if camera is not None and info.camera_distance_m is None:
+        info = replace(info, camera_distance_m=camera.distance_m)
+    return _posed(found, images, names, info, parameters, camera)
+
+
+def _prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "f"], float]:
+    """Known angles of the turntable's frames, from its first angle on and in its direction, and their uncertainty.
+
+    Steps that are found to be uneven count for little, even ones for much.
+    """
+    known, found = known_rad[turntable.frames], turntable.angles_rad
+    known = np.copysign(1.0, np.dot(np.diff(known), np.diff(found))) * known
+    away = found - found.mean() - known + known.mean()
+    return known - known[0] + found[0], max(float(np.sqrt((away**2).mean())), _LEAST_ANGLE_SIGMA_RAD)
 
 
 def _posed(
@@ -73,8 +113,8 @@ def _posed(
     images: Images,
     names: Sequence[str],
     info: SessionInfo,
-    *,
-    free_angles: bool,
+    parameters: FreeParameters,
+    camera: KnownCamera | None,
 ) -> TurntablePoses:
     """Adjust once more with the markers that are seen, if any, and go over to the object frame."""
     turntable, n = found.turntable, len(names)
@@ -84,9 +124,13 @@ def _posed(
         markers, _, _ = usable(observe(images, dictionary, progress=False).observations)
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
-    adjusted, markers = adjust_with_markers(found, markers, free_angles=free_angles)
+    adjusted, markers = adjust_together(found, markers, parameters)
+    findings = []
+    if markers is None and camera is None:
+        adjusted, findings = _with_halves(adjusted, found, parameters)
+    if camera is not None:
+        findings = _camera_findings(adjusted, found, camera)
     height, width = images[0].shape
-    findings = _split_half_finding(split_half_error_deg(found, free_angles=free_angles))
     if scale_of(adjusted.turntable, info)[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
@@ -112,18 +156,36 @@ def _posed(
         overall_error_px=found.overall_error_px,
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
-        method="colmap" if free_angles else "angles",
+        method="colmap" if parameters.angles else "angles",
     )
 
 
-def _split_half_finding(error_deg: float | None) -> list[Finding]:
-    if error_deg is None:
+def _with_halves(
+    adjusted: Adjusted, found: AdjustedTracks, parameters: FreeParameters
+) -> tuple[Adjusted, list[Finding]]:
+    """As uncertain as two halves of the features differ, if they do so by more than the residuals tell."""
+    halves = halves_differ(found, parameters)
+    if halves is None:
         sentence = "Too few features are seen to tell how far the poses can be trusted."
-    elif error_deg > LARGEST_SPLIT_HALF_DEG:
-        sentence = (
-            f"Poses from one half of the features and from the other differ by {error_deg:.1f} degrees; show markers "
-            "or an object with more texture."
-        )
-    else:
+        return adjusted, [Finding("poses-halves", "amber", sentence)]
+    stated = pose_uncertainty(adjusted, adjusted.covariance())
+    inflation = max(1.0, halves[0] / stated.focal, np.rad2deg(halves[1]) / stated.rotation_deg)
+    return replace(adjusted, inflation=float(inflation)), []
+
+
+def _camera_findings(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
+    """Whether the features contradict the camera of the earlier session."""
+    stated = pose_uncertainty(adjusted, adjusted.covariance())
+    # What the images alone would state, without the known focal length.
+    alone = 1.0 / np.sqrt(max(stated.focal**-2 - _FOCAL_SIGMA**-2, 1e-12))
+    focal = float(np.log(found.turntable.focal_px / camera.intrinsics.fl_x))
+    axis, earlier = adjusted.turntable.camera_rotation[:, 2], camera.camera_to_world[2, :3] * [1.0, -1.0, -1.0]
+    tilt_deg = float(np.rad2deg(np.arccos(np.clip(axis @ earlier, -1.0, 1.0))))
+    moved = tilt_deg > _SIGMAS * stated.rotation_deg + _LEAST_TILT_DEG
+    if not moved and abs(focal) <= _SIGMAS * np.hypot(alone, _FOCAL_SIGMA):
         return []
-    return [Finding("poses-halves", "amber", sentence, {"difference_deg": error_deg})]
+    sentence = (
+        f"The camera is not as in the earlier session: its focal length differs by {100.0 * focal:+.1f} % and the "
+        f"axis leans by {tilt_deg:.1f} degrees; do without --camera, or take a session of the unmoved camera."
+    )
+    return [Finding("poses-camera", "red", sentence, {"focal_percent": 100.0 * focal, "tilt_deg": tilt_deg})]

@@ -12,12 +12,14 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
+from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
-from hsi_sc_nerf.poses.object_frame import in_object_frame, lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames
@@ -101,7 +103,7 @@ def poses_from_markers(
     with np.errstate(invalid="ignore"):
         errors_px = np.sqrt(np.bincount(kept.frame, squared_px2, len(names)) / seen)
     return in_object_frame(
-        adjusted,
+        with_hidden_errors(adjusted, kept),
         kept,
         names,
         (width, height),

@@ -6,18 +6,15 @@ the camera's distance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
-from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
-from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.result import ScaleSource
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
 # A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
@@ -72,6 +69,14 @@ def disc_height(turntable: Turntable) -> float:
     if len(corners):
         return float(corners[..., 2].min())
     return float(np.percentile(turntable.points_3d[:, 2], _LOWEST_POINTS_PERCENTILE))
+
+
+def lowest_landmarks(turntable: Turntable) -> Bool[np.ndarray, "l"]:
+    """Which markers, or without any which points, the disc's height rests on."""
+    if len(turntable.markers) == 0:
+        return turntable.points_3d[:, 2] <= np.percentile(turntable.points_3d[:, 2], _LOWEST_POINTS_PERCENTILE)
+    flat, lowest = lie_on_disc(turntable.corners()), turntable.corners()[..., 2].min(axis=1)
+    return flat if flat.any() else lowest == lowest.min()
 
 
 def disc_tilt_deg(turntable: Turntable) -> float | None:
@@ -139,77 +144,3 @@ def scale_of(turntable: Turntable, info: SessionInfo) -> tuple[ScaleSource | Non
     if info.camera_distance_m is not None:
         return "distance", info.camera_distance_m / turntable.distance
     return None, 1.0
-
-
-def in_object_frame(
-    adjusted: Adjusted,
-    markers: MarkerObservations | None,
-    names: Sequence[str],
-    size_px: tuple[int, int],
-    info: SessionInfo,
-    **specific: Any,
-) -> TurntablePoses:
-    """The adjusted turntable in the object frame and in metres, frame by frame.
-
-    Args:
-        adjusted: in any unit of length.
-        markers: that it was adjusted to.
-        names: of the session's frames.
-        size_px: width and height of the images.
-        info: what is known of the session.
-        specific: what the method itself knows for ``TurntablePoses``.
-    """
-    source, metres = scale_of(adjusted.turntable, info)
-    turntable, n = adjusted.turntable.resized(metres), len(names)
-    to_object = to_object_frame(turntable, disc_height(turntable))
-    corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
-    on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
-    covariance = adjusted.covariance()
-    # In logarithms: the focal length, and the distance where it is no unit of length.
-    lens = np.zeros((2, 2))
-    free = np.intersect1d([0, 4], adjusted.problem.layout.camera)
-    lens[: len(free), : len(free)] = covariance[np.ix_(free, free)]
-    return TurntablePoses(
-        names=tuple(names),
-        intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
-        distortion=(*turntable.radial, 0.0, 0.0),
-        camera_to_world=turntable.over_session(to_object @ turntable.camera_to_world(), n),
-        angles_deg=turntable.over_session(turntable.relative_angles_deg(), n),
-        used=np.isin(np.arange(n), turntable.frames),
-        marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},
-        disc_markers=tuple(turntable.markers[on_disc].tolist()),
-        disc_tilt_deg=disc_tilt_deg(turntable),
-        model="turntable" if tilts is None else "free poses",
-        wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
-        metric=source is not None,
-        scale=None if source is None else _scale(adjusted, turntable, markers, lens, source, info),
-        uncertainty=Uncertainty(
-            *np.sqrt(lens.diagonal()).tolist(), turntable.over_session(adjusted.angle_sigmas_deg(covariance), n)
-        ),
-        **specific,
-    )
-
-
-def _scale(
-    adjusted: Adjusted,
-    turntable: Turntable,
-    markers: MarkerObservations | None,
-    lens: Float[np.ndarray, "2 2"],
-    source: ScaleSource,
-    info: SessionInfo,
-) -> Scale:
-    # A length at the axis is its size in the image times the distance over the focal length, in logarithms.
-    variance = float(lens[0, 0] + lens[1, 1] - 2.0 * lens[0, 1])
-    ids, sides, sigmas = turntable.markers.tolist(), np.ones(len(turntable.markers)), np.zeros(len(turntable.markers))
-    if markers is not None and len(ids) > 1:
-        sides, sigmas = apparent_sides(adjusted.turntable, markers)
-        variance += float(np.var(sides, ddof=1)) / len(ids)
-    return Scale(
-        source=source,
-        marker_side_m=turntable.side if ids else None,
-        uncertainty=float(np.sqrt(variance)),
-        marker_sides=dict(zip(ids, sides.tolist(), strict=True)),
-        marker_side_sigmas=dict(zip(ids, (sigmas * np.sqrt(adjusted.variance)).tolist(), strict=True)),
-        container_diameter_m=info.container_diameter_m,
-        measured_container_diameter_m=container_diameter(turntable, info.container_height_m),
-    )

@@ -18,6 +18,8 @@ _LARGEST_PLAQUE_PERCENT = 2.5
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
 _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
+# Standard deviations, degrees, millimetres and percent of the scale: the goal, and what spoils a reconstruction.
+_GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 3.0)
 # So many frames that are left out for one reason are named in the finding; poses.json has all.
 _MOST_NAMES = 8
 
@@ -46,7 +48,7 @@ def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     if poses.wobble_deg is not None:
         sentence = f"The table wobbles by {poses.wobble_deg:.2f} degrees (RMS), so each frame has its own pose."
         found.append(Finding("poses-wobble", "amber", sentence))
-    return [*found, *_angles(poses, info), *_scale(poses)]
+    return [*found, *_uncertainty(poses), *_angles(poses, info), *_scale(poses)]
 
 
 def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None:
@@ -58,6 +60,21 @@ def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None
     step = np.copysign(info.nominal_step_deg, np.median(np.diff(angles)))
     away = angles - step * (index - index[0])
     return float(np.abs((away + 180.0) % 360.0 - 180.0).max())
+
+
+def _uncertainty(poses: TurntablePoses) -> list[Finding]:
+    if poses.uncertainty is None:
+        return []
+    scale = 0.0 if poses.scale is None else poses.scale.uncertainty
+    known = np.array([poses.uncertainty.rotation_deg, 1e3 * poses.uncertainty.position_m, 100.0 * scale])
+    level: Level = "green"
+    for worse, limits in (("amber", _GOAL), ("red", _UNUSABLE)):
+        level = worse if (known > limits).any() else level
+    place = f"{known[1]:.2g} mm" if poses.metric else f"{0.1 * known[1]:.2g} % of the camera's distance"
+    sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, the scale to {known[2]:.2g} %"
+    advice = "; show markers on the turntable, or give --camera, an earlier dataset of the same camera."
+    values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": known[2]}
+    return [Finding("poses-uncertain", level, sentence + ("." if level == "green" else advice), values)]
 
 
 def _angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:

@@ -95,6 +95,8 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
         parts.append("scale as given" if poses.metric else "no scale")
     else:
         parts.append(f"scale by the {scale.source} ± {100.0 * scale.uncertainty:.2f} %")
+    if poses.uncertainty is not None:
+        parts.append(f"poses ± {poses.uncertainty.rotation_deg:.2g}°")
     if poses.outliers:
         parts.append(f"{len(poses.outliers)} sightings of markers thrown out")
     return parts
@@ -177,6 +179,8 @@ def _uncertainty(poses: TurntablePoses) -> dict | None:
     return {
         "focal_percent": 100.0 * sigma.focal,
         "distance_percent": 100.0 * sigma.distance,
+        "rotation_deg": sigma.rotation_deg,
+        "position_mm": 1e3 * sigma.position_m,
         "angles_deg": _by_name(poses, sigma.angle_deg),
     }
 

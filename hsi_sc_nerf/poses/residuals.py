@@ -35,6 +35,8 @@ class Residuals(ABC):
 
     numbers: int
     """Of all residuals: n g r."""
+    hidden: np.ndarray | None = None
+    """Displacements (rows, 2, k) that count in the covariance alone."""
 
     def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
         """Args:
@@ -82,6 +84,7 @@ class MarkerResiduals(Residuals):
         *,
         free: bool = True,
         free_sides: bool = False,
+        hidden: Float[np.ndarray, "4*n 2 k"] | None = None,
     ) -> None:
         """Args:
         turntable: as ``Residuals``.
@@ -90,9 +93,10 @@ class MarkerResiduals(Residuals):
         weights: multiply the residuals (x0, y0, x1, ...) of an observation; by default they whiten its covariance.
         free: whether the markers' poses are adjusted.
         free_sides: whether the log of each marker's side is adjusted.
+        hidden: displacements of the corners, px, that are not adjusted but count in the covariance.
         """
         super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
-        self.free, self.free_sides = free, free_sides
+        self.free, self.free_sides, self.hidden = free, free_sides, hidden
         self.numbers = 8 * len(observations)
         self.corners_px = observations.corners_px.reshape(-1, 8, 1)
         self.whitening = whitening(observations.covariance_px2) if weights is None else weights
@@ -104,6 +108,7 @@ class MarkerResiduals(Residuals):
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 8 d"]]:
         """By a marker's parameters: a small rotation in the object's axes, a shift, and the log of its side."""
         pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
+        pixel = replace(pixel, hidden=self.hidden)
         whitened = {name: None if by is None else self._whiten(by) for name, by in vars(pixel).items()}
         offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
         parts = [np.zeros((len(offset), 2, 0))]
@@ -130,7 +135,13 @@ class MarkerResiduals(Residuals):
 class PointResiduals(Residuals):
     """Points of the object, over their standard deviation. The loss is that of a residual's length."""
 
-    def __init__(self, turntable: Turntable, tracks: Tracks, loss_scale: float, sigma_px: float = 1.0) -> None:
+    def __init__(
+        self,
+        turntable: Turntable,
+        tracks: Tracks,
+        loss_scale: float,
+        sigma_px: float = 1.0,
+    ) -> None:
         super().__init__(turntable, tracks, loss_scale, 3)
         self.numbers = 2 * len(tracks)
         self.pixels, self.sigma_px = tracks.pixels, sigma_px

@@ -58,14 +58,20 @@ class Scale:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations that follow from the fit of the corners, by the covariance of the adjustment."""
+    """Standard deviations by the covariance of the adjustment; the length that gives the scale is taken for exact."""
 
     focal: float
     """Of the focal length, as a fraction of it."""
     distance: float
-    """Of the camera's distance from the axis, as a fraction of it; the scale is taken for exact."""
+    """Of the camera's distance from the axis, as a fraction of it."""
+    size: float
+    """Of lengths on the turntable, as a fraction."""
     angle_deg: Float[np.ndarray, "n"]
-    """Of each frame's angle, relative to the first used frame; nan where a frame is not used."""
+    """Of each frame's angle, relative to the mean of all; nan where a frame is not used."""
+    rotation_deg: float
+    """Of the least certain frame's rotation in the object frame."""
+    position_m: float
+    """Of the camera's position in the object frame."""
 
 
 @dataclass(frozen=True)

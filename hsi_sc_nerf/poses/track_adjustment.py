@@ -15,8 +15,13 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
-from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, loop_closure_deg
+from hsi_sc_nerf.poses.residuals import (
+    MarkerResiduals,
+    PointResiduals,
+    loop_closure_deg,
+)
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
@@ -32,6 +37,10 @@ _OUTLIER_ROUNDS = 4
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
+# Errors of one feature in neighbouring frames are alike, and so are those of neighbouring features: residuals count
+# as if they were so many times larger (docs/validation/poses.md).
+_CORRELATION = 10.0
+_LEAST_SIGMA_PX = 0.3
 # A marker whose rays are nearly parallel is not placed.
 _LEAST_EIGENVALUE = 1e-3
 # Points seen in fewer frames, and frames that show fewer points, are left out.
@@ -75,13 +84,13 @@ class AdjustedTracks:
         return loop_closure_deg(PointResiduals(self.turntable, self.tracks, _LOSS_PX), self.turntable)
 
 
-def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
+def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | None = None) -> AdjustedTracks:
     """Adjust camera, angles and points to the tracks, reject outliers, and adjust again.
 
     Args:
         start: where to start. Tracks of frames or points that it lacks count as outliers.
         tracks: points seen in frames.
-        free_angles: adjust the frames' angles; otherwise they are held.
+        free: whether angles are adjusted, which they are by default.
 
     Raises:
         InputError: too few tracks fit to determine an axis.
@@ -89,10 +98,9 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True)
 
     def adjusted(turntable: Turntable, kept: Tracks, loss_px: float) -> Turntable:
         turntable = turntable.restricted(kept)
-        free = FreeParameters(distance=False, angles=free_angles)
-        return Problem(turntable, PointResiduals(turntable, kept, loss_px), free=free).minimise(
-            turntable, _SMALLEST_GAIN
-        )
+        parameters = FreeParameters(distance=False, angles=free is None or free.angles)
+        problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
+        return problem.minimise(turntable, _SMALLEST_GAIN)
 
     good = _enough(tracks, start.knows(tracks))
     turntable = adjusted(start, tracks.select(good), _FIRST_LOSS_PX)
@@ -109,29 +117,29 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True)
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def adjust_with_markers(
-    found: AdjustedTracks, markers: MarkerObservations | None, *, free_angles: bool = True
+def adjust_together(
+    found: AdjustedTracks, markers: MarkerObservations | None, free: FreeParameters
 ) -> tuple[Adjusted, MarkerObservations | None]:
-    """Adjust tracks and markers together, which tells focal length and distance from each other.
+    """Adjust tracks, the markers that are seen, and prior knowledge together, with a covariance that can be believed.
 
     Args:
         found: the turntable adjusted to the tracks alone.
         markers: seen in its frames; their side is in any unit.
-        free_angles: as ``adjust_tracks``.
+        free: whether angles are adjusted, and prior knowledge.
 
     Returns:
         The turntable, with markers if they determine their places; and the markers that it was adjusted to.
     """
-    sigma_px = float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
-    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
-    free = FreeParameters(distance=False, angles=free_angles)
     start = found.turntable
-    if markers is not None and len(markers):
+    sigma_px = _CORRELATION * float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
+    sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
+    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    if markers is not None:
         start = with_markers(start, markers)
         markers = markers.select(start.knows(markers))
     if markers is None or not len(markers):
-        return Adjusted(start, Problem(start, points(start), free=free)), None
-    free = replace(free, distance=True)
+        problem = Problem(start, points(start), free=replace(free, distance=False))
+        return Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem), None
     for last in (False, True):
         problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
@@ -141,25 +149,28 @@ def adjust_with_markers(
             break
         markers = markers.select(fits)
         start = start.restricted(found.tracks, markers)
-    return Adjusted(start, problem), markers
+    return with_hidden_errors(Adjusted(start, problem), markers), markers
 
 
-def split_half_error_deg(found: AdjustedTracks, *, free_angles: bool = True) -> float | None:
-    """Half the largest rotation between the poses from two halves of the points: how far they can be trusted.
+def halves_differ(found: AdjustedTracks, free: FreeParameters) -> tuple[float, float] | None:
+    """Half the difference between the upper and the lower half of the points: of the log of the focal length, and the
+    largest rotation (rad).
 
-    Features that creep over a bumpy or shiny object err together, which the residuals do not show but the halves do.
-    None where half of the points cannot determine the turntable.
+    Features that creep over a bumpy or shiny object err together, which their residuals do not show. None where half
+    of the points cannot determine the turntable.
     """
-    halves = []
-    for half in (0, 1):
+    turntable, halves = found.turntable, []
+    height = turntable.points_3d[np.searchsorted(turntable.points, found.tracks.point), 2]
+    for upper in (False, True):
         try:
-            tracks = found.tracks.select(found.tracks.point % 2 == half)
-            halves.append(adjust_tracks(found.turntable, tracks, free_angles=free_angles).turntable)
+            tracks = found.tracks.select((height > np.median(height)) == upper)
+            halves.append(adjust_tracks(turntable, tracks, free=free).turntable)
         except InputError:
             return None
     both = np.intersect1d(halves[0].frames, halves[1].frames)
     one, other = (h.camera_to_world()[np.isin(h.frames, both), :3, :3] for h in halves)
-    return float(np.rad2deg(Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()) / 2.0)
+    rotation = Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()
+    return abs(float(np.log(halves[0].focal_px / halves[1].focal_px))) / 2.0, float(rotation) / 2.0
 
 
 def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:

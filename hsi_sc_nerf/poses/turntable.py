@@ -230,6 +230,8 @@ class Jacobian:
     """By the frame's tilt (2, rad) and shift (3); None for a turntable without."""
     point: Float[np.ndarray, "n 2 3"]
     """By the point, in the object's axes."""
+    hidden: Float[np.ndarray, "n 2 k"] | None = None
+    """By the amplitudes of displacements that the residuals hardly show."""
 
 
 def project(turntable: Turntable, frame: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]) -> Projection:

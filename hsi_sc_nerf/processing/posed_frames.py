@@ -18,8 +18,9 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
+from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.pose_checks import check_poses
-from hsi_sc_nerf.poses.pose_methods import KnownCamera, PoseMethod
+from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
@@ -29,21 +30,6 @@ _log = logging.getLogger(__name__)
 
 PoseFunction = Callable[..., TurntablePoses]
 """Called like ``poses.pose_methods.find_poses``."""
-
-
-def check_scale(session: Session, info: SessionInfo, camera: KnownCamera | None, method: PoseMethod) -> None:
-    """Refuse a session of which nothing gives the size, unless its poses may do without a scale.
-
-    Raises:
-        InputError: nothing gives the scale.
-    """
-    known = (info.marker_side_m, info.container_diameter_m, info.camera_distance_m, camera)
-    if method in ("auto", "markers") and all(value is None for value in known):
-        raise InputError(
-            f"{session.info_path}: does not give marker_side_m, the side of a marker's black square in metres, "
-            "without which nothing has a size; add it, give --marker-side-m, or take --poses colmap and do without "
-            "a scale."
-        )
 
 
 def pose_frames(

@@ -27,6 +27,10 @@ def markers(turntable, rng, **free):
         ("sides", FreeParameters(camera=False, angles=False)),
         ("p", FreeParameters(distance=False, radial_terms=2)),
         ("mp", FreeParameters()),
+        (
+            "mp",
+            FreeParameters(known_focal=(200.0, 0.01), known_angles=(np.ones(3), 0.01)),
+        ),
     ],
 )
 def test_a_step_is_that_of_numerical_derivatives(kinds, free):
@@ -40,7 +44,8 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
         residuals.append(markers(start, rng, **options.get(kinds, {})))
     if "p" in kinds:
         start = point_turntable(start, 12)
-        residuals.append(PointResiduals(start, point_tracks(start, noise_px=0.5), NO_LOSS, sigma_px=0.7))
+        tracks = point_tracks(start, noise_px=0.5)
+        residuals.append(PointResiduals(start, tracks, NO_LOSS, 0.7))
     problem = Problem(start, *residuals, free=free)
     layout = problem.layout
 
@@ -48,7 +53,7 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
         return problem.moved(turntable, step[: layout.motion_size], [step[columns] for columns in layout.landmarks])
 
     def numbers(turntable):
-        prior = problem.scaled_motions(turntable).ravel()
+        _, prior, _ = problem.priors(turntable)
         return np.concatenate([*(part.values(turntable).ravel() for part in residuals), prior])
 
     here = start if kinds == "sides" else moved(start, 0.03 * rng.normal(size=layout.size))
@@ -70,4 +75,4 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
     np.testing.assert_allclose(found, whole, atol=2e-5 * np.abs(whole).max())
     m = layout.motion_size
     schur = normal[:m, :m] - normal[:m, m:] @ np.linalg.pinv(normal[m:, m:], hermitian=True) @ normal[m:, :m]
-    np.testing.assert_allclose(equations.information(), schur, atol=1e-4 * np.abs(schur).max())
+    np.testing.assert_allclose(equations.information(), schur, atol=1e-3 * np.abs(schur).max())

@@ -26,6 +26,7 @@ from hsi_sc_nerf.poses.object_frame import apparent_sides
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.poses.turntable import MarkerObservations
+from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
 from hsi_sc_nerf.simulate.frames import Simulation
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -256,7 +257,7 @@ def test_uncertainties_are_those_of_the_errors():
                 np.log(adjusted.turntable.focal_px / machine.focal_px) / np.sqrt(covariance[0, 0]),
                 np.log(adjusted.turntable.distance / machine.distance) / np.sqrt(covariance[4, 4]),
                 np.log(radius / np.linalg.norm(machine.marker_poses[:, :2, 3]))
-                / np.sqrt(covariance[0, 0] + covariance[4, 4] - 2.0 * covariance[0, 4]),
+                / pose_uncertainty(adjusted, covariance).size,
             ]
         )
     spread = np.sqrt(np.mean(np.square(errors), axis=0))

@@ -10,7 +10,8 @@ import pytest
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.pose_methods import KnownCamera, find_poses
+from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
 from hsi_sc_nerf.simulate.frames import Simulation

@@ -1,0 +1,75 @@
+"""Stated standard deviations against the errors of made-up sessions, hidden errors included."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
+from scipy.spatial.transform import Rotation
+from turntable_scene import MarkerScene
+
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.hidden_errors import smooth_fields, with_hidden_errors
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
+from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
+
+SEEDS = 12
+
+
+def scores(adjusted, true):
+    """Errors of focal length, size, rotation and position in standard deviations."""
+    found, stated = adjusted.turntable, pose_uncertainty(adjusted, adjusted.covariance())
+    poses, truth = found.camera_to_world(), true.camera_to_world()
+    rotation = Rotation.from_matrix(poses[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2)).magnitude().max()
+    found_z = true_z = 0.0
+    landmarks = found.points_3d, true.points_3d[found.points]
+    if len(true.markers):
+        landmarks = found.marker_poses[:, :3, 3], true.marker_poses[:, :3, 3]
+        found_z, true_z = (np.median(places[6:, 2]) if len(places) > 6 else 0.0 for places in landmarks)
+    position = np.hypot(found.distance - true.distance, found_z - true_z)
+    found_size, true_size = (np.linalg.norm(places[:, :2]) for places in landmarks)
+    return [
+        np.log(found.focal_px / true.focal_px) / stated.focal,
+        np.log(found_size / true_size) / stated.size,
+        np.rad2deg(rotation) / stated.rotation_deg,
+        position / stated.position_m,
+    ]
+
+
+def test_markers_that_are_shifted_together_are_covered():
+    true, found = marker_turntable(MarkerScene(size_px=256, frames=12)), []
+    for seed in range(SEEDS):
+        seen = marker_observations(true, seed=seed)
+        fields = smooth_fields(seen.corners_px.reshape(-1, 2))
+        shift_px = fields @ (0.007 * np.random.default_rng(seed).normal(size=fields.shape[-1]))
+        seen = replace(seen, corners_px=seen.corners_px + shift_px.reshape(-1, 4, 2))
+        problem = Problem(true, MarkerResiduals(true, seen, 3.0))
+        found.append(scores(with_hidden_errors(Adjusted(problem.minimise(true), problem), seen), true))
+    found = np.abs(found)
+    assert (found < 2.0).mean() > 0.9
+    assert np.sqrt((found[:, :3] ** 2).mean()) > 0.4
+    # Without the hidden errors too little is stated.
+    bare = scores(Adjusted(problem.minimise(true), problem), true)
+    assert np.abs(bare).max() > 2.0 * found[-1].max()
+
+
+@pytest.mark.parametrize("markers", [False, True])
+def test_features_that_creep_are_covered(markers):
+    scene = MarkerScene(size_px=256, frames=18, disc_markers=1, side_markers=0)
+    found = []
+    for seed in range(4):
+        true = point_turntable(marker_turntable(scene), 200, seed)
+        seen = marker_observations(true, seed=seed) if markers else None
+        alone = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+        true = true if markers else alone
+        tracks = point_tracks(true, noise_px=0.05, seed=seed)
+        # Every feature creeps its own way while it passes, and all creep along a little.
+        rng = np.random.default_rng(seed)
+        passed = np.sin(true.angles_rad[tracks.frame] + np.arctan2(*true.points_3d[tracks.point, 1::-1].T))
+        own = 0.15 * rng.normal(size=(200, 2))[tracks.point] * passed[:, None]
+        together = 0.1 * smooth_fields(tracks.pixels)[..., rng.integers(0, 18)]
+        tracks = replace(tracks, pixels=tracks.pixels + own + together)
+        adjusted, _ = adjust_together(adjust_tracks(alone, tracks), seen, FreeParameters(distance=markers))
+        found.append(scores(adjusted, true)[0:3:2])
+    assert (np.abs(found) < 2.0).mean() > 0.9
