@@ -103,7 +103,9 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("x")
-    for session, told in ((tmp_path / "session", "something other"), (out, "is the session itself")):
+    (tmp_path / "session").mkdir()
+    nowhere = tmp_path / "nowhere"
+    for session, told in ((tmp_path / "session", "something other"), (out, "session itself"), (nowhere, "no folder")):
         with pytest.raises(InputError, match=told):
             RunCommand(session, out, max_num_iterations=5).main()
     assert [path.name for path in out.iterdir()] == ["thesis.txt"]
