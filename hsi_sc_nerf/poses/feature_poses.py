@@ -12,11 +12,12 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
+from hsi_sc_nerf.poses.container_outline import container_radius
 from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import disc_height, lie_on_disc, scale_of
 from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
@@ -131,10 +132,11 @@ def _posed(
     if camera is not None:
         findings = _camera_findings(adjusted, found, camera)
     height, width = images[0].shape
-    if scale_of(adjusted.turntable, info)[0] is None:
+    outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
+    if scale_of(adjusted.turntable, info, None if outline is None else outline[0])[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
-            "give marker_side_m, or give camera_distance_m in session.json."
+            "give marker_side_m, or give camera_distance_m or the container's size in session.json."
         )
         findings.append(Finding("poses-no-scale", "amber", sentence))
     if not lie_on_disc(adjusted.turntable.corners()).any():
@@ -146,6 +148,7 @@ def _posed(
         names,
         (width, height),
         info,
+        outline,
         reprojection_error_px=turntable.over_session(found.frame_errors_px(), n),
         dropped={
             names[i]: "it shares too few features with other frames"
@@ -157,6 +160,16 @@ def _posed(
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
+    )
+
+
+def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> tuple[float, float] | None:
+    """The container's radius; its lid is where the features end."""
+    if info.container_diameter_m is None or info.container_height_m is None:
+        return None
+    grays = SessionPictures.of(images).named(GRAY)
+    return container_radius(
+        grays, turntable, disc_height(turntable), info.container_height_m / info.container_diameter_m
     )
 
 

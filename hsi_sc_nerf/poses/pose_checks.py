@@ -14,6 +14,8 @@ REPROJECTION_TARGET_PX = 1.0
 _SIGMAS = 3.0
 # A plaque that carries a marker stands off the container's wall: the container is found wider by up to this.
 _LARGEST_PLAQUE_PERCENT = 2.5
+# A distance measured by tape, from a lens whose centre is inside, is good to this.
+_DISTANCE_PERCENT = 5.0
 # A marker's side is odd if it differs by this and by so many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
@@ -48,7 +50,7 @@ def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     if poses.wobble_deg is not None:
         sentence = f"The table wobbles by {poses.wobble_deg:.2f} degrees (RMS), so each frame has its own pose."
         found.append(Finding("poses-wobble", "amber", sentence))
-    return [*found, *_uncertainty(poses), *_angles(poses, info), *_scale(poses)]
+    return [*found, *_uncertainty(poses), *_angles(poses, info), *_scale(poses), *_distance(poses, info)]
 
 
 def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None:
@@ -126,6 +128,23 @@ def _scale(poses: TurntablePoses) -> list[Finding]:
             )
             found.append(Finding("poses-markers", "amber", sentence, {"marker": marker, "relative_side": side}))
     return found
+
+
+def _distance(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
+    """Whether the camera stands as far from the axis as is given, where something else gives the scale."""
+    if info.camera_distance_m is None or poses.scale is None or poses.scale.source == "distance":
+        return []
+    found_m = float(np.linalg.norm(poses.camera_to_world[poses.used][0, :2, 3]))
+    sigma = 0.0 if poses.uncertainty is None else poses.uncertainty.distance
+    percent = 100.0 * (found_m / info.camera_distance_m - 1.0)
+    values = {"difference_percent": percent, "uncertainty_percent": 100.0 * sigma}
+    if abs(percent) <= max(100.0 * _SIGMAS * sigma, _DISTANCE_PERCENT):
+        return []
+    sentence = (
+        f"The camera is {1e3 * found_m:.0f} mm from the axis by the poses, but camera_distance_m is "
+        f"{info.camera_distance_m:g}; measure it, the markers and the container again."
+    )
+    return [Finding("poses-scale", "red", sentence, values)]
 
 
 def _left_out(poses: TurntablePoses) -> str:
