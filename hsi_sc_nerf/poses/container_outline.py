@@ -20,8 +20,11 @@ _MOST_POINTS_PERCENTILE = 90.0
 _REACH = 0.08
 # Edges are sought along this part of the container's height, from below; above, the object may overhang.
 _HEIGHTS = np.linspace(0.15, 0.7, 24)
-# An edge stands out by so many times the median slope; frames agree to this fraction.
-_LEAST_CONTRAST = 6.0
+_SMOOTHING = 3.0
+"""Standard deviation of the Gaussian over the radii."""
+# Both edges change the brightness by this from one radius to the next, gray levels, but for so many places in a
+# hundred; frames agree to this fraction of the radius.
+_LEAST_SLOPE, _WEAKEST_PERCENTILE = 0.5, 20.0
 _LARGEST_SPREAD = 0.02
 # Blur, wear and the lid's rim, as a fraction of the radius.
 _EDGE_SIGMA = 0.005
@@ -46,14 +49,14 @@ def container_radius(
     object_radius = np.percentile(np.linalg.norm(turntable.points_3d[:, :2], axis=1), _MOST_POINTS_PERCENTILE)
     radii = float(object_radius) * _RADII
     place = _edges_px(turntable, radii, top, height_over_diameter)
-    slopes = np.stack([_slopes(images[frame], place) for frame in turntable.frames])
-    typical = np.median(slopes, axis=0)
-    together = np.minimum(*np.abs(typical))
+    pictures = np.stack([images[frame] for frame in turntable.frames]).astype(np.float32)
+    together = _strengths(pictures.mean(axis=0), place).min(axis=0)
     best = int(np.argmax(together))
-    if together[best] < _LEAST_CONTRAST * np.median(together):
+    if together[best] < _LEAST_SLOPE:
         return None
+    strengths = np.stack([_strengths(picture, place) for picture in pictures])
     near = np.abs(np.log(radii / radii[best])) < _REACH
-    peaks = np.argmax((slopes * np.sign(typical[:, best])[:, None])[..., near], axis=-1)
+    peaks = np.argmax(strengths[..., near], axis=-1)
     found = radii[near][peaks].mean(axis=1)
     spread = float(np.median(np.abs(found / np.median(found) - 1.0)))
     if spread > _LARGEST_SPREAD:
@@ -74,16 +77,15 @@ def _edges_px(
     return turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px
 
 
-def _slopes(
-    image: UInt8[np.ndarray, "h w"], place: Float[np.ndarray, "2 heights radii 2"]
-) -> Float[np.ndarray, "2 radii"]:
-    """How the brightness changes with the radius at each edge: the median over its height."""
-    x, y = (place[..., k].astype(np.float32) - np.float32(0.5) for k in (0, 1))
-    shape = (-1, place.shape[2])
-    shown = cv2.remap(
-        image.astype(np.float32), x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
-    ).reshape(place.shape[:3])  # fmt: skip
-    with np.errstate(invalid="ignore"):
-        slopes = np.median(gaussian_filter1d(shown, 3.0, axis=-1, order=1), axis=1)
-    return np.nan_to_num(slopes)
+def _strengths(
+    image: Float[np.ndarray, "h w"], place: Float[np.ndarray, "2 heights r 2"]
+) -> Float[np.ndarray, "2 r"]:
+    """How much the brightness changes from one radius to the next, at least in most places along each edge.
+
+    An edge of the container goes all along its height, before the disc and before the wall; patterns of the wall do
+    not. 0 outside of the image.
+    """
+    x, y = (place[..., k].astype(np.float32).reshape(-1, place.shape[2]) - np.float32(0.5) for k in (0, 1))
+    shown = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    slopes = gaussian_filter1d(shown.reshape(place.shape[:3]), _SMOOTHING, axis=-1, order=1)
+    return np.percentile(np.abs(np.nan_to_num(slopes)), _WEAKEST_PERCENTILE, axis=1)

@@ -88,7 +88,7 @@ def poses_from_features(
     parameters = FreeParameters(
         angles=not hold_angles,
         known_focal=None if camera is None else (camera.intrinsics.fl_x, _FOCAL_SIGMA),
-        known_angles=None if angles_deg is None else _prior_of_angles(found.turntable, np.deg2rad(angles_deg)),
+        known_angles=None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg)),
     )
     if hold_angles and parameters.known_angles is not None:
         held = replace(found.turntable, angles_rad=parameters.known_angles[0])
@@ -98,7 +98,7 @@ def poses_from_features(
     return _posed(found, images, names, info, parameters, camera)
 
 
-def _prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "f"], float]:
+def prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "f"], float]:
     """Known angles of the turntable's frames, from its first angle on and in its direction, and their uncertainty.
 
     Steps that are found to be uneven count for little, even ones for much.
@@ -130,7 +130,7 @@ def _posed(
     if markers is None and camera is None:
         adjusted, findings = _with_halves(adjusted, found, parameters)
     if camera is not None:
-        findings = _camera_findings(adjusted, found, camera)
+        findings = check_camera(adjusted, found, camera)
     height, width = images[0].shape
     outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
     if scale_of(adjusted.turntable, info, None if outline is None else outline[0])[0] is None:
@@ -186,7 +186,7 @@ def _with_halves(
     return replace(adjusted, inflation=float(inflation)), []
 
 
-def _camera_findings(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
+def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
     """Whether the features contradict the camera of the earlier session."""
     stated = pose_uncertainty(adjusted, adjusted.covariance())
     # What the images alone would state, without the known focal length.
