@@ -2,7 +2,8 @@
 
     uv run python benchmarks/calibration_accuracy.py --pictures docs/images
 
-Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them.
+Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them. A
+second table has the error of the lamps' drift if the light of each pixel scatters from frame to frame.
 """
 
 from __future__ import annotations
@@ -12,17 +13,21 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tyro
+from jaxtyping import Float, UInt16
 from results_table import RESULTS, write_results
 from rich.progress import track
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.calibration.report import draw_calibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
-from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import Capture, open_session
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.scores.processing import CalibrationScore, score_calibration
+from hsi_sc_nerf.simulate.scores.processing import CalibrationScore, lamp_output, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -47,6 +52,24 @@ SESSIONS: dict[str, tuple[tuple[str, ...], CalibrationConfig]] = {
     "both, dead bands, saturated highlights": ((FALLOFF, DRIFT, *SENSOR), CORRECTED),
     "all these and noise": ((FALLOFF, DRIFT, *SENSOR, *NOISE), CORRECTED),
 }
+WARM_UP = "{lamp_drift: {percent: -5, temperature_change_k: -30}}"
+SCATTERS: dict[str, tuple[float, float]] = {
+    "none": (0.0, 0.0),
+    "2 %": (0.02, 0.0),
+    "5 %": (0.05, 0.0),
+    "6 %": (0.06, 0.0),
+    "10 %": (0.1, 0.0),
+    "5 %, and a tenfold value in 2 % of the pixels": (0.05, 0.02),
+}
+"""Scatter of a pixel's light in a frame, common to all bands (standard deviation), and fraction of fireflies."""
+SCATTER_COLUMNS = [
+    "scatter of a pixel",
+    "static pixels",
+    "drift, RMS %",
+    "worst band, RMS %",
+    "largest error, %",
+    "error / stated error",
+]
 COLUMNS = [
     "session",
     "reflectance, RMS",
@@ -76,6 +99,26 @@ class CalibrationAccuracy:
         """Measure, print the table, write it."""
         rows = [[name, *_cells(self._score(*case))] for name, case in track(SESSIONS.items(), "calibrating")]
         write_results("calibration_accuracy", COLUMNS, rows, folder=self.results)
+        self.measure_scatter()
+
+    def measure_scatter(self) -> None:
+        """Measure drift on one noisy session whose light scatters more and more, and write that table."""
+        scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=(WARM_UP, *NOISE))
+        folder = Path(tempfile.mkdtemp())
+        try:
+            session = open_session(simulate_session(scene, folder / "session", progress=False))
+            truth = load_truth(session.path)
+            light = np.stack([lamp_output(truth, capture.name) for capture in session.frames])
+            original = [capture.cube.read() for capture in session.frames]
+            rows = []
+            for name, strength in track(SCATTERS.items(), "scattering"):
+                for number, capture in enumerate(session.frames):
+                    _scatter(capture, original[number], *strength, seed=number)
+                drift = calibrate_session(session, PLAIN).drift
+                rows.append([name, *_drift_cells(drift, light / light[0])])
+        finally:
+            shutil.rmtree(folder)
+        write_results("drift_with_scatter", SCATTER_COLUMNS, rows, folder=self.results)
 
     def _score(self, effects: tuple[str, ...], config: CalibrationConfig) -> CalibrationScore:
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects)
@@ -99,6 +142,39 @@ def _cells(score: CalibrationScore) -> list[str]:
         f"{100.0 * score.drift_rms:.3f}",
         f"{100.0 * score.flagged_fraction:.2f}",
     ]
+
+
+def _scatter(
+    capture: Capture, counts: UInt16[np.ndarray, "lines samples bands"], scatter: float, fireflies: float, seed: int
+) -> None:
+    """Write a capture's cube again with the light of its pixels scattered."""
+    rng = np.random.default_rng(seed)
+    factor = np.exp(scatter * rng.standard_normal(counts.shape[:2]))
+    factor[rng.random(factor.shape) < fireflies] *= 10.0
+    dark = 0.0 if capture.dark is None else capture.dark.read().mean(axis=0)
+    scattered = np.rint((counts - dark) * factor[..., None] + dark).clip(0, np.iinfo(np.uint16).max)
+    cube = capture.cube
+    write_cube(
+        cube.header_path,
+        scattered.astype(np.uint16),
+        wavelengths_nm=cube.wavelengths_nm,
+        interleave=cube.interleave,
+        data_suffix=cube.data_path.suffix,
+        extra_header={"tint": cube.integration_time_ms},
+    )
+
+
+def _drift_cells(drift: LampDriftEstimate | NotMeasurable, true: Float[np.ndarray, "frames bands"]) -> list[str]:
+    if isinstance(drift, NotMeasurable):
+        return ["0", "-", "-", "-", "-"]
+    error = drift.factor / true - 1.0
+    ratio = (error / np.maximum(drift.standard_error, 1e-9))[1:]
+    percent = (_rms(error), np.sqrt(np.square(error).mean(axis=0)).max(), np.abs(error).max())
+    return [str(int(drift.static.sum())), *(f"{100.0 * value:.3f}" for value in percent), f"{_rms(ratio):.2f}"]
+
+
+def _rms(values: Float[np.ndarray, "*shape"]) -> float:
+    return float(np.sqrt(np.square(values).mean()))
 
 
 if __name__ == "__main__":

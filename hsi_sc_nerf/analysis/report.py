@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -96,7 +95,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
             "have in common, such as those of scale, poses or training."
         )
     rows = [
-        [name, with_spread(factor * size[key], factor * spread[key] if spread else None), unit]
+        [name, f"{factor * size[key]:.4g}{f' ± {factor * spread[key]:.2g}' if spread else ''}", unit]
         for key, (name, unit, factor) in _SIZES.items()
     ]
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
@@ -162,19 +161,6 @@ def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits
         writer = csv.writer(file)
         writer.writerow(["wavelength_nm", *titles])
         writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
-
-
-def with_spread(value: float, sd: float | None) -> str:
-    """A number with its standard deviation, to two digits of the deviation; with four digits if there is none.
-
-    Example:
-        >>> with_spread(251.23, 1.87)
-        '251.2 ± 1.9'
-    """
-    if not sd:
-        return f"{value:.4g}"
-    decimals = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def _nm(name: str) -> str:

@@ -1,8 +1,9 @@
 """Drift of the lamps over a session, from the static part of the chamber.
 
-Some lines of each frame are read. The pixels that follow one common course over the frames are static
-(`static_pixels`). Their sum in each band, relative to the first frame, is the lamps' light, and a low-order
-polynomial over 1 / wavelength removes its noise.
+Some lines of each frame are read, and the pixels that follow one common course over the frames are static
+(`static_pixels`). The common grey level is a robust mean over them, in which their scatter averages out. The change
+of each band comes from the sum of their spectra, each divided by its own deviation from the grey level, in which a
+scatter that is common to all bands cancels. A low-order polynomial over 1 / wavelength removes the bands' noise.
 """
 
 from __future__ import annotations
@@ -17,20 +18,19 @@ from scipy import stats
 
 from hsi_sc_nerf.calibration.detector import no_data
 from hsi_sc_nerf.calibration.noise import NoiseModel
+from hsi_sc_nerf.calibration.static_pixels import MIN_FRACTION, Courses, grey_deviation, static_pixels
 
 CorrectDrift = Literal["auto", "always", "never"]
 ReadLines = Callable[[int], Num[np.ndarray, "survey samples bands"]]
 
-SURVEY_FRACTION = 0.06
-"""Fraction of each frame's lines that is surveyed."""
+SURVEY_FRACTION, SURVEY_PIXELS = 0.06, 8192
+"""Fraction of each frame's lines that is surveyed, and fewest pixels: a scatter of 5 % averages to 0.1 %."""
 MIN_LINES = 8
 """Fewest lines of a survey."""
-MIN_PIXELS, MIN_STATIC_FRACTION = 64, 0.05
-"""Fewest static pixels, and their least fraction of the surveyed ones."""
 BINS = 12
 """Bins of bands in which static pixels are searched for."""
 MIN_SIGNAL = 10.0
-"""Least signal-to-noise ratio of a pixel's bin, so that its logarithm is normal, and of a band in the curve's fit."""
+"""Least signal-to-noise ratio of a band in the curve's fit."""
 DEGREE = 2
 """Degree of the curve over 1 / wavelength. Changes of output and of colour temperature are linear in it."""
 FLOOR = 0.001
@@ -38,21 +38,6 @@ FLOOR = 0.001
 object changes the light on the chamber's wall."""
 SIGNIFICANCE = 0.001
 """p-value below which a drift is significant."""
-TOLERANCE = 0.002
-"""Relative deviation of a static pixel's course from the common one, beyond its noise: the lamps' light does not
-change by the same factor everywhere, and a bin's bands have other weights in every pixel."""
-NOISE_MARGIN = 1.5
-"""Factor by which variances may exceed the noise model's."""
-FALSE_ALARM = 1e-3
-"""Fraction of static pixels that noise alone may exclude."""
-SMALLEST_COUNT = 1e-3
-"""Replaces counts that have no logarithm, which are not used."""
-BLOCK_PX = 16
-"""Neighbouring pixels whose median course is a candidate for the common one."""
-MAX_BLOCKS, MAX_VOTERS = 256, 4096
-"""Largest numbers of candidates, and of pixels that vote for them."""
-ROUNDS = 5
-"""Iterations of the static pixels and their common course."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +49,7 @@ class LampDriftEstimate:
         measured: the same before smoothing; nan in bands without enough light.
         standard_error: of ``factor``; 0 in the first frame.
         static: which of the surveyed pixels are static.
+        scatter: of their grey levels, sensor noise included (standard deviation, relative).
         p_value: of such a drift under steady lamps (`drift_p_value`).
         significant: whether ``p_value`` is below ``SIGNIFICANCE``.
     """
@@ -72,6 +58,7 @@ class LampDriftEstimate:
     measured: Float[np.ndarray, "frames bands"]
     standard_error: Float[np.ndarray, "frames bands"]
     static: Bool[np.ndarray, "survey samples"]
+    scatter: float
     p_value: float
     significant: bool
 
@@ -115,13 +102,16 @@ def measure_lamp_drift(
     if len(wavelengths_nm) <= DEGREE:
         return NotMeasurable(f"{len(wavelengths_nm)} bands are too few for a curve over the wavelength")
     survey = _Survey(read_lines, frames, dark, noise, saturation_counts, dead)
-    static, unusable = survey.find_static(_bins(wavelengths_nm))
-    fraction = float(static.mean())
-    if static.sum() < MIN_PIXELS or fraction < MIN_STATIC_FRACTION:
+    counts, variance, unusable = survey.read_bins(_bins(wavelengths_nm))
+    courses = Courses.of(counts, variance)
+    static, common = static_pixels(courses)
+    image = static.reshape(unusable.shape[:2])
+    if not static.any():
         return NotMeasurable(
-            f"only {100.0 * fraction:.1f} % of the surveyed pixels follow one course; more must stand still"
+            f"less than {100.0 * MIN_FRACTION:.0f} % of the surveyed pixels follow one course over the frames"
         )
-    total, variance = survey.sum_over(static, unusable)
+    deviation, scatter, grey_error = grey_deviation(courses, image, common)
+    total, variance = survey.sum_over(image, unusable, np.exp(-deviation))
     lit = (total > MIN_SIGNAL * np.sqrt(variance)).all(axis=0)
     if lit.sum() <= DEGREE:
         return NotMeasurable("what stands still in the image is too dark")
@@ -131,12 +121,14 @@ def measure_lamp_drift(
     coefficients, covariance = fit_over_wavelength(
         np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0), basis[lit]
     )
+    # The first term is constant over the bands, as the grey level's error is.
+    covariance[0, 0] += grey_error**2
     factor = np.exp((coefficients - coefficients[0]) @ basis.T)
     # The first frame's error is part of all the others.
     standard_error = factor * np.sqrt(2.0 * np.einsum("bi,ij,bj->b", basis, covariance, basis))
     standard_error[0] = 0.0
     p_value = drift_p_value(coefficients, covariance)
-    return LampDriftEstimate(factor, measured, standard_error, static, p_value, p_value < SIGNIFICANCE)
+    return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
 
 
 def correction(
@@ -148,81 +140,15 @@ def correction(
     return drift.factor if drift.significant or correct == "always" else None
 
 
-def survey_lines(lines: int) -> Int[np.ndarray, "survey"]:
+def survey_lines(lines: int, samples: int) -> Int[np.ndarray, "survey"]:
     """Lines of a frame that are surveyed, ascending, with the first and the last.
 
     They are twice as dense towards the edges of the image, where the chamber is most likely to be visible.
     """
-    count = max(MIN_LINES, round(SURVEY_FRACTION * lines))
-    even = np.linspace(0.0, 1.0, min(count, lines))
+    count = min(lines, max(MIN_LINES, round(SURVEY_FRACTION * lines), -(-SURVEY_PIXELS // samples)))
+    even = np.linspace(0.0, 1.0, count)
     denser = even - np.sin(2.0 * np.pi * even) / (4.0 * np.pi)
     return np.unique((denser * (lines - 1)).round().astype(int))
-
-
-def static_pixels(
-    counts: Float[np.ndarray, "pixels frames bins"], variance: Float[np.ndarray, "pixels bins"]
-) -> Bool[np.ndarray, "pixels"]:
-    """Pixels whose counts follow one common course over the frames, within their noise and whatever their spectrum.
-
-    The course that most pixels follow is found as in RANSAC, but its candidates are median courses of blocks of
-    neighbours, which have little noise. A rotating surface has a course of its own unless it looks the same from all
-    sides. If nothing is static, few pixels agree on any course.
-
-    Args:
-        counts: counts above dark in bins of bands, pixels in reading order; overwritten.
-        variance: of one count (mean over the frames); infinite if the pixel's counts cannot be used.
-    """
-    frames = counts.shape[1]
-    bins_needed = max(1, counts.shape[2] // 2)
-    mean = counts.mean(axis=1)
-    usable = (mean > MIN_SIGNAL * np.sqrt(variance)) & (counts.min(axis=1) > 0.0)
-    relative = np.where(usable, variance, 0.0) / np.where(usable, mean, 1.0) ** 2
-    weight = (usable / (relative + TOLERANCE**2)).astype(np.float32)
-    course = np.log(np.maximum(counts, SMALLEST_COUNT, out=counts), out=counts)
-    course -= course.mean(axis=1, keepdims=True)
-    judged = usable.sum(axis=1) >= bins_needed
-    degrees = np.maximum((frames - 1) * usable.sum(axis=1), 1)
-    over_frames = NOISE_MARGIN * stats.chi2.isf(FALSE_ALARM, degrees)
-
-    voters = np.flatnonzero(judged)
-    voters = voters[:: max(1, len(voters) // MAX_VOTERS)]
-    if not len(voters):
-        return judged
-    candidates = _candidates(course)
-    votes = _chi_square(course[voters], weight[voters], candidates) <= over_frames[voters, None]
-    common = candidates[int(votes.sum(axis=0).argmax())]
-    in_a_frame = NOISE_MARGIN * stats.chi2.isf(FALSE_ALARM / frames, np.maximum(usable.sum(axis=1), 1))
-    static = np.zeros(len(course), bool)
-    for _ in range(ROUNDS):
-        residual = course - common
-        np.square(residual, out=residual)
-        by_frame = np.matmul(residual, weight[..., None])[..., 0]
-        before = static
-        static = judged & (by_frame.sum(axis=1) <= over_frames) & (by_frame.max(axis=1) <= in_a_frame)
-        if not static.any() or (static == before).all():
-            break
-        total = weight[static].sum(axis=0)
-        common = np.einsum("pfk,pk->fk", course[static], weight[static]) / np.where(total > 0.0, total, 1.0)
-    return static
-
-
-def _candidates(course: Float[np.ndarray, "pixels frames bins"]) -> Float[np.ndarray, "blocks frames bins"]:
-    """Median courses of evenly spread blocks of neighbours."""
-    starts = np.arange(0, max(1, len(course) - BLOCK_PX + 1), BLOCK_PX)
-    starts = starts[np.unique(np.linspace(0, len(starts) - 1, MAX_BLOCKS).round().astype(int))]
-    return np.stack([np.median(course[start : start + BLOCK_PX], axis=0) for start in starts])
-
-
-def _chi_square(
-    course: Float[np.ndarray, "pixels frames bins"],
-    weight: Float[np.ndarray, "pixels bins"],
-    candidates: Float[np.ndarray, "blocks frames bins"],
-) -> Float[np.ndarray, "pixels blocks"]:
-    """Squared distance of each pixel's course from each candidate, in units of its variance."""
-    weighted = course * weight[:, None]
-    squared = np.einsum("pfk,pfk->p", course, weighted)[:, None]
-    product = weighted.reshape(len(course), -1) @ candidates.reshape(len(candidates), -1).T
-    return squared - 2.0 * product + weight @ np.square(candidates).sum(axis=1).T
 
 
 def smooth_basis(
@@ -294,58 +220,62 @@ class _Survey:
     saturation_counts: float | None
     dead: Bool[np.ndarray, "samples bands"] | None
 
-    def find_static(
+    def read_bins(
         self, bins: Bool[np.ndarray, "bands bins"]
-    ) -> tuple[Bool[np.ndarray, "survey samples"], Bool[np.ndarray, "survey samples bands"]]:
-        """Static pixels, and unusable readings: of dead elements, or saturated or no data in some frame."""
-        first = self.read_lines(0)
-        samples, bands = first.shape[1:]
-        summed = bins.astype(np.float32)
-        binned = np.empty((*first.shape[:2], self.frames, bins.shape[1]), np.float32)
-        unusable = np.zeros_like(first, dtype=bool)
-        dead = np.nonzero(np.zeros((samples, bands), bool) if self.dead is None else self.dead)
+    ) -> tuple[
+        Float[np.ndarray, "pixels frames bins"],
+        Float[np.ndarray, "pixels bins"],
+        Bool[np.ndarray, "survey samples bands"],
+    ]:
+        """Counts above dark in bins of bands; their variances, infinite if unusable; and unusable readings.
+
+        Unusable are readings of dead elements, and those that are saturated or no data in some frame.
+        """
+        shape = self._read(0)[0].shape
+        dead = np.zeros(shape[1:], bool) if self.dead is None else self.dead
+        counts = np.empty((shape[0] * shape[1], self.frames, bins.shape[1]), np.float32)
+        unusable = np.zeros(shape, dtype=bool)
         for frame in range(self.frames):
-            (counts, missing), dark = self._read(frame), self._dark(frame, samples)
-            if missing is not None:
-                unusable |= missing
-            if self.saturation_counts is not None and counts.max() >= self.saturation_counts:
-                unusable |= counts >= self.saturation_counts
-            light = counts.astype(np.float32)
-            light[:, dead[0], dead[1]] = dark[dead]
-            binned[:, :, frame] = light @ summed - dark @ summed
+            light, missing = self._read(frame)
+            unusable |= missing
+            light[:, dead] = 0.0
+            counts[:, frame] = (light @ bins.astype(np.float32)).reshape(len(counts), -1)
         # A dead element is in no sum, so it does not exclude its bin, even if it is stuck at the largest count.
-        unusable[:, dead[0], dead[1]] = False
+        unusable[:, dead] = False
         excluded = np.stack([unusable[..., members].any(axis=-1) for members in bins.T], axis=-1)
-        unusable[:, dead[0], dead[1]] = True
-        binned = binned.reshape(-1, *binned.shape[2:])
-        photon_variance = self.noise.counts_per_electron * np.maximum(binned.mean(axis=1), 0.0)
+        unusable[:, dead] = True
+        photon_variance = self.noise.counts_per_electron * np.maximum(counts.mean(axis=1), 0.0)
         variance = photon_variance + self.noise.read_noise**2 @ bins
-        static = static_pixels(binned, np.where(excluded.reshape(variance.shape), np.inf, variance))
-        return static.reshape(first.shape[:2]), unusable
+        return counts, np.where(excluded.reshape(variance.shape), np.inf, variance), unusable
 
     def sum_over(
-        self, static: Bool[np.ndarray, "survey samples"], unusable: Bool[np.ndarray, "survey samples bands"]
+        self,
+        static: Bool[np.ndarray, "survey samples"],
+        unusable: Bool[np.ndarray, "survey samples bands"],
+        weight: Float[np.ndarray, "pixels frames"],
     ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-        """Sum of the static pixels' usable counts above dark in each band, and its variance."""
-        samples, bands = unusable.shape[1:]
-        weight = static.astype(np.float32)[:, None]
-        left_out = np.nonzero(unusable & static[..., None])
-        readings = static.sum(axis=0)[:, None] - (unusable & static[..., None]).sum(axis=0)
-        total = np.empty((self.frames, bands))
+        """Weighted sum of the static pixels' usable counts above dark in each band, and its variance."""
+        usable = ~unusable[static]
+        total, photons, readings = np.empty((3, self.frames, usable.shape[1]))
         for frame in range(self.frames):
-            counts, _ = self._read(frame)
-            total[frame] = np.matmul(weight, counts.astype(np.float32)).sum(axis=(0, 1), dtype=np.float64)
-            total[frame] -= np.bincount(left_out[2], counts[left_out], minlength=bands)
-            total[frame] -= (readings * self._dark(frame, samples)).sum(axis=0)
-        photon_variance = self.noise.counts_per_electron * np.maximum(total, 0.0)
-        return total, photon_variance + readings.sum(axis=0) * self.noise.read_noise**2
+            light, squared = self._read(frame)[0][static] * usable, weight[:, frame] ** 2
+            total[frame], photons[frame], readings[frame] = (
+                weight[:, frame] @ light,
+                squared @ light,
+                squared @ usable,
+            )
+        photon_variance = self.noise.counts_per_electron * np.maximum(photons, 0.0)
+        return total, photon_variance + readings * self.noise.read_noise**2
 
-    def _read(self, frame: int) -> tuple[Num[np.ndarray, "survey samples bands"], np.ndarray | None]:
-        """Raw counts of a frame's lines, 0 for no data, and which are no data (None if all are data)."""
+    def _read(
+        self, frame: int
+    ) -> tuple[Float[np.ndarray, "survey samples bands"], Bool[np.ndarray, "survey samples bands"]]:
+        """Counts of a frame above dark, 0 for no data, and which are no data or saturated."""
         counts = self.read_lines(frame)
         missing = no_data(counts, None)
-        return counts if missing is None else np.where(missing, 0, counts), missing
-
-    def _dark(self, frame: int, samples: int) -> Float[np.ndarray, "samples bands"]:
-        dark = self.dark[frame if len(self.dark) > 1 else 0].astype(np.float32)
-        return np.broadcast_to(dark, (samples, dark.shape[1]))
+        light = counts.astype(np.float32) - self.dark[frame if len(self.dark) > 1 else 0].astype(np.float32)
+        unusable = np.zeros(counts.shape, bool) if missing is None else missing
+        light[unusable] = 0.0
+        if self.saturation_counts is not None:
+            unusable = unusable | (counts >= self.saturation_counts)
+        return light, unusable

@@ -167,7 +167,8 @@ def pack_counts(
     lines, samples, _ = counts.shape
     kept = len(calibration.bands)
     file_bands = _as_slice(calibration.bands)
-    dead = _DeadElements.of(calibration, samples)
+    dead, replaced_by = _dead_elements(calibration, samples)
+    dead_at = np.flatnonzero(dead)
     scale, offset = _line_constants(calibration, samples)
     flat = calibration.flat
     if flat is not None and not (np.isfinite(flat).all() and (flat > 0.0).all()):
@@ -182,12 +183,12 @@ def pack_counts(
     if buffer is None:
         buffer = np.empty(lines * samples * kept, np.uint16)
     packed = np.rot90(buffer[: lines * samples * kept].reshape(*upright_shape, kept), -turns)
-    flags = np.tile(dead.pixel_flags, (lines, 1))
+    flags = np.tile(np.where(dead.any(axis=0), np.uint8(PixelFlag.DEAD), np.uint8(0)), (lines, 1))
     line_pictures = _LinePictures(pictures, kept, lines, samples)
     counted = {name: np.zeros(kept, np.int64) for name in ("clipped_low", "clipped_high", "saturated", "no_data")}
 
     def count(name: str, marked: Bool[np.ndarray, "kept samples"]) -> None:
-        marked.reshape(-1)[dead.at] = False
+        marked.reshape(-1)[dead_at] = False
         counted[name] += cv2.reduce(marked.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[:, 0]
 
     values = np.empty((kept, samples), np.float32)
@@ -221,13 +222,13 @@ def pack_counts(
             for name, clipped in (("clipped_low", values < low), ("clipped_high", values >= high + 1)):
                 count(name, clipped if flagged is None else clipped & ~flagged)
             np.clip(values, low + _HALF, high + _HALF, out=values)
-        values.reshape(-1)[dead.at] = values.reshape(-1)[dead.replaced_by]
+        values.reshape(-1)[dead_at] = values.reshape(-1)[replaced_by]
         line_pictures.add(line, values)
 
         np.copyto(numbers, values, casting="unsafe")
         if flagged is not None:
             numbers[flagged] = FLAGGED
-        numbers.reshape(-1)[dead.at] = FLAGGED
+        numbers.reshape(-1)[dead_at] = FLAGGED
         in_block = line % len(block)
         cv2.transpose(numbers, dst=block[in_block])
         if turns == 0:
@@ -235,32 +236,25 @@ def pack_counts(
         elif in_block == len(block) - 1 or line == lines - 1:
             packed[line - in_block : line + 1] = block[: in_block + 1]
 
-    pixel_counts = PixelCounts(dead=dead.per_band * lines, **counted)
+    pixel_counts = PixelCounts(dead=dead.sum(axis=1) * lines, **counted)
     return PackedReflectance(packed, flags, pixel_counts, line_pictures.rgb, line_pictures.gray, line_pictures.binned)
 
 
-@dataclass(frozen=True, eq=False)
-class _DeadElements:
-    """Dead elements of a line ``(kept, samples)``: flat indices, indices of their replacements, numbers by band."""
+def _dead_elements(
+    calibration: FrameCalibration, samples: int
+) -> tuple[Bool[np.ndarray, "kept samples"], Int[np.ndarray, "dead"]]:
+    """Dead elements of a line, and the flat indices of what replaces them in pictures.
 
-    at: Int[np.ndarray, "dead"]
-    replaced_by: Int[np.ndarray, "dead"]
-    per_band: Int[np.ndarray, "kept"]
-    pixel_flags: UInt8[np.ndarray, "samples"]
-
-    @staticmethod
-    def of(calibration: FrameCalibration, samples: int) -> _DeadElements:
-        """A dead element is replaced by the nearest good band of its sample, or by itself if there is none."""
-        kept = len(calibration.bands)
-        dead = np.zeros((kept, samples), bool) if calibration.dead is None else calibration.dead.T[calibration.bands]
-        band, sample = np.nonzero(dead)
-        index = np.arange(kept)[:, None]
-        before = np.maximum.accumulate(np.where(dead, -kept, index), axis=0)[band, sample]
-        after = np.minimum.accumulate(np.where(dead, 2 * kept, index)[::-1], axis=0)[::-1][band, sample]
-        nearest = np.where(band - before <= after - band, before, after)
-        replaced_by = np.where((nearest < 0) | (nearest >= kept), band, nearest) * samples + sample
-        flags = np.where(dead.any(axis=0), np.uint8(PixelFlag.DEAD), np.uint8(0))
-        return _DeadElements(band * samples + sample, replaced_by, dead.sum(axis=1), flags)
+    That is the nearest good band of the same sample, or the element itself if there is none.
+    """
+    kept = len(calibration.bands)
+    dead = np.zeros((kept, samples), bool) if calibration.dead is None else calibration.dead.T[calibration.bands]
+    band, sample = np.nonzero(dead)
+    index = np.arange(kept)[:, None]
+    before = np.maximum.accumulate(np.where(dead, -kept, index), axis=0)[band, sample]
+    after = np.minimum.accumulate(np.where(dead, 2 * kept, index)[::-1], axis=0)[::-1][band, sample]
+    nearest = np.where(band - before <= after - band, before, after)
+    return dead, np.where((nearest < 0) | (nearest >= kept), band, nearest) * samples + sample
 
 
 def _line_constants(

@@ -38,8 +38,8 @@ from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE, ReflectanceUncertainty
 
-DEFECT_FRAMES, DEFECT_LINES = 6, 4
-"""Frames, evenly spread, and lines of each that are searched for defects and saturation."""
+DEFECT_FRAMES, DEFECT_LINES, DEFECT_WHITE_LINES = 6, 4, 128
+"""Frames, lines of each, and largest number of lines of the white that are searched for defects and saturation."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,6 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     if panel_path is not None:
         panel = read_panel(panel_path, session.wavelengths_nm)
     noise = _noise(session, source, whites[0], defects)
-
     drift = _drift(session, darks, noise, defects)
     # A white in every frame drifts with the lamps.
     drift_factor = correction(drift, config.lamp_drift) if source == "tarp" else None
@@ -200,7 +199,7 @@ def _drift(
 ) -> LampDriftEstimate | NotMeasurable:
     """The lamps' drift, from counts at the first frame's integration time."""
     captures = session.frames
-    survey = survey_lines(captures[0].cube.shape[0])
+    survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
@@ -256,8 +255,8 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
         assert session.white is not None
         # `white_reference` finds the tarp again, without the dead elements.
         roi = tarp_roi(session.white)
-    inside = slice(None) if roi is None else slice(max(0, roi[1]), roi[3])
-    white = _readings(cube, dark, np.arange(cube.shape[0])[inside])
+    inside = np.arange(cube.shape[0])[slice(None) if roi is None else slice(max(0, roi[1]), roi[3])]
+    white = _readings(cube, dark, inside[:: -(-len(inside) // DEFECT_WHITE_LINES)])
     if white.counts.shape[1] != samples:
         white, of_frames = of_frames[0], of_frames[1:]
     return find_defects(white, of_frames, good_bands=good_bands)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -17,8 +16,8 @@ from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
 
-LINES = 16
-"""Lines of each cube that are read, evenly spread."""
+LINES, DARK_LINES = 16, 8
+"""Lines of each cube that are read, evenly spread, and of each dark cube."""
 CLIPPED_FROM = 1.05
 """Reflectance that counts as clipped: noise and uneven light alone take a white wall's values just above 1."""
 CLIPPED_AMBER, CLIPPED_RED = 0.01, 0.05
@@ -43,15 +42,6 @@ WHITE_FRACTION = 0.25
 """A capture that outshines the others in this fraction of the pixels looks like a white."""
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """What is wrong with the white (None for nothing), and the figures behind it."""
-
-    fault: str | None
-    clipped_fraction: float
-    values: dict[str, object]
-
-
 def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
     """Check the white of a session on a few lines of each cube.
 
@@ -69,31 +59,24 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     Example:
         >>> refuse_red(check_white(open_session(Path("captures"))))
     """
-    source = "auto" if source == "target" else source
-    found = white_source(session, source, None)
+    found = white_source(session, "auto" if source == "target" else source, None)
     if found == "product":
         return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
-    verdict = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
-    white = "the white of each capture"
-    if session.white is not None and found == "tarp":
-        white = f"the capture {session.white.name}"
-    level: Level = "red"
-    if verdict.fault is None:
-        sentence, level = f"White: {white} looks like a white.", "green"
+    fault, clipped, values = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
+    white = f"the capture {session.white.name}" if session.white and found == "tarp" else "the white of each capture"
+    if fault is None:
+        of_white = Finding("white", "green", f"White: {white} looks like a white.", values)
     else:
-        sentence = f"{session.path}: {verdict.fault}."
-    clipped = verdict.clipped_fraction
-    of_clipped: Level = "red" if clipped > CLIPPED_RED else "amber" if clipped > CLIPPED_AMBER else "green"
+        of_white = Finding("white", "red", f"{session.path}: {fault}.", values)
+    level: Level = "red" if clipped > CLIPPED_RED else "amber" if clipped > CLIPPED_AMBER else "green"
     told = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
-    if of_clipped != "green":
-        told = f"{session.path}: {told} and will be clipped; check that it is a white, in the frames' light."
-    return [
-        Finding("white", level, sentence, verdict.values),
-        Finding("white-clipped", of_clipped, told.rstrip(".") + ".", {"fraction": clipped}),
-    ]
+    if level != "green":
+        told = f"{session.path}: {told} and will be clipped; check that it is a white, in the frames' light"
+    return [of_white, Finding("white-clipped", level, f"{told}.", {"fraction": clipped})]
 
 
-def _check_tarp(session: Session) -> _Verdict:
+def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]:
+    """What is wrong with the tarp (None for nothing), the fraction of clipped values, and the figures behind it."""
     tarp, frames = session.white, session.frames
     assert tarp is not None
     light = _light(tarp.cube, tarp.dark)
@@ -101,41 +84,41 @@ def _check_tarp(session: Session) -> _Verdict:
     brightest = np.percentile(image, 99.0)
     region = largest_component(image >= TARP_BRIGHTNESS * brightest)
     if not brightest > 0.0:
-        return _Verdict(f"the white {tarp.name} is dark; take it again", 0.0, {})
+        return f"the white {tarp.name} is dark; take it again", 0.0, {}
     white = np.median(light[region], axis=0)
     live = ~unlit_bands(white[None]) & tarp.cube.good_bands
-    compared = _Compared.of(frames, [white[None] / exposure_ratio(tarp, frame) for frame in frames], live)
-    images = compared.images * np.array([exposure_ratio(tarp, frame) for frame in frames])[:, None, None]
-    roughness = float(np.median(np.abs(np.diff(image, axis=1)[region[:, 1:]]) / image[:, 1:][region[:, 1:]]))
+    exposures = np.array([exposure_ratio(tarp, frame) for frame in frames])
+    images, clipped, outshone = _compare_with_white(frames, [white[None] / ratio for ratio in exposures], live)
+    differences = np.abs(np.diff(image, axis=1)) / np.maximum(image[:, 1:], 1e-9)
+    roughness = float(np.median(differences[region[:, 1:]])) if region[:, 1:].any() else np.inf
     brighter, alike, looks_white = 1.0, 0.0, None
     if images.shape[1:] == image.shape:
         image = light[..., live].mean(axis=-1)
-        brighter, alike, best = _compare_with_frames(image, region, images)
+        brighter, alike, best = _compare_with_frames(image, region, images * exposures[:, None, None])
         looks_white = None if best is None else frames[best].name
     fault = None
     if brighter < BRIGHTER and alike >= ALIKE:
-        fault = f"the white {tarp.name} shows the same as the frames, and nothing in it is brighter than there"
-    elif compared.outshone > OUTSHONE_FRACTION:
-        fault = f"the white {tarp.name} is too dark or coloured: the frames are over twice as bright in some bands"
+        fault = "shows the same as the frames, and nothing in it is brighter than there"
+    elif outshone > OUTSHONE_FRACTION:
+        fault = "is too dark or coloured: the frames are over twice as bright in some bands"
     elif roughness > ROUGHNESS:
-        fault = f"the white {tarp.name} is not flat: neighbouring pixels differ by {100.0 * roughness:.0f} %"
+        fault = f"is not flat: neighbouring pixels differ by {100.0 * roughness:.0f} %"
     if fault is not None:
-        fault += (
-            f"; {looks_white} looks most like a white, so name it as 'white_reference' in session.json"
-            if looks_white
-            else "; no other capture looks like a white, so take one"
-        )
-    return _Verdict(
+        advice = "no other capture looks like a white, so take one"
+        if looks_white is not None:
+            advice = f"{looks_white} looks most like a white, so name it as 'white_reference' in session.json"
+        fault = f"the white {tarp.name} {fault}; {advice}"
+    return (
         fault,
-        compared.clipped,
+        clipped,
         {
             "white": tarp.name,
-            "looks_most_like_a_white": looks_white if fault else tarp.name,
+            "looks_most_like_a_white": tarp.name if fault is None else looks_white,
             "area_fraction": float(region.mean()),
             "roughness": roughness,
             "brighter_than_frames_fraction": brighter,
             "like_the_frames_fraction": alike,
-            "outshone_fraction": compared.outshone,
+            "outshone_fraction": outshone,
         },
     )
 
@@ -163,54 +146,43 @@ def _compare_with_frames(
     return float((image > MARGIN * high)[region].mean()), float(inside[moving].mean()), best
 
 
-def _check_own_whites(session: Session) -> _Verdict:
-    frames, whites, faults = session.frames, [], []
-    unevenness = 0.0
-    for frame in frames:
+def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, object]]:
+    """As `_check_tarp`, for WHITEREF cubes."""
+    whites, uneven, good_bands = [], {}, np.ones(len(session.wavelengths_nm), bool)
+    for frame in session.frames:
         assert frame.white is not None
         light = _light(frame.white, frame.white_dark)
-        column = np.median(light, axis=0)
-        if len(column) != frame.cube.shape[1]:
-            column = np.median(column, axis=0, keepdims=True)
-        whites.append(column / white_exposure_ratio(session, "capture", frame))
-        brightness = light.mean(axis=-1)
-        low, middle, high = np.percentile(brightness, [10.0, 50.0, 90.0], axis=0)
-        uneven = float(np.median((high - low) / np.maximum(middle, 1e-9)))
-        unevenness = max(unevenness, uneven)
-        if uneven > UNEVENNESS:
-            faults.append(frame.name)
-    live = ~unlit_bands(np.concatenate([np.median(white, axis=0, keepdims=True) for white in whites]))
-    compared = _Compared.of(frames, whites, live & np.logical_and.reduce([frame.cube.good_bands for frame in frames]))
-    fault = None
-    if faults:
-        fault = f"the WHITEREF of {', '.join(faults)} is not flat; take a white that fills the image"
-    elif compared.outshone > OUTSHONE_FRACTION:
+        columns = np.median(light, axis=0)
+        if len(columns) != frame.cube.shape[1]:
+            columns = np.median(columns, axis=0, keepdims=True)
+        whites.append(columns / white_exposure_ratio(session, "capture", frame))
+        low, middle, high = np.percentile(light.mean(axis=-1), [10.0, 50.0, 90.0], axis=0)
+        uneven[frame.name] = float(np.median((high - low) / np.maximum(middle, 1e-9)))
+        good_bands &= frame.cube.good_bands
+    lit = ~unlit_bands(np.stack([np.median(white, axis=0) for white in whites]))
+    _, clipped, outshone = _compare_with_white(session.frames, whites, lit & good_bands)
+    fault, not_flat = None, [name for name, unevenness in uneven.items() if unevenness > UNEVENNESS]
+    if not_flat:
+        fault = f"the WHITEREF of {', '.join(not_flat)} is not flat; take a white that fills the image"
+    elif outshone > OUTSHONE_FRACTION:
         fault = "the WHITEREF cubes are too dark or coloured: the frames are over twice as bright in some bands"
-    return _Verdict(fault, compared.clipped, {"unevenness": unevenness, "outshone_fraction": compared.outshone})
+    return fault, clipped, {"unevenness": max(uneven.values()), "outshone_fraction": outshone}
 
 
-@dataclass(frozen=True, eq=False)
-class _Compared:
-    """Frames against their white: brightness, fraction of clipped values, and of values far above the white's."""
+def _compare_with_white(
+    frames: Sequence[Capture], whites: Sequence[Float[np.ndarray, "columns bands"]], live: Bool[np.ndarray, "bands"]
+) -> tuple[Float[np.ndarray, "frames lines samples"], float, float]:
+    """Brightness of the frames' lines; fraction of values above the white's; and largest fraction far above it.
 
-    images: Float[np.ndarray, "frames lines samples"]
-    clipped: float
-    outshone: float
-
-    @staticmethod
-    def of(
-        frames: Sequence[Capture],
-        whites: Sequence[Float[np.ndarray, "columns bands"]],
-        live: Bool[np.ndarray, "bands"],
-    ) -> _Compared:
-        """Compare each frame with its white, in the live bands and at the frame's exposure."""
-        images, clipped, outshone = [], [], []
-        for frame, white in zip(frames, whites, strict=True):
-            light = _light(frame.cube, frame.dark)[..., live]
-            images.append(light.mean(axis=-1))
-            clipped.append((light > CLIPPED_FROM * white[..., live]).mean())
-            outshone.append((light > OUTSHONE * white[..., live]).mean(axis=(0, 1)))
-        return _Compared(np.stack(images), float(np.mean(clipped)), float(np.mean(outshone, axis=0).max()))
+    The whites are at the frames' exposures, the last fraction is that of the worst of the live bands.
+    """
+    images, clipped, outshone = [], [], []
+    for frame, white in zip(frames, whites, strict=True):
+        light = _light(frame.cube, frame.dark)[..., live]
+        images.append(light.mean(axis=-1))
+        clipped.append((light > CLIPPED_FROM * white[..., live]).mean())
+        outshone.append((light > OUTSHONE * white[..., live]).mean(axis=(0, 1)))
+    return np.stack(images), float(np.mean(clipped)), float(np.mean(outshone, axis=0).max())
 
 
 def _light(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "lines samples bands"]:
@@ -218,5 +190,6 @@ def _light(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "lines samples ba
     rows = np.unique(np.linspace(0, cube.shape[0] - 1, min(LINES, cube.shape[0]) + 2).round().astype(int)[1:-1])
     counts = np.asarray(cube.memmap()[rows])
     missing = no_data(counts, cube.ignore_value)
-    light = counts.astype(np.float32) - dark_columns(None if dark is None else dark.memmap(), *cube.shape[1:])
+    dark_lines = None if dark is None else dark.memmap()[:DARK_LINES]
+    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:])
     return light if missing is None else np.where(missing, 0.0, light)

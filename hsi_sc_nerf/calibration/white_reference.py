@@ -40,7 +40,6 @@ class White:
         measured: mean counts above dark before smoothing; nan in bad bands and, with one column for each sample, in
             dead elements.
         spectrum: the same after smoothing.
-        dark: mean counts without light.
         pixels: pixels averaged for each column.
         window_bands: bands averaged by smoothing for each band; 0 in bad bands.
         bad_bands: bands in which the white is unlit, saturated, or without a live detector element.
@@ -48,7 +47,6 @@ class White:
 
     measured: Float[np.ndarray, "columns bands"]
     spectrum: Float[np.ndarray, "columns bands"]
-    dark: Float[np.ndarray, "dark_columns bands"]
     pixels: int
     window_bands: Int[np.ndarray, "bands"]
     bad_bands: Bool[np.ndarray, "bands"]
@@ -126,7 +124,6 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
     return WhiteReference(
         measured,
         spectrum,
-        dark,
         pixels=int(mask.sum()),
         window_bands=window_bands.max(axis=0),
         bad_bands=bad_bands,
@@ -160,11 +157,10 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
         pixels = len(counts)
     else:
         measured, pixels = readings.mean_spectrum(dark_spectra)[None], everywhere.size
-        dark_spectra = dark_spectra.mean(axis=0, keepdims=True)
     bad_bands = _bad_bands(white, measured, readings, defects)
     measured = np.where(bad_bands | ~(measured > 0.0), np.nan, measured)
     spectrum, window_bands = smooth_spectrum(measured, white.wavelengths_nm)
-    return White(measured, spectrum, dark_spectra, pixels, window_bands.max(axis=0), bad_bands)
+    return White(measured, spectrum, pixels, window_bands.max(axis=0), bad_bands)
 
 
 def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:

@@ -15,9 +15,12 @@ import numpy as np
 from jaxtyping import Float, Num, Shaped
 from spectral.io import envi
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.spectra.bands import covered
+from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 # Order of a cube's axes (lines, samples, bands) in a data file.
 _AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
@@ -99,6 +102,9 @@ def write_cube(
 ) -> None:
     """Write an ENVI pair, little endian. Both files appear whole or not at all, the data file first.
 
+    Where the bands show red, green and blue (`paper.PSEUDO_RGB_NM`), they are the header's ``default bands``, which
+    viewers such as SPy's ``get_rgb`` take.
+
     Args:
         header_path: the header, ending in ``.hdr``.
         cube: the numbers; their data type is kept.
@@ -117,6 +123,9 @@ def write_cube(
         spectral = {"wavelength units": "nm", "wavelength": [float(w) for w in wavelengths_nm]}
         if len(wavelengths_nm) != cube.shape[2]:
             raise ValueError(f"{len(wavelengths_nm)} wavelengths for {cube.shape[2]} bands")
+        if covered(wavelengths_nm, paper.PSEUDO_RGB_NM).all():
+            # ENVI counts bands from 1.
+            spectral["default bands"] = (nearest_bands(wavelengths_nm, paper.PSEUDO_RGB_NM) + 1).tolist()
     stored = np.ascontiguousarray(cube.transpose(_AXES[interleave]))
     stored = stored.astype(stored.dtype.newbyteorder("<"), copy=False)
     header = {

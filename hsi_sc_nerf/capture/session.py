@@ -18,7 +18,7 @@ from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.capture.layout import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_band_centres, read_session_info
-from hsi_sc_nerf.capture.specim_iq import SpecimMetadata, dark_of_white, image_rotation_deg, read_metadata
+from hsi_sc_nerf.capture.specim_iq import SpecimMetadata, dark_of_white, read_metadata, usual_rotation_deg
 from hsi_sc_nerf.errors import InputError
 
 # Headers list centres to about 0.01 nm; two captures of one instrument agree to that.
@@ -189,40 +189,35 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     captures = open_captures(kept, info, path, damaged)
     white_name = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
+    if broken_white is None and not captures:  # all for the same reason, most likely
+        broken_white = next(iter(damaged.values()))
     if broken_white is not None:
         raise InputError(f"{broken_white}.")
     tarp = next((c for c in captures if c.name.lower() == white_name and c.has_counts), None)
     frames = [capture for capture in captures if capture.name.lower() != white_name]
     frames = _consistent(frames, tarp, damaged)
     if damaged and not skip_damaged:
-        _refuse_damaged(path, damaged)
+        raise InputError(
+            f"{path}: {in_short(damaged)} cannot be used; copy the captures again, or leave them out with "
+            "--skip-damaged."
+        )
     _check_whites(path, info, tarp, frames)
     if len(frames) < 2:
         raise InputError(
             f"{path}: has {'a single frame' if frames else 'no frames'} beside the white reference; a reconstruction "
             "needs several frames of the turning object."
         )
-    # The images of all frames are rotated as the first frame's metadata say.
     rotation_deg = info.image_rotation_deg
     if rotation_deg is None:
-        first = next(files for files in kept if files.name == frames[0].name)
-        if frames[0].metadata is None and first.metadata is not None:
-            frames[0] = replace(frames[0], metadata=read_metadata(first.metadata))
-        rotation_deg = image_rotation_deg(frames[0].metadata, frames[0].cube)
+        rotation_deg = usual_rotation_deg(frames[0].cube)
     return Session(
         path, info, tarp, tuple(frames), rotation_deg, damaged=damaged, skipped=found.skipped, excluded=tuple(exclude)
     )
 
 
-def _refuse_damaged(path: Path, damaged: Mapping[str, str]) -> None:
-    """Name all captures that cannot be used at once."""
-    if len(damaged) == 1:
-        raise InputError(f"{next(iter(damaged.values()))} (--skip-damaged leaves the capture out).")
-    reasons = ", ".join(f"{name} ({reason.split('; ')[0]})" for name, reason in damaged.items())
-    raise InputError(
-        f"{path}: {len(damaged)} captures cannot be used; copy them again or leave them out with --skip-damaged: "
-        f"{reasons}."
-    )
+def in_short(damaged: Mapping[str, str]) -> str:
+    """Captures that cannot be used, each with the reason."""
+    return ", ".join(f"{name} ({reason.split(': ', 1)[-1].split('; ')[0]})" for name, reason in damaged.items())
 
 
 def _check_whites(path: Path, info: SessionInfo, tarp: Capture | None, frames: list[Capture]) -> None:

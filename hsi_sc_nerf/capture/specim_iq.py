@@ -12,8 +12,6 @@ from hsi_sc_nerf.errors import InputError
 
 IMAGE_ROTATION_DEG = 90
 """The slit is upright and scans sideways: the files' images are turned by this, counter-clockwise."""
-# Fields of no other camera's metadata, normalised: WR_mode and datacube_angle.
-_SPECIM_IQ_FIELDS = ("wrmode", "datacubeangle")
 
 
 @dataclass(frozen=True)
@@ -25,21 +23,18 @@ class SpecimMetadata:
         integration_time_ms: of the capture; None if it is not given.
         white_mode: "custom": the white was taken at another time, with its own integration time and dark;
             "simultaneous": it was taken in the capture's own frame; None if it is not given.
-        is_specim_iq: whether a real SPECIM IQ wrote the file.
     """
 
     path: Path
     integration_time_ms: float | None
     white_mode: str | None
-    is_specim_iq: bool
 
 
 def read_metadata(path: Path) -> SpecimMetadata:
     """Read a capture's XML: ``<key field="integration_time">10</key>`` and similar, in any namespace.
 
     A field's name is the attribute ``field`` or ``name`` or the element's tag; case, blanks, hyphens and underscores
-    are ignored. A real SPECIM IQ is recognised by its name anywhere in the file or by the fields ``WR_mode`` and
-    ``datacube_angle``, unless the file says "simulated".
+    are ignored.
 
     Raises:
         InputError: the file is no XML, or the integration time is not a positive number.
@@ -49,30 +44,23 @@ def read_metadata(path: Path) -> SpecimMetadata:
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
         raise InputError(f"{path}: is no readable XML ({error}); copy the capture's metadata again.") from error
     values: dict[str, str] = {}
-    words = []
     for element in root.iter():
         text = (element.text or "").strip()
         name = element.get("field") or element.get("name") or str(element.tag).rpartition("}")[2]
         if text:
             values.setdefault(_normalised(name), text)
-        words += [text, *element.attrib.values()]
-    text = _normalised(" ".join(words))
-    is_named = "specimiq" in text or any(field in values for field in _SPECIM_IQ_FIELDS)
     return SpecimMetadata(
         path=path,
         integration_time_ms=_integration_time_ms(path, values.get("integrationtime") or values.get("tint")),
         white_mode=_normalised(values["wrmode"]) if "wrmode" in values else None,
-        is_specim_iq=is_named and "simulated" not in text,
     )
 
 
-def image_rotation_deg(metadata: SpecimMetadata | None, cube: Cube) -> int:
-    """Rotation of a file's image from upright, counter-clockwise: 90 if a real SPECIM IQ took it, else 0.
+def usual_rotation_deg(cube: Cube) -> int:
+    """Rotation of a file's image from upright, counter-clockwise, as far as its header tells.
 
-    The camera is recognised by its metadata (`read_metadata`) or by the header's ``sensor type`` or ``description``.
+    It is 90 if the ``sensor type`` or ``description`` is that of a real SPECIM IQ, else 0.
     """
-    if metadata is not None and metadata.is_specim_iq:
-        return IMAGE_ROTATION_DEG
     camera = _normalised(" ".join(str(cube.fields.get(key, "")) for key in ("sensor type", "description")))
     return IMAGE_ROTATION_DEG if "specimiq" in camera and "simulated" not in camera else 0
 

@@ -34,7 +34,8 @@ class ExportCommand:
         Raises:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
+        from hsi_sc_nerf.export.description import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud
         from hsi_sc_nerf.models.trained_run import open_run
 
-        export_cloud(open_run(self.load_config), self.output_dir, self.options)
+        export_cloud(open_run(self.load_config), self.output_dir, self.options, run_name(self.load_config))

@@ -13,7 +13,6 @@ from rich.markup import escape
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
 from hsi_sc_nerf.inspection.picture import draw_inspection
 from hsi_sc_nerf.inspection.session_json import suggestion
@@ -58,7 +57,9 @@ class InspectCommand:
             write_json(self.output_dir / "inspection.json", inspection.report())
             draw_inspection(inspection, self.output_dir / "inspection.png")
             console.print(f"{self.output_dir}: inspection.json and inspection.png are written.", highlight=False)
-        refuse_red(inspection.findings)
+        red = [finding.sentence for finding in inspection.findings if finding.level == "red"]
+        if red:
+            raise InputError(" ".join(red))
 
     def _watch(self, console: Console) -> None:
         if not self.session.is_dir():

@@ -14,17 +14,22 @@ from hsi_sc_nerf.cli.compare import CompareCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
 from hsi_sc_nerf.cli.export import ExportCommand
 from hsi_sc_nerf.cli.inspect import InspectCommand
+from hsi_sc_nerf.cli.markers import MarkersCommand
 from hsi_sc_nerf.cli.process import ProcessCommand
 from hsi_sc_nerf.cli.render import RenderCommand
 from hsi_sc_nerf.cli.report import ReportCommand
+from hsi_sc_nerf.cli.run import RunCommand
 from hsi_sc_nerf.cli.sample import SampleCommand
 from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.library_warnings import ignore_library_warnings
 
 Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[RunCommand, tyro.conf.subcommand("run")]
+    | Annotated[MarkersCommand, tyro.conf.subcommand("markers")]
     | Annotated[InspectCommand, tyro.conf.subcommand("inspect")]
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
@@ -39,6 +44,7 @@ Commands = (
 
 def main() -> None:
     """Run the command of the command line; invalid input exits with one sentence and status 2."""
+    ignore_library_warnings()
     try:
         # Reading the options can already raise InputError.
         command = tyro.cli(Commands, description=__doc__)  # type: ignore[var-annotated]

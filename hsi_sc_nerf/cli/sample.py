@@ -47,6 +47,7 @@ class SampleCommand:
                 written.
         """
         check_options(self)
+        from hsi_sc_nerf.export.description import run_name
         from hsi_sc_nerf.export.sample_points import sample_points
         from hsi_sc_nerf.export.sampled_ply import read_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_run
@@ -63,7 +64,8 @@ class SampleCommand:
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
         output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
-        write_sampled_ply(output, given, found, run.dataset.wavelengths_nm, run.model.rgb_bands)
+        name = run_name(self.load_config)
+        write_sampled_ply(output, given, found, run.dataset.wavelengths_nm, run.model.rgb_bands, name)
         console = Console()
         if no_spectrum:
             console.print(

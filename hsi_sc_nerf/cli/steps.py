@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -12,6 +14,8 @@ from pathlib import Path
 
 from hsi_sc_nerf.benchmark.machine import peak_memory_mib
 from hsi_sc_nerf.errors import InputError
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,9 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
     with log.open("wb") as output:
-        process = subprocess.Popen(list(argv), stdout=output, env=environment)
+        # A step that outlives its run would write into the folder of the next one.
+        orphans = _end_with_parent if sys.platform == "linux" else None
+        process = subprocess.Popen(list(argv), stdout=output, env=environment, preexec_fn=orphans)
         try:
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:
@@ -75,3 +81,15 @@ def nerfstudio_command(script: str) -> list[str]:
 def own_command() -> list[str]:
     """Command that runs `hsi-sc-nerf` with this Python."""
     return [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
+
+
+def typed_command(words: Sequence[str]) -> list[str]:
+    """Command that runs with this Python what a user would type, such as ``("ns-train", "hsi-sc-nerf", ...)``."""
+    scripts = {"ns-train": "train", "ns-eval": "eval", "ns-export": "exporter"}
+    program = own_command() if words[0] == "hsi-sc-nerf" else nerfstudio_command(scripts[words[0]])
+    return [*program, *words[1:]]
+
+
+def _end_with_parent() -> None:
+    """In a new process: end when the process that started it is killed (Linux)."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -119,8 +119,13 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         )
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The training batch of ``step``: the same for the same step, stage and seed."""
+        """The training batch of ``step``: the same for the same step, stage and seed.
+
+        nerfstudio's exporters ask for step 0 again and again: they get other pixels of the object each time.
+        """
         self.train_count += 1
+        if self.test_mode != "val":  # nerfstudio's name for training
+            step, self.foreground_ray_fraction = self.train_count, 1.0
         if self._held is not None:
             pixels = self.train_pixel_sampler.draw(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
             indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)

@@ -54,12 +54,14 @@ class CloudStream:
         wavelengths_nm: band centres.
         extra_names: the chunks' extra columns, in order.
         chunks: the chunks, which are iterated over once.
+        run: name of the run that made the cloud, which files state.
     """
 
     count: int
     wavelengths_nm: Float[np.ndarray, "bands"]
     extra_names: tuple[str, ...]
     chunks: Iterable[SpectralCloud]
+    run: str = ""
 
 
 def stream(cloud: SpectralCloud, chunk_points: int = CHUNK_POINTS) -> CloudStream:

@@ -18,8 +18,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream
+from hsi_sc_nerf.export.description import COLUMNS, REFLECTANCE, cloud_attributes, comment_lines
 from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, make_folder
 
@@ -33,14 +35,14 @@ LAS_MAX_DIMENSIONS = 341
 """A dimension of extra bytes is described by 192 bytes, and all descriptions share one record of at most 65535."""
 _LAS_POINT_FORMAT = 7
 """With colours."""
+_LAS_TEXT_RECORD = 3
+"""The specification's record for a text that describes the file."""
 _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals
 _COLOURS = ("red", "green", "blue")
 _EIGHT_TO_SIXTEEN_BITS = 257
 
 _NORMALS = ("nx", "ny", "nz")
-_TABLE_ATTRIBUTES = {"title": "spectral point cloud", "frame": "object: z along the turntable's axis, up; metres"}
-_REFLECTANCE_ATTRIBUTES = {"units": "1", "long_name": "reflectance", "coordinates": "x y z"}
-_WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band"}
+_WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band", "standard_name": "radiation_wavelength"}
 
 
 def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: CloudFormat) -> Path:
@@ -100,6 +102,11 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     names = [*_LAS_NORMALS, *bands, *cloud.extra_names]
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
+    header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
+    text = "\n".join(comment_lines([*_COLOURS, *cloud.extra_names], cloud.run)).replace(
+        "scalar_WAVELENGTH", "WAVELENGTH"
+    )
+    header.vlrs.append(laspy.VLR("LASF_Spec", _LAS_TEXT_RECORD, "text area description", text.encode()))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:
         for chunk in cloud.chunks:
@@ -115,11 +122,17 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
 
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable."""
-    units = dict.fromkeys("xyz", "m") | dict.fromkeys(_NORMALS, "1")
-    yield "reflectance", "<f4", ("point", "wavelength"), _REFLECTANCE_ATTRIBUTES
-    for name in ("x", "y", "z", *_NORMALS, *_COLOURS, *cloud.extra_names):
-        attributes = {"units": units[name]} if name in units else {}
-        yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
+    meanings = {"reflectance": REFLECTANCE} | COLUMNS
+    for name in ("reflectance", "x", "y", "z", *_NORMALS, *_COLOURS, *cloud.extra_names):
+        attributes = dict(zip(("units", "long_name"), meanings.get(name, ()), strict=False))
+        if name == "reflectance":
+            yield name, "<f4", ("point", "wavelength"), attributes | {"coordinates": "x y z"}
+        else:
+            yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
+
+
+def _table_attributes(cloud: CloudStream) -> dict[str, str]:
+    return {"Conventions": "CF-1.11", **cloud_attributes(cloud.run)}
 
 
 def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:
@@ -142,7 +155,7 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
     import h5netcdf
 
     with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
-        file.attrs.update(_TABLE_ATTRIBUTES)
+        file.attrs.update(_table_attributes(cloud))
         file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
         wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
         wavelength.attrs.update(_WAVELENGTH_ATTRIBUTES)
@@ -162,7 +175,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
     try:
         make_folder(path.parent)
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
-        group.attrs.update(_TABLE_ATTRIBUTES)
+        group.attrs.update(_table_attributes(cloud))
 
         def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: dict[str, str]) -> Any:
             return group.create_array(

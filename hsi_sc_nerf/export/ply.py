@@ -2,7 +2,8 @@
 
 The first element, ``vertex``, holds ``x y z nx ny nz`` (float, metres), ``red green blue`` (uchar), one float a band
 named by its wavelength (``scalar_397.32nm``; CloudCompare shows properties that begin with ``scalar_`` as scalar
-fields), and the extra columns. A million points of 204 bands take 843 MB.
+fields), and the extra columns. Comments state the frame, the run, and the unit and meaning of each column. A million
+points of 204 bands take 843 MB.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, stream
+from hsi_sc_nerf.export.description import comment_lines
 from hsi_sc_nerf.files import atomic_write
 
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
@@ -52,7 +54,8 @@ def write_spectral_ply(
     if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
         raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
     properties = (f"property {'uchar' if name in _COLOUR else 'float'} {name}" for name in names)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {cloud.count}", *properties]
+    comments = (f"comment {line}" for line in comment_lines(names, cloud.run))
+    header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {cloud.count}", *properties]
     faces = np.empty(0 if triangles is None else len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     if triangles is not None:
         faces["count"], faces["corners"] = 3, triangles
@@ -100,8 +103,8 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")
-        >>> cloud.spectra.shape
-        (1000000, 204)
+        >>> len(cloud.wavelengths_nm)
+        204
     """
     path = Path(path)
     if not path.is_file():

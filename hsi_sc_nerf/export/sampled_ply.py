@@ -12,6 +12,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.export.cloud import estimate_normals
+from hsi_sc_nerf.export.description import comment_lines
 from hsi_sc_nerf.export.ply import band_property_names
 from hsi_sc_nerf.export.sample_points import PointSpectra
 from hsi_sc_nerf.files import atomic_write
@@ -78,8 +79,11 @@ def write_sampled_ply(
     found: PointSpectra,
     wavelengths_nm: Float[np.ndarray, "bands"],
     rgb_bands: list[int],
+    run: str,
 ) -> None:
     """Write a file with the spectra of its points as binary PLY, and normals and pseudo-RGB if it has none.
+
+    Its comments state ``run``, the name of the run, and what the new columns mean.
 
     Raises:
         InputError: the file cannot be written.
@@ -101,6 +105,8 @@ def write_sampled_ply(
     elements = [
         PlyElement.describe(rows, "vertex") if element.name == "vertex" else element for element in content.elements
     ]
+    added = comment_lines([name for name in columns if name not in ("x", "y", "z")], run)
+    comments = [*content.comments, *(line for line in added if line not in content.comments)]
     with atomic_write(path) as (temporary,):
-        file = PlyData(elements, byte_order="<", comments=content.comments, obj_info=content.obj_info)
+        file = PlyData(elements, byte_order="<", comments=comments, obj_info=content.obj_info)
         file.write(str(temporary))

@@ -45,10 +45,11 @@ from hsi_sc_nerf.surface.view_statistics import COLUMNS, view_statistics
 EXTRA = ("opacity", INCIDENCE, *COLUMNS)
 
 
-def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Path:
+def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name: str = "") -> Path:
     """Write the cloud of a run to ``OUTPUT_DIR/point_cloud.*`` (metres, object frame) and return its path.
 
-    Spectra are rendered and written in chunks, so that memory does not grow with the number of points.
+    Spectra are rendered and written in chunks, so that memory does not grow with the number of points. The file
+    states the run's ``name``.
 
     Raises:
         InputError: the model holds no object, the options contradict the run, or the file cannot be written.
@@ -81,9 +82,8 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions) -> Pa
     if options.normal_method == "open3d":
         normals = estimate_normals(surface.points, surface.mesh_normals).astype(np.float32)
     chunks = _render_chunks(run, renders, surface, normals, bands, batch)
-    path = write_cloud(
-        target, CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks), options.format
-    )
+    cloud = CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name)
+    path = write_cloud(target, cloud, options.format)
     summary = f"{len(surface):,} points with {len(bands)} bands, in metres: {escape(str(path))}"
     CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
     return path

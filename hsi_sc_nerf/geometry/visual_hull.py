@@ -27,8 +27,9 @@ def visual_hull(
     masks: Bool[np.ndarray, "frames h w"],
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
+    max_missed_fraction: float = MAX_MISSED_FRACTION,
 ) -> Float[np.ndarray, "kept 3"]:
-    """The points that most frames see (`MIN_VIEWS_FRACTION`) and few outside the mask (`MAX_MISSED_FRACTION`).
+    """The points that most frames see (`MIN_VIEWS_FRACTION`) and few outside the mask.
 
     Lens distortion is neglected.
 
@@ -37,13 +38,14 @@ def visual_hull(
         masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
         intrinsics: of the one camera.
+        max_missed_fraction: fraction of all frames that may have a point of the hull outside of their mask.
 
     Example:
         >>> ticks = np.linspace(-0.1, 0.1, 48)
         >>> centres = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
         >>> hull = visual_hull(centres, masks, camera_to_worlds, intrinsics)
     """
-    max_missed = int(MAX_MISSED_FRACTION * len(masks) + 1e-9)
+    max_missed = int(max_missed_fraction * len(masks) + 1e-9)
     # A few frames rule out most points, before all frames test the rest.
     for step in (_FIRST_STEP, 1):
 

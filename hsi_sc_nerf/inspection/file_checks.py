@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.capture.session import Capture, Session, in_short
 from hsi_sc_nerf.findings import Finding, Level
 
 _DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}")
@@ -52,7 +52,7 @@ def names_in_short(names: Sequence[str], most: int = 6) -> str:
 
 def leave_out(names: Sequence[str]) -> str:
     """The options that leave captures out."""
-    return "--exclude " + " ".join(names)
+    return " ".join(f"--exclude {name}" for name in names)
 
 
 def _binning(capture: Capture) -> str | None:
@@ -83,10 +83,9 @@ def _frames(session: Session) -> Finding:
 def _damaged(session: Session) -> list[Finding]:
     if not session.damaged:
         return []
-    names = list(session.damaged)
     sentence = (
-        f"{session.path}: {len(names)} captures cannot be used: {names_in_short(names)}; copy them again or leave "
-        f"them out with --skip-damaged ({'; '.join(reason.split('; ')[0] for reason in session.damaged.values())})."
+        f"{session.path}: {in_short(session.damaged)} cannot be used; copy the captures again, or leave them out "
+        "with --skip-damaged."
     )
     return [Finding("damaged", "red", sentence, dict(session.damaged))]
 
@@ -109,7 +108,7 @@ def _same(
         return Finding(name, "green", f"All frames have the same {what}: {usual}.", {"usual": usual})
     differing = ", ".join(sorted({str(values[frame]) for frame in others}))
     sentence = (
-        f"{session.path}: {names_in_short(others)} differ from the other frames in their {what} ({differing}, not "
+        f"{session.path}: the {what} of {names_in_short(others)} differ from the other frames' ({differing}, not "
         f"{usual}): {advice}"
     )
     sentence += f" with {leave_out(others)}." if level == "red" else "."

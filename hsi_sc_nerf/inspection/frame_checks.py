@@ -14,10 +14,10 @@ from hsi_sc_nerf.inspection.file_checks import leave_out, names_in_short
 from hsi_sc_nerf.inspection.look import Look, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
-SATURATED_AMBER, SATURATED_RED = 0.005, 0.1
+SATURATED_AMBER, SATURATED_RED = 0.005, 0.25
 """Fractions of a frame's values: highlights are flagged value by value; from the red one the exposure is wrong."""
-DARK_AMBER, DARK_RED = 0.2, 0.7
-"""Fractions of a frame's values without light; the outermost bands of a good session have some."""
+DARK_AMBER, DARK_RED = 0.2, 0.95
+"""Fractions of a frame's values without light: a good session has some in its outermost bands, a covered lens all."""
 BLURRED = 0.6
 """A frame is less sharp than the others if its edges have this fraction of their slope."""
 COMPARED_PX = 40
@@ -100,9 +100,7 @@ def _focus(session: Session, looks: Sequence[Look]) -> Finding:
     blurred = [look.name for look, ratio in zip(looks, relative, strict=True) if ratio < BLURRED]
     values = {"sharpness_over_median": _by_name(looks, relative)}
     if blurred:
-        sentence = (
-            f"Focus: {names_in_short(blurred)} are less sharp than the other frames; look at them, or leave them out."
-        )
+        sentence = f"Focus: less sharp than the other frames: {names_in_short(blurred)}; look at the picture."
         return Finding("focus", "amber", sentence, values)
     return Finding("focus", "green", "Focus: all frames are about equally sharp.", values)
 
@@ -134,17 +132,15 @@ def _other_object(session: Session, looks: Sequence[Look], detections: Sequence[
     values = {"deviation_over_median": _by_name(looks, ratios), "unknown_markers": strangers}
     wrong = [look.name for look in looks if look.name in {*different, *strangers}]
     if wrong:
-        why = "look unlike all other frames" if different else "show other markers than all other frames"
+        why = "unlike all other frames" if different else "other markers than in all other frames"
         sentence = (
-            f"{session.path}: {names_in_short(wrong)} {why} (another object, or a moved camera); leave them out with "
+            f"{session.path}: {why} (another object, or a moved camera): {names_in_short(wrong)}; leave out with "
             f"{leave_out(wrong)}."
         )
         return Finding("other-object", "red", sentence, values)
     doubtful = [look.name for look, ratio in zip(looks, ratios, strict=True) if ratio > DIFFERENT_AMBER]
     if doubtful:
-        sentence = (
-            f"{names_in_short(doubtful)} look somewhat unlike the frames beside them; compare them in the picture."
-        )
+        sentence = f"Somewhat unlike the other frames: {names_in_short(doubtful)}; compare them in the picture."
         return Finding("other-object", "amber", sentence, values)
     return Finding("other-object", "green", "All frames look like frames of one object.", values)
 

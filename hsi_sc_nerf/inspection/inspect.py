@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from hsi_sc_nerf.calibration.white_check import check_white
+from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.file_checks import check_files
@@ -54,16 +56,23 @@ class Inspection:
         }
 
 
-def inspect_session(session: Session, poses: PoseMethod = "auto", scale_known: bool = False) -> Inspection:
+def inspect_session(
+    session: Session,
+    poses: PoseMethod = "auto",
+    scale_known: bool = False,
+    white_source: Literal["auto"] | WhiteSource = "auto",
+) -> Inspection:
     """Check a session before anything is computed from it; a few lines and bands of each cube are read.
 
     Args:
         session: the session, opened with ``skip_damaged``.
         poses: how poses will be found; without a scale, "auto" and "markers" are red.
         scale_known: whether something beside ``session.json`` gives the scale.
+        white_source: where the white is.
 
     Raises:
-        InputError: a cube cannot be read, or ``session.json`` names an unknown marker dictionary.
+        InputError: the session does not have that source of white, a cube cannot be read, or ``session.json`` names
+            an unknown marker dictionary.
 
     Example:
         >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))
@@ -75,7 +84,7 @@ def inspect_session(session: Session, poses: PoseMethod = "auto", scale_known: b
     suggested = filled_in(session, markers)
     findings = [
         *check_files(session),
-        *check_white(session),
+        *check_white(session, white_source),
         *check_frames(session, looks, markers.detections),
         *check_markers(session, markers),
         upright,

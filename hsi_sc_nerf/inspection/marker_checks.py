@@ -19,7 +19,7 @@ from hsi_sc_nerf.inspection.turn import frame_angles_deg
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 
-FITTED_MARKERS = 8
+FITTED_MARKERS = 5
 """Markers whose corners are fitted; they give their error."""
 EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
 """Smallest side of a marker in px, and the largest error of poses in degrees and mm that simulated sessions with such

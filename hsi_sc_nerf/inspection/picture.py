@@ -54,9 +54,10 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
             )
         for axes, (label, values) in zip(parts[1:], lines.items(), strict=True):
             axes.plot(values, marker=".", color=COLOURS[0])
-            axes.set(ylabel=label, ylim=(0, None))
-        shown = range(0, len(names), max(1, len(names) // 12))
-        parts[-1].set_xticks(list(shown), [names[index] for index in shown], rotation=30, ha="right", fontsize=7)
+            axes.set(ylabel=label, ylim=(0, 1.1 * max(max(values), 1e-9)))
+            shown = range(0, len(names), max(1, len(names) // 12))
+            labels = [names[index] for index in shown] if axes is parts[-1] else []
+            axes.set_xticks(list(shown), labels or [""] * len(shown), rotation=30, ha="right", fontsize=7)
         save_figure(figure, path)
 
 

@@ -23,7 +23,7 @@ FEWEST_QUADS = 6
 
 
 def frame_angles_deg(detections: Sequence[Detections]) -> Float[np.ndarray, "frames"]:
-    """Angle of the table in each frame relative to the first that has one, good to a degree or two.
+    """Angle of the table in each frame relative to the first that has one, good to a few degrees.
 
     Args:
         detections: markers of each frame.

@@ -147,9 +147,10 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            if self._loaded is not None:
-                self._keep_stage_of(self._loaded)
+            was_to_be_kept = self._loaded is not None and self._keep_stage_of(self._loaded)
             left = self.plan.num_iterations - self._start_step
+            if left <= 0 and was_to_be_kept:
+                return
             if left <= 0:
                 raise InputError(
                     f"{self._loaded}: has all {self.plan.num_iterations} iterations; raise --max-num-iterations to "
@@ -250,12 +251,14 @@ class StagedTrainer(Trainer):
         if step == stage.end - 1:
             self._keep(stage)
 
-    def _keep_stage_of(self, loaded: Path) -> None:
-        """Keep the stage that a loaded checkpoint completed, if its run was killed before it did so."""
+    def _keep_stage_of(self, loaded: Path) -> bool:
+        """Keep the stage that a loaded checkpoint completed; False if its run has kept it, or none was completed."""
         stage = self.plan.at(self._start_step - 1)
         kept = loaded.resolve().parents[1] / f"stage-{stage.config.name}" / loaded.name
-        if self._completed == stage.config.name and self._start_step == stage.end and not kept.exists():
-            self._keep(stage)
+        if self._completed != stage.config.name or self._start_step != stage.end or kept.exists():
+            return False
+        self._keep(stage)
+        return True
 
     def _keep(self, stage: Stage) -> None:
         """Keep the last checkpoint of a finished stage, and its metrics of the held-out views."""

@@ -48,12 +48,9 @@ def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, in
 def shared_files(session: Session) -> list[tuple[str, int, int]]:
     """The same of the files that every frame's reflectance depends on.
 
-    These are ``session.json``, the files it names, the tarp, and the first frame's metadata, which give the rotation
-    of all images.
+    These are ``session.json``, the files it names, and the tarp.
     """
-    metadata = session.frames[0].metadata
     paths = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
-    paths.append(None if metadata is None else metadata.path)
     stamps = _stamps(session.path, [path for path in paths if path is not None and path.is_file()])
     return stamps if session.white is None else stamps + capture_files(session, session.white)
 

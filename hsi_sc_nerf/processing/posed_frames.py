@@ -32,21 +32,6 @@ PoseFunction = Callable[..., TurntablePoses]
 """Called like ``poses.pose_methods.find_poses``."""
 
 
-def check_scale(session: Session, info: SessionInfo, camera: KnownCamera | None, method: PoseMethod) -> None:
-    """Refuse a session of which nothing gives the size, unless its poses may do without a scale.
-
-    Raises:
-        InputError: nothing gives the scale.
-    """
-    known = (info.marker_side_m, info.container_diameter_m, info.camera_distance_m, camera)
-    if method in ("auto", "markers") and all(value is None for value in known):
-        raise InputError(
-            f"{session.info_path}: does not give marker_side_m, the side of a marker's black square in metres, "
-            "without which nothing has a size; add it, give --marker-side-m, or take --poses colmap and do without "
-            "a scale."
-        )
-
-
 def pose_frames(
     session: Session,
     images: Sequence[UInt8[np.ndarray, "h w"]],

@@ -22,7 +22,7 @@ from hsi_sc_nerf.calibration.report import (
     write_calibration,
 )
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
-from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session import Session, in_short, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.findings import refuse_red
@@ -42,6 +42,7 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
+from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
@@ -165,7 +166,7 @@ def process_session(
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
-    masks = _write_masks(caches, frames, poses, container, config.masks, output_dir, console)
+    masks = _write_masks(caches, frames, poses, container, config, output_dir, console)
     object_box_m, scene_box_m = _boxes(session, frames, masks, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
@@ -205,11 +206,11 @@ def _checked(session: Session, config: ProcessConfig, console: Console) -> Sessi
     Raises:
         InputError: a finding is red and not accepted.
     """
-    for name, reason in session.damaged.items():
-        console.print(f"Left out: {name} ({reason.split('; ')[0]}).", highlight=False)
+    if session.damaged:
+        console.print(f"Left out: {in_short(session.damaged)}.", highlight=False)
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
-        inspection = inspect_session(session, config.poses, scale_known)
+        inspection = inspect_session(session, config.poses, scale_known, config.calibration.white_source)
     findings = [finding for finding in inspection.findings if finding.name != "damaged"]
     for finding in findings:
         if finding.level == "amber" or finding.name in config.accept:
@@ -262,26 +263,43 @@ def _write_masks(
     frames: Sequence[PackedFrame],
     poses: TurntablePoses,
     container: Container | None,
-    config: MaskConfig,
+    config: ProcessConfig,
     output_dir: Path,
     console: Console,
 ) -> Bool[np.ndarray, "frames h w"]:
-    """Find, write and draw the foreground masks of the posed frames."""
+    """Find, write, draw and check the foreground masks of the posed frames.
+
+    Raises:
+        InputError: a finding is red and not accepted.
+    """
     regions = None
     if container is not None:
         distortion = np.array(poses.distortion, dtype=float)
-        regions = [
-            above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
-            for frame in frames
-        ]
-    masks = foreground_masks([cache.bins for cache in caches], config, regions)
+        regions = np.stack(
+            [
+                above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.masks.overhang)
+                for frame in frames
+            ]
+        )
+    masks = foreground_masks([cache.bins for cache in caches], config.masks, regions)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
-        if not mask.any():
-            _log.warning("%s: nothing of the object was found in this frame (see report/masks.png)", frame.capture)
     images, names = [frame.pseudo_rgb() for frame in frames], [frame.capture for frame in frames]
     mask_picture(output_dir / "report" / "masks.png", images, list(masks), names)
     console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
+    findings = check_masks(
+        masks,
+        names,
+        np.stack([frame.camera_to_world for frame in frames]),
+        poses.intrinsics,
+        np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches]),
+        regions,
+        None if container is None else container.height_m,
+    )
+    for finding in findings:
+        if finding.level == "amber" or finding.name in config.accept:
+            _log.warning("%s: %s", finding.name, finding.sentence)
+    refuse_red(findings, config.accept)
     return masks
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays
-from hsi_sc_nerf.geometry.visual_hull import visual_hull
+from hsi_sc_nerf.geometry.visual_hull import MAX_MISSED_FRACTION, visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import Container
 
@@ -32,9 +32,6 @@ def object_box(
 ) -> Float[np.ndarray, "2 3"]:
     """Minimum and maximum of the masks' visual hull, object frame, metres.
 
-    The hull is computed on a grid of voxels twice: in the cube that the cameras see, then in the bounds found there.
-    Masks are dilated by half a voxel's diagonal, so that parts thinner than a voxel are kept.
-
     Args:
         masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
@@ -49,6 +46,32 @@ def object_box(
         >>> masks = np.stack([frame.mask() for frame in dataset.frames])
         >>> low_m, high_m = object_box(masks, dataset.camera_to_worlds, dataset.intrinsics)
     """
+    hull, step, _ = hull_voxels(masks, camera_to_worlds, intrinsics, min_z_m)
+    if len(hull) == 0:
+        raise InputError(
+            "the foreground masks and the poses do not fit each other, so that no object is left in space; look "
+            "at report/masks.png and report/poses.png."
+        )
+    low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
+    box = np.stack([low - OBJECT_MARGIN_M, high + OBJECT_MARGIN_M])
+    if min_z_m is not None:
+        box[0, 2] = max(box[0, 2], min_z_m)
+    return box
+
+
+def hull_voxels(
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    min_z_m: float | None = None,
+    max_missed_fraction: float = MAX_MISSED_FRACTION,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"], int]:
+    """Voxels of the masks' visual hull: their centres (n may be 0), their sides, and the diameter of one in px.
+
+    The hull is computed on a grid twice: in the cube that the cameras see, then in the bounds found there. Masks are
+    dilated by half a voxel's diagonal, so that parts thinner than a voxel are kept. Arguments are those of
+    `object_box` and of `visual_hull`.
+    """
     # The point that all frames look at.
     (centre,), _ = closest_point_to_rays(camera_to_worlds[:, :3, 3], camera_to_worlds[:, :3, 2])
     distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).min()
@@ -60,20 +83,13 @@ def object_box(
         points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
         if min_z_m is not None:
             points = points[points[:, 2] >= min_z_m - step[2] / 2.0]
-        half_diagonal_px = intrinsics.fl_x * np.linalg.norm(step) / 2.0 / distance
-        size_px = 2 * int(np.ceil(half_diagonal_px)) + 1
+        size_px = 2 * int(np.ceil(intrinsics.fl_x * np.linalg.norm(step) / 2.0 / distance)) + 1
         dilated = np.stack([dilate(mask, size_px) for mask in masks])
-        hull = visual_hull(points, dilated, camera_to_worlds, intrinsics)
+        hull = visual_hull(points, dilated, camera_to_worlds, intrinsics, max_missed_fraction)
         if len(hull) == 0:
-            raise InputError(
-                "the foreground masks and the poses do not fit each other, so that no object is left in space; look "
-                "at report/masks.png and report/poses.png."
-            )
+            break
         low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
-    box = np.stack([low - OBJECT_MARGIN_M, high + OBJECT_MARGIN_M])
-    if min_z_m is not None:
-        box[0, 2] = max(box[0, 2], min_z_m)
-    return box
+    return hull, step, size_px
 
 
 def scene_box(

@@ -15,8 +15,15 @@ from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
-from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section, read_json
+from hsi_sc_nerf.report.dataset_sections import (
+    calibration_section,
+    inspection_section,
+    masks_section,
+    poses_section,
+    read_json,
+)
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
+from hsi_sc_nerf.report.judgements import judge_cloud
 from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
 from hsi_sc_nerf.report.result_sections import comparison_key_figure, comparison_section, traits_section
 from hsi_sc_nerf.report.run_sections import (
@@ -31,6 +38,7 @@ from hsi_sc_nerf.report.view_sections import (
     metric_key_figures,
     spectra_section,
     views_section,
+    white_of,
 )
 
 if TYPE_CHECKING:
@@ -80,12 +88,13 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     run = open_run(folder / "config.yml")
     cloud = _cloud(run, folder, sources)
     views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset
-    scores = [view.scores for view in views]
+    scores, white = [view.scores for view in views], white_of(views)
     sections = [
+        *inspection_section(dataset),
         object_section(cloud, sources.points),
-        views_section(views, held_out),
+        views_section(views, held_out, white),
         bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
-        spectra_section(views[len(views) // 2], dataset.wavelengths_nm),
+        spectra_section(views[len(views) // 2], dataset.wavelengths_nm, white),
         *results,
         training_section(read_scalars(folder), stage_ends(folder)),
         calibration_section(dataset),
@@ -110,7 +119,7 @@ def object_section(cloud: SpectralCloud, points: int) -> Section:
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
         f"which changes reflectance by {spectra.rmse:.1e} (root mean square; at most {spectra.largest_error:.1e})."
     )
-    return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)])
+    return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)], judge_cloud(cloud))
 
 
 def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path:

@@ -15,6 +15,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.charts import Curve, line_chart
+from hsi_sc_nerf.report.judgements import judge_calibration, judge_masks, judge_poses
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
@@ -51,6 +52,23 @@ def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Blo
     return [Folded(summary, [Figure([embedded_file(path, summary)], f"{summary}.")])] if path.is_file() else []
 
 
+def inspection_section(dataset: PackedDataset) -> list[Section]:
+    """What `hsi-sc-nerf inspect` found in the session, as ``report/inspection.json`` of the dataset keeps it.
+
+    Raises:
+        InputError: that file holds no findings.
+    """
+    path = dataset.root / "report" / "inspection.json"
+    content = read_json(path)
+    if content is None:
+        return []
+    try:
+        findings = [Finding(one["name"], one["level"], one["sentence"]) for one in content["findings"]]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: holds no findings ({error}); inspect the session again.") from error
+    return [Section("inspection", "The session", [], findings)]
+
+
 def calibration_section(dataset: PackedDataset) -> Section:
     """Calibration from counts to reflectance, and the uncertainty of reflectance."""
     found = read_json(dataset.root / "calibration.json")
@@ -75,7 +93,8 @@ def calibration_section(dataset: PackedDataset) -> Section:
         ("uncertainty.png", "Uncertainty by reflectance and band"),
     ):
         blocks += _folded_picture(dataset, name, summary)
-    return Section("calibration", "Calibration", blocks)
+    findings = judge_calibration(dataset.flagged_values / _values(dataset), (found or {}).get("lamp_drift") or {})
+    return Section("calibration", "Calibration", blocks, findings)
 
 
 def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Table:
@@ -148,7 +167,7 @@ def masks_section(dataset: PackedDataset) -> Section:
         Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
         *_folded_picture(dataset, "masks.png", "All frames in pseudo-RGB with the outline of the mask in magenta"),
     ]
-    return Section("masks", "Masks", blocks)
+    return Section("masks", "Masks", blocks, judge_masks(areas_px, [frame.capture for frame in dataset.frames]))
 
 
 def poses_section(dataset: PackedDataset) -> Section:
@@ -168,8 +187,7 @@ def poses_section(dataset: PackedDataset) -> Section:
         caption = "Turn of the table since the frame before, degrees, positive counter-clockwise."
         blocks.append(Figure([chart], caption))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
-    warnings = [Finding("poses", "amber", sentence) for sentence in found.get("warnings", ())]
-    return Section("poses", "Poses", blocks, warnings)
+    return Section("poses", "Poses", blocks, judge_poses(found))
 
 
 def _by_frame(values: Float[np.ndarray, "frames"], y_label: str, alt: str) -> Markup:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.evaluation.spectral_metrics import (
@@ -20,7 +20,6 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.packed.pixels import spread_over
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -36,14 +35,14 @@ class HeldOutView:
 
     Attributes:
         scores: of the view.
-        measured_rgb: pseudo-RGB.
+        measured_rgb: reflectance in the bands of pseudo-RGB.
         rendered_rgb: likewise.
         points: spectra around some points of the object.
     """
 
     scores: ViewScores
-    measured_rgb: UInt8[np.ndarray, "h w 3"]
-    rendered_rgb: UInt8[np.ndarray, "h w 3"]
+    measured_rgb: Float[np.ndarray, "h w 3"]
+    rendered_rgb: Float[np.ndarray, "h w 3"]
     points: list[PointSpectra]
 
 
@@ -62,8 +61,8 @@ def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
         radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
         yield HeldOutView(
             score_view(frames[index].capture, rendered, measured, mask, valid),
-            to_8_bit(measured[..., model.rgb_bands].numpy()),
-            to_8_bit(rendered[..., model.rgb_bands].numpy()),
+            measured[..., model.rgb_bands].numpy(),
+            rendered[..., model.rgb_bands].numpy(),
             point_spectra(
                 measured.masked_fill(~valid, torch.nan).numpy(),
                 rendered.numpy(),

@@ -25,7 +25,7 @@ WIDEST_PX = 1600
 """Wider pictures are downscaled to this."""
 _QUALITY = 82
 # Levels of findings as words, because colour alone does not tell everybody.
-_WORDS = {"green": "Good:", "amber": "Look at:", "red": "Wrong:"}
+_WORDS = {"green": "Good:", "amber": "Check:", "red": "Problem:"}
 
 
 @dataclass(frozen=True)

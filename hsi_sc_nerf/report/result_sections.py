@@ -11,6 +11,7 @@ import numpy as np
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.report.charts import Curve, line_chart
+from hsi_sc_nerf.report.judgements import judge_comparison, judge_traits
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _MM_PER_M = 1000.0
@@ -43,7 +44,7 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Se
     if picture.is_file():
         alt = "The cloud and the reference, coloured by the distance to the other"
         blocks.append(Folded("Where the distances are", [Figure([embedded_file(picture, alt)], f"{alt}.")]))
-    return Section("comparison", title, blocks)
+    return Section("comparison", title, blocks, judge_comparison(comparison))
 
 
 def comparison_key_figure(comparison: Mapping[str, Any]) -> dict[str, str]:
@@ -99,9 +100,8 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path) -> Section:
         command = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
         return Section("traits", "Traits", [Missing("The object's traits were not measured.", command)])
     try:
-        tables = trait_tables(traits)
+        tables, findings = trait_tables(traits), judge_traits(traits)
     except _WRONG_CONTENT as error:
         raise InputError(f"{source}: holds no traits ({error}); make it again with `hsi-sc-nerf traits`.") from error
-    return Section(
-        "traits", "Traits", [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
-    )
+    blocks = [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
+    return Section("traits", "Traits", blocks, findings)

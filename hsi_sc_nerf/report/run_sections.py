@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.report.charts import Curve, line_chart
+from hsi_sc_nerf.report.judgements import judge_training
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
@@ -73,7 +74,10 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
         "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage "
         "most training rays are the object's: its loss and PSNR do not compare with those of whole frames."
     )
-    return Section("training", "Training", [Figure(charts, caption, titles, columns=2)])
+    steps, psnr_db = scalars.get("Train Metrics Dict/psnr", (np.zeros(0), np.zeros(0)))
+    last_stage_from = ([0.0, 0.0, *marks.values()])[-2] if marks else 0.0
+    findings = judge_training(psnr_db[steps >= last_stage_from])
+    return Section("training", "Training", [Figure(charts, caption, titles, columns=2)], findings)
 
 
 def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:

@@ -19,6 +19,7 @@ from hsi_sc_nerf.report.held_out_views import (
     object_angles,
     spread_of_views,
 )
+from hsi_sc_nerf.report.judgements import judge_bands, judge_spectra, judge_views
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
@@ -53,12 +54,13 @@ def _over_views(views: Sequence[ViewScores], metric: str) -> tuple[str, str]:
     return f"{mean} ± {sd}", f"{low} to {high}"
 
 
-def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
+def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> Section:
     """Measured and rendered views, and maps of their differences.
 
     Args:
         views: those that were rendered.
         held_out: how many were held out.
+        white: reflectance in full brightness of the pictures (`white_of`).
     """
     number = f"all {held_out}" if held_out == len(views) else f"{len(views)} of the {held_out}"
     blocks: list[Block] = [
@@ -66,7 +68,8 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
         _metrics_table([view.scores for view in views]),
         f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
         f"(light), the error, root mean square over bands, from {ERROR_DRAWN[0]:g} (dark) to "
-        f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object.",
+        f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object. All pseudo-RGB pictures have "
+        f"one scale, at whose full brightness reflectance is {white:.2f}.",
     ]
     for index in spread_of_views(len(views), PICTURED_VIEWS):
         view = views[index]
@@ -77,8 +80,8 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
             (view.scores.error, ERROR_DRAWN, _ERROR_COLOURS, "Map of the error"),
         )
         pictures = [
-            embedded_array(view.measured_rgb[crop], f"{view.scores.name} as measured, pseudo-RGB"),
-            embedded_array(view.rendered_rgb[crop], f"{view.scores.name} as rendered, pseudo-RGB"),
+            embedded_array(to_8_bit(rgb[crop] / white), f"{view.scores.name} as {how}, pseudo-RGB")
+            for rgb, how in ((view.measured_rgb, "measured"), (view.rendered_rgb, "rendered"))
         ]
         for values, drawn, colours, label in maps:
             shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
@@ -87,7 +90,14 @@ def views_section(views: Sequence[HeldOutView], held_out: int) -> Section:
         metrics = view.scores.metrics
         caption = f"{view.scores.name}: SAM {metrics['sam']:.4f} rad, RMSE {metrics['rmse']:.4f}."
         blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
-    return Section("views", "Held-out views", blocks)
+    return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
+
+
+def white_of(views: Sequence[HeldOutView]) -> float:
+    """Reflectance in full brightness of all pictures: that of the brightest per cent of the measured object."""
+    values = np.concatenate([view.measured_rgb[view.scores.mask].ravel() for view in views])
+    finite = values[np.isfinite(values)]
+    return max(float(np.percentile(finite, 99.0)), 0.05) if len(finite) else 1.0
 
 
 def crop_around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
@@ -157,14 +167,18 @@ def bands_section(
             f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
         )
     figure = Figure(list(charts.values()), caption, list(charts), columns=2)
-    return Section("bands", "Accuracy by band and pixel", [figure])
+    findings = judge_bands(rmse[0].y, wavelengths_nm)
+    return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
 
-def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"]) -> Section:
-    """Measured and rendered spectra around some points of one view, with how much they vary there."""
-    picture = embedded_array(_marked(view), f"{view.scores.name} with the points marked")
-    charts = {}
-    for letter, point in zip(ascii_uppercase, view.points, strict=False):
+def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], white: float) -> Section:
+    """Measured and rendered spectra around some points of one view, with how much they vary there.
+
+    ``white`` is the reflectance in full brightness of the picture.
+    """
+    picture = embedded_array(_marked(view, white), f"{view.scores.name} with the points marked")
+    points, charts = dict(zip(ascii_uppercase, view.points, strict=False)), {}
+    for letter, point in points.items():
         where = f"line {point.line}, sample {point.sample}"
         charts[f"{letter}: {where}, {point.pixels} pixels"] = line_chart(
             [
@@ -181,13 +195,14 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
         "around the point, that is noise and texture together. Dashed: rendered, mean over the same pixels."
     )
     marked = Figure([picture], f"Points in {view.scores.name}, as measured.")
-    return Section("spectra", "Spectra", [marked, Figure(list(charts.values()), caption, list(charts), columns=2)])
+    blocks = [marked, Figure(list(charts.values()), caption, list(charts), columns=2)]
+    return Section("spectra", "Spectra", blocks, judge_spectra(points))
 
 
-def _marked(view: HeldOutView) -> UInt8[np.ndarray, "h w 3"]:
+def _marked(view: HeldOutView, white: float) -> UInt8[np.ndarray, "h w 3"]:
     """The measured picture round the object, enlarged, with a lettered ring at each point."""
     lines, samples = crop_around(view.scores.mask)
-    crop = np.ascontiguousarray(view.measured_rgb[lines, samples])
+    crop = to_8_bit(np.ascontiguousarray(view.measured_rgb[lines, samples]) / white)
     scale = max(1, round(_MARKED_PX / crop.shape[0]))
     image = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     first_line, first_sample = lines.start or 0, samples.start or 0

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 Outputs = dict[str, Tensor]
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
+# How far behind the first training camera a browser starts, as a fraction of the camera's distance to the object.
+_START_BEHIND = 0.1
 
 
 def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
@@ -72,6 +74,8 @@ def attach_spectral_panel(pipeline: Pipeline) -> SpectralPanel:
 class BrowserControl(ViewerControl):
     """nerfstudio's access to the viewer, which also reports every browser that opens it.
 
+    The training cameras are hidden when their scene is made: their pictures would cover the object and catch clicks.
+
     Args:
         opened: called with the browser, whose initial camera is inside the object.
     """
@@ -82,6 +86,14 @@ class BrowserControl(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
         viewer.viser_server.on_client_connect(self._opened)
+        show_scene = viewer.init_scene
+
+        def show_scene_without_cameras(*args: Any, **options: Any) -> None:
+            show_scene(*args, **options)
+            viewer.set_camera_visibility(False)
+            viewer.toggle_cameravis_button()
+
+        viewer.init_scene = show_scene_without_cameras  # type: ignore[method-assign]
 
 
 class SpectralPanel(torch.nn.Module):
@@ -125,7 +137,7 @@ class SpectralPanel(torch.nn.Module):
             hint="A click shows the spectrum of a point; while this is on, the mouse does not move the camera",
         )
         self.spectrum = ViewerMarkdown()
-        self.control = BrowserControl(lambda client: self._move_to(client, 0))
+        self.control = BrowserControl(lambda client: self._move_to(client, 0, _START_BEHIND))
 
     def render(self, camera: Cameras, render: Callable[[Cameras], Outputs]) -> Outputs:
         """Render a camera; for the viewer's camera, replace the spectra by the images that the controls select.
@@ -162,7 +174,24 @@ class SpectralPanel(torch.nn.Module):
         return pictures | outputs
 
     def show_spectrum(self, click: ViewerClick) -> None:
-        """Show the rendered spectrum at a click and, at a training view, the measured one."""
+        """Show the rendered spectrum at a click and, at a training view, the measured one; mark the point."""
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        viewer = self._viewer()
+        assert viewer is not None
+        point, curves, title, notes = self.spectrum_at(click)
+        plot = spectra_plot(self.wavelengths_nm, curves, title)
+        self.spectrum.show(f"{inline_image(plot, 'spectrum of the point')}\n\n{title}, {notes}")
+        viewer.viser_server.scene.add_icosphere(
+            "/picked_point",
+            radius=_POINT_RADIUS * VISER_NERFSTUDIO_SCALE_RATIO,
+            color=_POINT_RGB,
+            position=point.position.double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
+        )
+
+    def spectrum_at(self, click: ViewerClick) -> tuple[PickedPoint, dict[str, Float[np.ndarray, "bands"]], str, str]:
+        """The point under a click, its spectra by name (rendered, and measured at a training view), and two texts:
+        where it is, and how far it can be trusted."""
         viewer = self._viewer()
         assert viewer is not None
         views = _training_views(viewer)
@@ -171,19 +200,17 @@ class SpectralPanel(torch.nn.Module):
         metadata = {} if view is None else views.metadata(view, "cpu")
         with viewer.train_lock or contextlib.nullcontext():
             point = pick(viewer.get_model(), origin, direction, metadata)  # type: ignore[arg-type]
-        curves, notes = {"rendered": point.spectrum.numpy()}, [f"opacity {point.opacity:.2f}"]
+        curves, notes = {"rendered": point.spectrum.numpy()}, f"opacity {point.opacity:.2f}"
         if view is not None:
             measured, valid, seen = views.measured(view, direction[None])
             if seen.item():
                 curves["measured"] = np.where(valid[0], measured[0], np.nan)
                 angle = float(spectral_angle_map(point.spectrum[None, None], measured[None], valid[None]))
-                notes.append(f"spectral angle {angle:.3f} rad to {views.dataset.frames[view].capture}")
-        scale, transform = _object_frame(viewer)
-        millimetres = (point.position / scale - transform[:, 3]) * 1000.0
-        title = "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist())
-        plot = spectra_plot(self.wavelengths_nm, curves, title)
-        self.spectrum.show(f"{inline_image(plot, 'spectrum of the point')}\n\n{title}, {', '.join(notes)}")
-        self._mark(viewer, point)
+                notes += f", spectral angle {angle:.3f} rad to {views.dataset.frames[view].capture}"
+        # From the scene to metres in the object frame.
+        parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
+        millimetres = (point.position / parsed.dataparser_scale - parsed.dataparser_transform[:, 3]) * 1000.0
+        return point, curves, "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist()), notes
 
     def _viewer(self) -> Viewer | None:
         """The attached viewer; None without one."""
@@ -229,18 +256,24 @@ class SpectralPanel(torch.nn.Module):
         for client in viewer.viser_server.get_clients().values():
             self._move_to(client, view)
 
-    def _move_to(self, client: ClientHandle, view: int) -> None:
-        """Move a browser's camera to a training view, with the object as its centre of rotation."""
+    def _move_to(self, client: ClientHandle, view: int, behind: float = 0.0) -> None:
+        """Move a browser's camera to a training view, with the object as its centre of rotation.
+
+        Args:
+            client: the browser.
+            view: index of the view.
+            behind: how far behind the view's camera, as a fraction of its distance to the object.
+        """
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
         viewer = self._viewer()
         assert viewer is not None
         views = _training_views(viewer)
         rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
-        position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
         ahead = rotation.as_matrix()[:, 2] * views.distance(view) * VISER_NERFSTUDIO_SCALE_RATIO
+        position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
         with client.atomic():
-            client.camera.position = position
+            client.camera.position = position - behind * ahead
             client.camera.look_at = position + ahead
             client.camera.wxyz = rotation.wxyz
             client.camera.fov = views.vertical_fov(view, client.camera.aspect)
@@ -251,25 +284,9 @@ class SpectralPanel(torch.nn.Module):
         else:
             self.control.unregister_pointer_cb()
 
-    def _mark(self, viewer: Viewer, point: PickedPoint) -> None:
-        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
-
-        viewer.viser_server.scene.add_icosphere(
-            "/picked_point",
-            radius=_POINT_RADIUS * VISER_NERFSTUDIO_SCALE_RATIO,
-            color=_POINT_RGB,
-            position=point.position.double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
-        )
-
 
 def _training_views(viewer: Viewer) -> TrainingViews:
     return TrainingViews(cast(SpectralDataset, viewer.pipeline.datamanager.train_dataset))
-
-
-def _object_frame(viewer: Viewer) -> tuple[float, Float[Tensor, "3 4"]]:
-    """Scale and transform from metres in the object frame to the scene."""
-    parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
-    return parsed.dataparser_scale, parsed.dataparser_transform
 
 
 @dataclass(frozen=True, eq=False)

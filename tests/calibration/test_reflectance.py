@@ -130,16 +130,6 @@ def test_data_types(rng, plain, dtype, interleave):
     check(counts, replace(plain, gain=plain.gain * 24, saturation_counts=240.0, ignore_value=7.0))
 
 
-def test_detector_with_columns_and_an_uneven_illumination(rng, plain):
-    columns = replace(
-        plain,
-        dark=rng.uniform(90.0, 110.0, (SAMPLES, BANDS)),
-        gain=rng.uniform(0.9, 1.1, (SAMPLES, BANDS)) / 3600,
-        flat=rng.uniform(0.7, 1.2, (LINES, SAMPLES)),
-    )
-    check(make_counts(rng), columns)
-
-
 @pytest.mark.parametrize("bands", [[2, 3, 4, 5, 6, 7], [0, 1, 3, 4, 8, 9], [0, 1, 2, 3, 4, 5]])
 def test_bands_that_are_left_out_need_no_calibration(rng, plain, bands):
     left_out = np.setdiff1d(np.arange(BANDS), bands)
@@ -183,13 +173,6 @@ def test_finished_reflectance(rng):
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.05, 0.8), (-0.2, 5.0)])
 def test_bounds(rng, plain, bounds):
     check(make_counts(rng, high=8000), replace(plain, bounds=bounds))
-
-
-def test_more_lines_than_a_byte_counts(rng, plain):
-    counts = make_counts(rng, lines=600)
-    counts[:, 0] = 0
-    result = check(counts, replace(plain, saturation_counts=4000.0))
-    assert result.pixel_counts.clipped_low.min() >= 600
 
 
 def test_calibration_that_is_not_finite(rng, plain):

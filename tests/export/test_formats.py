@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,13 @@ COUNT = 50
 def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
     written = random_cloud(COUNT)
-    path = write_cloud(tmp_path / "cloud", stream(written, 7), "las")
+    path = write_cloud(tmp_path / "cloud", replace(stream(written, 7), run="pear/hsi-sc-nerf/now"), "las")
     read = laspy.read(path)
     assert path.name == "cloud.las"
+    (text,) = (vlr.record_data.decode().splitlines() for vlr in read.header.vlrs if vlr.record_id == 3)
+    assert "run: pear/hsi-sc-nerf/now" in text
+    assert any(line.startswith("views [1]: ") for line in text)
+    assert read.header.generating_software.startswith("hsi-sc-nerf")
     np.testing.assert_allclose(read.xyz, written.points, atol=1e-6)
     np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], 1) // 257, written.colours)
     for band, name in enumerate(BAND_NAMES):
@@ -43,13 +48,22 @@ def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, fil
     pytest.importorskip({"netcdf": "h5netcdf", "zarr": "zarr"}[file_format])
     written = random_cloud(COUNT)
     for _ in range(2):  # the second replaces the first
-        path = write_cloud(tmp_path / "cloud", stream(written, 7), file_format)
+        path = write_cloud(tmp_path / "cloud", replace(stream(written, 7), run="pear/hsi-sc-nerf/now"), file_format)
     assert [file.name for file in tmp_path.iterdir()] == [name]
     options = {"engine": "h5netcdf"} if file_format == "netcdf" else {"engine": "zarr", "consolidated": False}
     with xarray.open_dataset(path, **options) as table:
         assert dict(table.sizes) == {"point": COUNT, "wavelength": 4}
         np.testing.assert_array_equal(table.wavelength, WAVELENGTHS_NM)
         assert table.wavelength.attrs["units"] == "nm"
+        assert table.attrs["Conventions"].startswith("CF-")
+        assert table.attrs["run"] == "pear/hsi-sc-nerf/now"
+        assert table.attrs["comment"].startswith("object frame")
+        attributes = {name: variable.attrs for name, variable in table.variables.items()}
+        units = {name: (found["units"], found["long_name"] != "") for name, found in attributes.items()}
+        assert units == dict.fromkeys(table.variables, ("1", True)) | {
+            "wavelength": ("nm", True),
+            **dict.fromkeys("xyz", ("m", True)),
+        }
         assert {"x", "y", "z", "wavelength"} <= set(table.coords)
         nearest = table.reflectance.sel(wavelength=640.0, method="nearest")
         np.testing.assert_array_equal(nearest, written.spectra[:, 2])

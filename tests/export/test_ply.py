@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from plyfile import PlyData
 from random_cloud import BAND_NAMES, assert_equal, random_cloud
 
+from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_spectral_ply
@@ -25,7 +27,8 @@ def test_the_header_is_what_cloudcompare_expects(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
     write_spectral_ply(path, random_cloud())
     header = path.read_bytes().split(b"end_header\n")[0].decode()
-    assert header.splitlines() == [
+    lines = [line for line in header.splitlines() if not line.startswith("comment ")]
+    assert lines == [
         "ply",
         "format binary_little_endian 1.0",
         "element vertex 50",
@@ -35,6 +38,19 @@ def test_the_header_is_what_cloudcompare_expects(tmp_path: Path) -> None:
         *(f"property float {name}" for name in ("opacity", "views")),
     ]
     assert path.stat().st_size == len(header) + len("end_header\n") + 50 * (6 * 4 + 3 + 6 * 4)
+
+
+def test_comments_state_frame_run_and_the_unit_of_every_column(tmp_path: Path) -> None:
+    path, given = tmp_path / "cloud.ply", stream(random_cloud())
+    write_spectral_ply(path, replace(given, run="b\u00e4r/hsi-sc-nerf/now\nend_header"))
+    comments = PlyData.read(str(path)).comments
+    assert f"source: hsi-sc-nerf {__version__}" in comments
+    assert "run: b\\xe4r/hsi-sc-nerf/now end_header" in comments
+    assert any(line.startswith("comment: object frame: z points up") for line in comments)
+    described = {name: line for line in comments for name in line.split(" [")[0].split()}
+    for name in ("x", "nz", "blue", "opacity", "views", "bands"):
+        assert " [m]: " in described[name] if name == "x" else " [1]: " in described[name]
+    assert_equal(read_spectral_ply(path), random_cloud())
 
 
 def test_open3d_reads_it_and_its_copy_reads_back(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def sample(run, monkeypatch):
     monkeypatch.setattr(trained_run, "open_run", lambda _: run)
 
     def sample(path, **options):
-        SampleCommand(path, load_config=None, **options).main()
+        SampleCommand(path, load_config=Path("runs/ball/now/config.yml"), **options).main()
         return path.with_name(f"{path.stem}-spectral.ply")
 
     return sample
@@ -89,6 +89,9 @@ def test_a_ball_gives_its_spectrum_where_cameras_see_it(tmp_path, sample, capsys
         np.testing.assert_array_equal(after["vertex"][name], given["vertex"][name])
     assert [list(f) for f in after["face"]["vertex_indices"]] == [list(f) for f in given["face"]["vertex_indices"]]
     np.testing.assert_allclose(cloud.wavelengths_nm, factory.WAVELENGTHS_NM, atol=0.01)
+    assert "run: runs/ball/now" in after.comments
+    assert any(line.startswith("sampled_std [1]: ") for line in after.comments)
+    assert not any("position" in line for line in after.comments)  # in the file's own unit
     np.testing.assert_allclose((cloud.normals * radial).sum(axis=1), 1.0, atol=1e-3)
 
     poses = np.stack([factory.true_pose(ball_run.ANGLES_DEG[frame]) for frame in split_frames(10, 0.9)[0]])

@@ -109,11 +109,7 @@ def test_killed_while_a_stage_is_evaluated(tiny_dataset, tmp_path, monkeypatch, 
 
     options = {"load_dir": made.checkpoint_dir, "max_num_iterations": SWITCH + 1, "evaluate_stages": True}
     resumed = longer(tiny_dataset, tmp_path / "resumed", **options)
-    if stage == "full-frame":
-        resumed.train()
-    else:
-        with pytest.raises(SystemExit, match="has all 9 iterations"):
-            resumed.train()
+    resumed.train()
     for name in {stage, "masked"}:
         assert {path.suffix for path in (resumed.base_dir / f"stage-{name}").iterdir()} == {".ckpt", ".json"}
 

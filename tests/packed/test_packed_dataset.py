@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from spectral import get_rgb
 from spectral.io import envi as spy
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -149,6 +151,19 @@ def test_cubes_open_in_spy_as_reflectance(dataset):
 def test_widths_of_the_bands_are_in_the_header(tmp_path):
     write_packed_cube(tmp_path / "c.hdr", pack(np.ones((2, 2, 3))), WAVELENGTHS_NM, np.array([7.0, 7.125, 8.0]))
     assert spy.open(str(tmp_path / "c.hdr")).bands.bandwidths == [7.0, 7.125, 8.0]
+
+
+def test_spy_shows_a_red_thing_red(tmp_path):
+    wavelengths_nm = np.arange(400.0, 1000.0, 5.0)
+    red = np.where(wavelengths_nm > 580.0, 0.9, 0.1)
+    write_packed_cube(tmp_path / "c.hdr", pack(np.tile(red, (4, 4, 1))), wavelengths_nm)
+    cube = spy.open(str(tmp_path / "c.hdr"))
+    shown_nm = [wavelengths_nm[int(band) - 1] for band in cube.metadata["default bands"]]
+    np.testing.assert_allclose(shown_nm, paper.PSEUDO_RGB_NM, atol=2.5)
+    # SPy counts from 0, and takes the header's default bands.
+    np.testing.assert_allclose(get_rgb(cube, stretch_all=False, bounds=(0.0, 1.0))[0, 0], [0.9, 0.1, 0.1], atol=1e-4)
+    write_packed_cube(tmp_path / "swir.hdr", pack(np.ones((4, 4, 3))), np.array([1000.0, 1300.0, 1600.0]))
+    assert "default bands" not in spy.open(str(tmp_path / "swir.hdr")).metadata
 
 
 def test_packing_clips_and_flags(tmp_path):

@@ -2,7 +2,9 @@
 
 import json
 import re
+from contextlib import contextmanager
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import ball_run
 import capture_factory as factory
@@ -15,14 +17,20 @@ from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report.build import ReportSources, write_report
-from hsi_sc_nerf.report.dataset_sections import calibration_section, masks_section, poses_section
+from hsi_sc_nerf.report.dataset_sections import (
+    calibration_section,
+    inspection_section,
+    masks_section,
+    poses_section,
+)
 from hsi_sc_nerf.report.page import html_page
 from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
-SECTIONS = ["object", "views", "bands", "spectra", "comparison", "traits", "training"]
+SECTIONS = ["inspection", "object", "views", "bands", "spectra", "comparison", "traits", "training"]
 SECTIONS += ["calibration", "masks", "poses", "settings"]
 COMPARISON = {
     "scores": {
@@ -42,9 +50,10 @@ TRAITS = trait_content(
 
 
 def ball(wavelengths_nm, count=4000):
-    """A ball whose northern half has twice the reflectance of its southern."""
-    normals = np.random.default_rng(0).normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    """A ball of evenly spread points whose northern half has twice the reflectance of its southern."""
+    z, azimuth = 1.0 - 2.0 * (np.arange(count) + 0.5) / count, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    wide = np.sqrt(1.0 - z**2)
+    normals = np.stack([wide * np.cos(azimuth), wide * np.sin(azimuth), z], axis=-1)
     shape = np.linspace(0.2, 0.4, len(wavelengths_nm))
     spectra = np.where(normals[:, 2:] > 0, 2.0, 1.0) * shape
     colours = np.full((count, 3), 128, np.uint8)
@@ -58,6 +67,8 @@ def run(tmp_path_factory):
     data = ball_run.write_ball_dataset(folder / "data")
     transforms = (data / "transforms.json").read_text()
     (data / "transforms.json").write_text(transforms.replace('"ball"', json.dumps(HOSTILE)))
+    finding = {"name": "white", "level": "amber", "sentence": HOSTILE, "values": {}}
+    write_json(data / "report" / "inspection.json", {"findings": [finding]})
     run = ball_run.write_untrained_run(data, folder / "runs").parent
     write_spectral_ply(run / "point_cloud.ply", ball(factory.WAVELENGTHS_NM))
     (run / "comparison.json").write_text(json.dumps(COMPARISON))
@@ -102,9 +113,9 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report):
     assert set(addresses) <= {"http://www.w3.org/2000/svg"}  # a name, which nothing fetches
 
     assert "<img src=x" not in text
-    assert text.count("{{ 7 * 7 }}") > 3
+    assert text.count("{{ 7 * 7 }}") > 5
     assert len(page.all("script")) == 2
-    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229.0 ± 1.0", "250.0 ± 2.0", "cm²", "mL"):
+    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229 ± 1", "250 ± 2", "cm²", "mL"):
         assert shown in text
     assert "run <code>ns-train" in text  # it has no log
     assert not list(report.parent.glob(".*")) + list(report.parent.glob("*.tmp"))
@@ -122,6 +133,10 @@ def test_sections_on_a_processed_session(flagged_dataset):
 
 
 def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, tmp_path):
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "inspection.json").write_text('{"findings": ["white"]}')
+    with pytest.raises(InputError, match=r"inspection\.json: holds no findings"):
+        inspection_section(SimpleNamespace(root=tmp_path))
     with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
@@ -139,14 +154,13 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     assert not (tmp_path / "report.html").exists()
 
 
-@pytest.mark.slow
-@needs_browser
-def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
-    """No message in the console, colours that follow from the numbers, the spectrum of the point under a click."""
+@contextmanager
+def opened(report, **window):
+    """The report in a browser, and what its console said."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     with sync_api.sync_playwright() as playwright:
         browser = launch(playwright)
-        page = browser.new_page(viewport={"width": 700, "height": 600}, reduced_motion="reduce")
+        page = browser.new_page(reduced_motion="reduce", **window)
         page.set_default_timeout(120_000)
         messages, requests = [], []
         page.on("console", lambda message: messages.append(message.text))
@@ -154,6 +168,22 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
         page.on("request", lambda request: requests.append(request.url))
         page.goto(report.as_uri())
         assert page.locator("#cloud").get_attribute("data-state") == "ready"
+        yield page
+        assert messages == []
+        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
+        browser.close()
+
+
+def picked_mm(page):
+    """Position of the last picked point."""
+    return np.array(re.findall(r"-?[\d.]+", page.locator(".picked li").last.inner_text()), float)
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
+    """Colours that follow from the numbers, the spectrum of the point under a click."""
+    with opened(report, viewport={"width": 700, "height": 600}) as page:
         canvas = page.locator("#cloud canvas")
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")
@@ -177,16 +207,55 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
         click(0.5, 0.65)
         click(0.02, 0.02)
         assert page.locator(".picked li").count() == 1
-        point_mm = [float(word) for word in re.findall(r"-?[\d.]+", page.locator(".picked li").inner_text())]
-        assert np.linalg.norm(point_mm) == pytest.approx(30.0, abs=0.2)
-        assert point_mm[2] < 0.0
+        assert page.locator(".missed").is_visible()
+        assert np.linalg.norm(picked_mm(page)) == pytest.approx(30.0, abs=0.2)
+        assert picked_mm(page)[2] < 0.0
+        style = page.locator(".picked .line").evaluate(
+            "line => [getComputedStyle(line)].map((s) => [s.stroke, s.fill])[0]"
+        )
+        assert style == ["rgb(0, 114, 178)", "none"]
         with page.expect_download() as download:
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)
         np.testing.assert_allclose(saved[:, 1], np.linspace(0.2, 0.4, len(saved)), atol=2e-3)
-        before = canvas.screenshot()
-        canvas.press("ArrowUp")
-        assert canvas.screenshot() != before
-        assert messages == []
-        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
-        browser.close()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_spectrum_is_picked_by_keyboard(report):
+    """The page is entered by tabulator; the cross shows where; arrows move what is under it."""
+    with opened(report, viewport={"width": 1280, "height": 900}) as page:
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.tagName") == "CANVAS":
+                break
+        assert page.locator(".cross").is_visible()
+        page.keyboard.press("Enter")
+        front = picked_mm(page)
+        for _ in range(8):
+            page.keyboard.press("ArrowUp")
+        page.keyboard.press("Enter")
+        above = picked_mm(page)
+        assert above[2] > front[2] + 10.0
+        for _ in range(16):
+            page.keyboard.press("Shift+ArrowRight")
+        page.keyboard.press("Enter")
+        assert page.locator(".picked li").count() == 2
+        assert page.locator(".missed").is_visible()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(report):
+    with opened(report, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
+        size = "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
+        assert page.locator("section > .card[open]").count() == 1
+        width, height = page.evaluate(size)
+        assert width == 390
+        assert height < 5000
+        page.evaluate("for (const one of document.querySelectorAll('details')) one.open = true")
+        assert page.evaluate(size)[0] == 390
+        names = page.locator("tbody th").evaluate_all("all => all.map((one) => one.clientWidth)")
+        assert min(names) >= 80
+        reach = "all => all.map((one) => one.getBoundingClientRect().right)"
+        assert max(page.locator("main :is(p, li, img, svg, canvas, .wide)").evaluate_all(reach)) <= 391

@@ -49,7 +49,6 @@ def test_folder_is_as_the_instrument_leaves_it(small_session):
     assert cube.dtype == np.uint16
     metadata = read_metadata(small_session / "apple_001" / "metadata" / "apple_001.xml")
     assert metadata.integration_time_ms == cube.integration_time_ms == 10.0
-    assert not metadata.is_specim_iq
     assert json.loads((small_session / "session.json").read_text()) == {
         "object": "apple",
         "nominal_step_deg": 120.0,

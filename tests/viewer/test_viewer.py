@@ -133,6 +133,10 @@ def attached(pipeline):
         train_lock=None,
         get_model=lambda: model,
         control_panel=SimpleNamespace(output_render="spectral_angle", split=False),
+        calls=(calls := []),
+        init_scene=lambda dataset, train_state: calls.append((dataset, train_state)),
+        set_camera_visibility=lambda visible: calls.append("cameras shown" if visible else "cameras hidden"),
+        toggle_cameravis_button=lambda: calls.append("button switched"),
     )
     found = [path for path, _ in parse_object(panel, ViewerElement, "panel")]
     names = ("band", "composite", "index", "legend", "measured_view", "picking", "spectrum")
@@ -161,28 +165,18 @@ def rendered_as(spectral):
 @pytest.mark.slow
 def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
     panel, server, _ = attached
-    frame = pipeline.datamanager.train_dataset.cameras[2:3]
     spectral = np.full((4, 4, 12), 0.5, np.float32)
-    assert set(panel.render(frame, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
     panel.measured_view.cb_hook(SimpleNamespace(value=1))
-    alone = SpectralPanel(panel.wavelengths_nm, 9)
-    assert set(alone.render(server.moved_camera(), rendered_as(spectral))) == {"rgb", "spectral", "depth"}
-    assert not list(panel.parameters())
-    assert not panel.state_dict()
-
-
-@pytest.mark.slow
-def test_an_attached_panel_is_found_by_the_viewer_and_keeps_checkpoints(pipeline):
+    camera, frame = server.moved_camera(), pipeline.datamanager.train_dataset.cameras[2:3]
+    assert set(panel.render(frame, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
     before = pipeline.state_dict().keys()
-    panel = attach_spectral_panel(pipeline)
+    alone = attach_spectral_panel(pipeline)
+    assert set(alone.render(camera, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
     found = [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements")]
     assert "Custom Elements/spectral_panel/band" in found
-    assert pipeline.state_dict().keys() == before
-    # Without a viewer the model renders as before.
-    frame = pipeline.datamanager.train_dataset.cameras[2:3]
+    assert pipeline.state_dict().keys() == before  # checkpoints stay as they are
     frame.rescale_output_resolution(0.1)
     assert "spectral" in pipeline.model.get_outputs_for_camera(frame)
-    assert panel.wavelengths_nm is pipeline.model.wavelengths_nm
 
 
 def test_a_viewer_gets_pictures_of_one_or_three_channels(attached, pipeline):
@@ -258,18 +252,24 @@ def test_the_camera_stands_where_a_view_was_taken_and_sees_all_of_it(attached, p
     assert half * aspect == pytest.approx(float(frame.width / 2 / frame.fx))
 
 
-def test_a_browser_that_opens_stands_at_the_first_view_and_turns_around_the_object(attached, pipeline):
-    _, server, _ = attached
+def test_a_browser_opens_behind_the_first_camera_and_turns_around_the_object(attached, pipeline):
+    _, server, viewer = attached
     (opened,) = server.opened
     opened(server.client)
     frame = pipeline.datamanager.train_dataset.cameras[0]
-    np.testing.assert_allclose(server.moved_camera().camera_to_worlds[0], frame.camera_to_worlds, atol=1e-5)
-    ahead = torch.from_numpy((server.camera.look_at - server.camera.position) / 10.0).float()
-    torch.testing.assert_close(ahead / ahead.norm(), -frame.camera_to_worlds[:, 2], rtol=0, atol=1e-5)
+    camera = server.moved_camera()
+    torch.testing.assert_close(
+        camera.camera_to_worlds[0, :, :3].float(), frame.camera_to_worlds[:, :3], rtol=0, atol=1e-5
+    )
+    behind = camera.camera_to_worlds[0, :, 3].float() - frame.camera_to_worlds[:, 3]
+    torch.testing.assert_close(behind / behind.norm(), frame.camera_to_worlds[:, 2], rtol=0, atol=1e-4)
+    assert FRAME_INDEX not in (camera.metadata or {})
+    # The centre of rotation is the nearest point of the optical axis to the object's middle.
     middle = pipeline.datamanager.train_dataset.metadata["object_box"].mean(0)
-    looked_at = frame.camera_to_worlds[:, 3] + ahead
-    # The nearest point of the optical axis.
-    assert (middle - looked_at) @ ahead == pytest.approx(0.0, abs=1e-4)
+    looked_at = torch.from_numpy(server.camera.look_at / 10.0).float()
+    assert (middle - looked_at) @ frame.camera_to_worlds[:, 2] == pytest.approx(0.0, abs=1e-4)
+    viewer.init_scene("dataset", train_state="completed")
+    assert viewer.calls == [("dataset", "completed"), "cameras hidden", "button switched"]
 
 
 def test_the_angle_is_zero_for_the_measured_view_and_blank_elsewhere(attached, pipeline):
@@ -304,7 +304,7 @@ def test_the_angle_is_zero_for_the_measured_view_and_blank_elsewhere(attached, p
     assert FRAME_INDEX not in moved.metadata
 
 
-def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline, monkeypatch):
+def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline):
     panel, server, _ = attached
     panel.spectrum.install(server)
     view, line, sample = 2, 60, 50
@@ -316,13 +316,10 @@ def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline, monkeypatch
     frame = dataset.cameras[view : view + 1]
     coords = torch.tensor([line + 0.5, sample + 0.5])
     ray = frame.generate_rays(camera_indices=0, coords=coords)
-    drawn = {}
-    monkeypatch.setattr(
-        "hsi_sc_nerf.viewer.panel.spectra_plot",
-        lambda wavelengths_nm, spectra, title: drawn.update(spectra, title=title) or b"",
-    )
     origin = tuple(frame.camera_to_worlds[0, :3, 3].tolist())
-    panel.show_spectrum(ViewerClick(origin, tuple((3.0 * ray.directions).flatten().tolist()), (0.5, 0.5)))
+    click = ViewerClick(origin, tuple((3.0 * ray.directions).flatten().tolist()), (0.5, 0.5))
+    _, drawn, title, _ = panel.spectrum_at(click)
+    panel.show_spectrum(click)
 
     reflectance, valid = truth_of(pipeline, view)
     expected = np.where(valid[line, sample], reflectance[line, sample], np.nan)
@@ -338,12 +335,11 @@ def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline, monkeypatch
     homogeneous = torch.eye(4)
     homogeneous[:3] = parsed.dataparser_transform
     in_metres = torch.linalg.inv(homogeneous) @ torch.cat([point / parsed.dataparser_scale, torch.ones(1)])
-    assert drawn["title"] == "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*(in_metres[:3] * 1000).tolist())
+    assert title == "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*(in_metres[:3] * 1000).tolist())
     np.testing.assert_allclose(server.points["/picked_point"]["position"], 10.0 * point, rtol=1e-4)
 
-    drawn.clear()
-    panel.show_spectrum(ViewerClick((origin[0] + 0.1, *origin[1:]), (0.0, 0.0, 1.0), (0.5, 0.5)))
-    assert set(drawn) == {"rendered", "title"}
+    elsewhere = ViewerClick((origin[0] + 0.1, *origin[1:]), (0.0, 0.0, 1.0), (0.5, 0.5))
+    assert set(panel.spectrum_at(elsewhere)[1]) == {"rendered"}
     panel.picking.cb_hook(SimpleNamespace(value=False))
     assert server.pointer is None
 

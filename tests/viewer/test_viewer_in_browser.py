@@ -6,6 +6,7 @@ import threading
 
 import ball_run
 import capture_factory as factory
+import matplotlib
 import numpy as np
 import pytest
 from headless_browser import launch, needs_browser
@@ -41,15 +42,13 @@ def address(tmp_path):
 
 @pytest.mark.slow
 @needs_browser
-def test_pictures_and_spectra_of_a_ball(address):
-    """It opens before the object; composites have their colours; a click tells place and opacity."""
+def test_pictures_and_spectra_of_a_ball_from_the_state_it_opens_in(address):
+    """It opens before the object; outputs have their colours; a click tells a position; so after a reload."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     with sync_api.sync_playwright() as playwright:
         browser = launch(playwright)
         page = browser.new_page(viewport=WINDOW)
         page.set_default_timeout(120_000)
-        page.goto(address, wait_until="domcontentloaded")
-        page.get_by_text("Hide Train Cams").click()
 
         def shows(colour):
             """Wait until the ball has a colour."""
@@ -66,9 +65,13 @@ def test_pictures_and_spectra_of_a_ball(address):
             page.get_by_role("option", name=name, exact=True).click()
 
         low, high = 255 * factory.PLANT.min(), 255 * factory.PLANT.max()
+        page.goto(address, wait_until="domcontentloaded")
         assert shows([low, low, low])
+        assert page.get_by_text("Show Train Cams").is_visible()
         choose("Output type", "composite")
         choose("Composite", "CIR")
+        assert shows([high, low, low])
+        page.reload(wait_until="domcontentloaded")
         assert shows([high, low, low])
         page.get_by_label("Click for spectrum").check()
         answer = page.get_by_text(re.compile(r"x -?[\d.]+, y .* mm, opacity"))
@@ -78,7 +81,10 @@ def test_pictures_and_spectra_of_a_ball(address):
             if answer.count():
                 break
         told = answer.inner_text(timeout=5000)
-        place, opacity = np.array(re.findall(r"-?[\d.]+", told)[:3], float), re.search(r"opacity ([\d.]+)", told)[1]
-        assert np.linalg.norm(place / 1000.0 - factory.SPHERE_CENTRE_M) == pytest.approx(0.04, abs=0.002)
-        assert float(opacity) > 0.98
+        point_mm = np.array(re.findall(r"-?[\d.]+", told)[:3], float)
+        opacity = float(re.search(r"opacity ([\d.]+)", told)[1])
+        assert np.linalg.norm(point_mm / 1000.0 - factory.SPHERE_CENTRE_M) == pytest.approx(0.04, abs=0.002)
+        assert opacity > 0.98
+        choose("Output type", "band")
+        assert shows(255 * np.array(matplotlib.colormaps["turbo"].colors[int(low)]))
         browser.close()

@@ -22,6 +22,7 @@ function rgbOf(colour) {
 function start(root, cloud) {
   const canvas = root.querySelector("canvas"), form = root.querySelector("form"), fields = form.elements;
   const legend = root.querySelector(".legend"), pickedBox = root.querySelector(".picked");
+  const missed = root.querySelector(".missed");
   const renderer = new Renderer(canvas, cloud), picked = [];
 
   function showBar(low, high, words) {
@@ -70,16 +71,16 @@ function start(root, cloud) {
       "aria-label": "Reflectance over wavelength of the points that were clicked" }, undefined, SVG);
     const add = (name, attributes, text) => svg.append(element(name, attributes, text, SVG));
     for (let value = 0; value <= highest; value += step) {
-      add("path", { class: "grid", d: `M${left} ${y(value)}H${width - 16}` });
-      add("text", { class: "number", x: left - 5, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(2));
+      add("path", { stroke: "var(--rule)", d: `M${left} ${y(value)}H${width - 16}` });
+      add("text", { x: left - 5, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(2));
     }
     for (let nm = Math.ceil(first / 100) * 100; nm <= last; nm += last - first > 450 ? 200 : 100) {
-      add("text", { class: "number", x: x(nm), y: height - 19, "text-anchor": "middle" }, String(nm));
+      add("text", { x: x(nm), y: height - 19, "text-anchor": "middle" }, String(nm));
     }
     add("text", { x: (left + width) / 2, y: height - 4, "text-anchor": "middle" }, "wavelength (nm)");
     for (const { spectrum, series } of picked) {
       const d = spectrum.map((v, i) => `${i ? "L" : "M"}${x(cloud.wavelengths[i]).toFixed(1)} ${y(v).toFixed(1)}`);
-      add("path", { class: `line s${series}`, d: d.join("") });
+      add("path", { class: "line", stroke: `var(--s${series})`, d: d.join("") });
     }
     const list = element("ul", {});
     for (const { point, series } of picked) {
@@ -93,6 +94,7 @@ function start(root, cloud) {
 
   function pick(x, y) {
     const point = renderer.pick(x, y);
+    missed.hidden = point >= 0;
     if (point < 0) return;
     if (picked.length === MOST_PICKED) picked.shift();
     const taken = new Set(picked.map(({ series }) => series));
@@ -113,6 +115,11 @@ function start(root, cloud) {
   function turn(right, up) {
     renderer.azimuth -= right;
     renderer.elevation = Math.min(1.55, Math.max(-1.55, renderer.elevation + up));
+    renderer.draw();
+  }
+
+  function move(right, up) {
+    renderer.shift = [renderer.shift[0] + right, renderer.shift[1] + up];
     renderer.draw();
   }
 
@@ -161,8 +168,7 @@ function start(root, cloud) {
       zoom(apart(before) / apart(now));
     } else if (event.shiftKey) {
       const scale = (2 * renderer.distance * Math.tan(FIELD_OF_VIEW / 2)) / canvas.clientHeight;
-      renderer.shift = [renderer.shift[0] + dx * scale, renderer.shift[1] - dy * scale];
-      renderer.draw();
+      move(dx * scale, -dy * scale);
     } else if (travelled > 3) turn(0.01 * dx, 0.01 * dy);
   });
   canvas.addEventListener("pointerup", (event) => {
@@ -175,9 +181,13 @@ function start(root, cloud) {
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
     const moves = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
-    if (moves[event.key]) turn(...moves[event.key]);
+    const by = moves[event.key];
+    if (by && event.shiftKey) move(by[0], by[1]);
+    else if (by) turn(...by);
     else if ("+-".includes(event.key)) zoom(event.key === "+" ? 0.9 : 1.1);
+    else if (event.key === "Enter" || event.key === " ") pick(canvas.clientWidth / 2, canvas.clientHeight / 2);
     else return;
+    fields.turning.checked = false;
     event.preventDefault();
   });
   window.addEventListener("resize", () => renderer.draw());
@@ -196,6 +206,14 @@ function start(root, cloud) {
   requestAnimationFrame(tick);
 }
 
+// On a narrow screen the cards are closed but for the first: the findings tell which to open.
+if (window.matchMedia("(max-width: 48rem)").matches) {
+  for (const card of document.querySelectorAll("section:not(#object) > .card")) card.open = false;
+}
+document.querySelector("header").addEventListener("click", ({ target }) => {
+  const card = target.hash && document.querySelector(`${target.hash} > .card`);
+  if (card) card.open = true;
+});
 const root = document.getElementById("cloud");
 if (root) {
   try {

@@ -1,0 +1,196 @@
+"""``hsi-sc-nerf run``: from the captures of a session to a report, each step by its own command."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shlex
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf import __version__
+from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.cli.steps import run_step, typed_command
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import make_folder, write_json
+from hsi_sc_nerf.settings_file import between, check_options
+
+STEPS_NAME = "steps.json"
+"""File of the output folder that says which steps were done with what; it marks the folder as a run's."""
+ITERATIONS_ON_CPU = 4000
+"""Without a GPU, 40 000 iterations take hours; these come close (docs/validation/reconstruction.md)."""
+ITERATIONS_ON_GPU = 40_000
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of the run.
+
+    Attributes:
+        name: shown, and the name of the log.
+        words: the command as a user would type it.
+        inputs: files and folders that its results depend on.
+        outputs: files that it leaves.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    inputs: tuple[Path, ...]
+    outputs: tuple[Path, ...]
+
+    def fingerprint(self, outside: Path) -> str:
+        """Hash of command, version, and sizes and times of the inputs but for those inside the folder ``outside``."""
+        digest = hashlib.sha256(json.dumps([__version__, self.words]).encode())
+        for path in self.inputs:
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                if file.is_file() and (path == file or outside not in file.parents):
+                    state = file.stat()
+                    digest.update(f"{file} {state.st_size} {state.st_mtime_ns}\n".encode())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class RunCommand:
+    """Process a session, train, evaluate, export the cloud, measure traits and write the report.
+
+    Each step is a command of its own, which is printed as it starts. A step is skipped while its inputs, its words
+    and its results are unchanged. A run that was stopped goes on where it stopped, also within the training.
+    """
+
+    session: tyro.conf.Positional[Path]
+    """Folder of the capture session."""
+    output_dir: Path
+    """Folder for the dataset, the trained run, the cloud, the traits and report.html."""
+    max_num_iterations: int | None = between(1, math.inf, default=None)
+    """Training steps of both stages together. Default: 40000 on a GPU, 4000 without one."""
+    num_points: int = between(1, math.inf, default=200_000)
+    """Number of points of the cloud."""
+    process: str = ""
+    """More words for `hsi-sc-nerf process`, joined to the option by an equals sign: --process="--poses colmap"."""
+    train: str = ""
+    """More words for `ns-train hsi-sc-nerf`, likewise: --train="--pipeline.model.head direct"."""
+
+    def main(self) -> None:
+        """Run the steps that are not up to date and print what was found.
+
+        Raises:
+            InputError: a step failed, or the output folder holds something else.
+        """
+        check_options(self)
+        steps = self._steps()
+        out = self.output_dir
+        if out.resolve() == self.session.resolve():
+            raise InputError(f"{out}: is the session itself; choose another --output-dir.")
+        make_folder(out)
+        if not (out / STEPS_NAME).is_file() and any(out.iterdir()):
+            raise InputError(f"{out}: holds something other than a run of `hsi-sc-nerf run`; choose another folder.")
+        console = Console(highlight=False, soft_wrap=True)
+        for number, step in enumerate(steps, start=1):
+            self._bring_up_to_date(step, console, f"[bold]{number}/{len(steps)} {step.name}[/bold]")
+        _show_results(out, console)
+
+    def _steps(self) -> list[Step]:
+        """The commands, in order."""
+        out = self.output_dir
+        data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
+        run = out / "training" / "hsi-sc-nerf" / "run"
+        config, weights = run / "config.yml", run / "nerfstudio_models"
+        packed = data / "transforms.json"
+        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
+        training += ["--timestamp", "run", "--vis", "tensorboard", "--max-num-iterations", self._iterations()]
+        evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
+        exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]
+        exporting += ["--num-points", self.num_points]
+        reporting = ["hsi-sc-nerf", "report", run, "--output", out / "report.html", "--cloud", cloud]
+        table: list[tuple[str, list[Any], tuple[Path, ...], tuple[Path, ...]]] = [
+            (
+                "process",
+                ["hsi-sc-nerf", "process", self.session, "--output-dir", data, *split_words(self.process)],
+                (self.session,),
+                (packed,),
+            ),
+            ("train", [*training, *split_words(self.train)], (packed, data / "masks"), (config,)),
+            ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
+            ("export", exporting, (packed, weights), (cloud,)),
+            (
+                "traits",
+                ["hsi-sc-nerf", "traits", cloud, "--data", data, "--output-dir", traits],
+                (cloud,),
+                (traits / "traits.json",),
+            ),
+            (
+                "report",
+                [*reporting, "--traits", traits / "traits.json"],
+                (packed, weights, cloud, traits / "traits.json"),
+                (out / "report.html",),
+            ),
+        ]
+        return [Step(name, tuple(map(str, words)), inputs, outputs) for name, words, inputs, outputs in table]
+
+    def _iterations(self) -> int:
+        if self.max_num_iterations is not None:
+            return self.max_num_iterations
+        import torch  # deferred because it takes seconds to import
+
+        return ITERATIONS_ON_GPU if torch.cuda.is_available() else ITERATIONS_ON_CPU
+
+    def _bring_up_to_date(self, step: Step, console: Console, title: str) -> None:
+        """Run a step unless its results are those of the same command and inputs."""
+        steps_path = self.output_dir / STEPS_NAME
+        done: dict[str, Any] = json.loads(steps_path.read_text(encoding="utf-8")) if steps_path.is_file() else {}
+        fingerprint = step.fingerprint(self.output_dir)
+        before = done.get(step.name, {})
+        same = before.get("fingerprint") == fingerprint
+        if same and before["finished"] and all(path.is_file() for path in step.outputs):
+            console.print(f"{title}: up to date")
+            return
+        words = [*step.words]
+        if step.name == "train":
+            run = step.outputs[0].parent
+            if not same:
+                shutil.rmtree(run, ignore_errors=True)
+            elif any(run.glob("nerfstudio_models/*.ckpt")):
+                words += ["--load-dir", str(run / "nerfstudio_models")]
+        console.print(f"{title}\n{escape(shlex.join(words))}")
+        entry = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
+        write_json(steps_path, done | {step.name: entry})
+        logs = self.output_dir / "logs"
+        make_folder(logs)
+        # A training whose last stage is kept was killed between its end and the next line of steps.json.
+        if step.name != "train" or not (same and any(run.glob("stage-masked/*.ckpt"))):
+            cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
+            entry["seconds"] = round(cost.seconds, 1)
+        missing = [path for path in step.outputs if not path.is_file()]
+        if missing:
+            raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
+        write_json(steps_path, done | {step.name: entry | {"finished": True}})
+
+
+def _show_results(out: Path, console: Console) -> None:
+    """Print scores, sizes, warnings of the steps, and what to open."""
+    results = json.loads((out / "eval.json").read_text(encoding="utf-8"))["results"]
+    scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format(**results)
+    console.print(f"Held-out views, inside the mask: {scores}")
+    traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
+    size = traits["size"]
+    volume = f"volume {1000 * size['volume_l']:.1f} mL" if traits["watertight"] else "no closed volume"
+    console.print(f"Size: height {1000 * size['height_m']:.1f} mm, area {1e4 * size['area_m2']:.1f} cm², {volume}")
+    for line in _warnings(sorted((out / "logs").glob("*.log"))):
+        console.print(f"[yellow]{escape(line)}")
+    console.print(f"Open {escape(str(out / 'report.html'))} in a browser.", style="bold")
+
+
+def _warnings(logs: Sequence[Path]) -> Iterator[str]:
+    """Lines of the steps' logs that warn."""
+    for log in logs:
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("Warning"):
+                yield f"{log.stem}: {line}"

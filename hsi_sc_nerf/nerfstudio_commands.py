@@ -1,0 +1,125 @@
+"""What nerfstudio's own commands do with runs of this package.
+
+``ns-export pointcloud`` writes the spectral cloud, and what a command cannot do ends in one sentence.
+
+nerfstudio's scripts have no extension point, and import their plugins while they are being imported themselves. So
+the ``main`` of a script's commands is wrapped at the first use of the complete script. Runs of other methods pass as
+they are.
+"""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.checkpoints import find_checkpoint
+from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
+from hsi_sc_nerf.models.trained_run import read_config
+
+_SCRIPTS = tuple(f"nerfstudio.scripts.{name}" for name in ("eval", "exporter", "render", "viewer.run_viewer"))
+_REFUSED = {
+    "ExportMarchingCubesMesh": "ns-export marching-cubes needs a signed distance, which this method does not have; "
+    "take ns-export poisson or tsdf, or `hsi-sc-nerf traits`, whose mesh.ply is closed and in metres.",
+    "ExportGaussianSplat": "ns-export gaussian-splat needs a model of Gaussians, which this method is not; take "
+    "ns-export pointcloud.",
+}
+"""Commands that cannot work, by the name of their class, and what to do instead."""
+
+
+def extend_nerfstudio_commands() -> None:
+    """Extend the scripts of nerfstudio that are being imported or are imported."""
+    for name in _SCRIPTS:
+        # ``python -m`` runs a script under another name.
+        module = sys.modules.get(name)
+        if module is not None:
+            _when_complete(module)
+
+
+def _when_complete(module: types.ModuleType) -> None:
+    """Wrap the commands of a script at the first use of its entry point, which is defined last."""
+    module.__class__ = _ScriptBeingImported
+    hasattr(module, "entrypoint")  # wraps a script that is complete
+
+
+class _ScriptBeingImported(types.ModuleType):
+    def __getattribute__(self, name: str) -> Any:
+        if name == "entrypoint" and name in vars(self):
+            self.__class__ = types.ModuleType  # type: ignore[assignment]
+            for kind in list(vars(self).values()):
+                if isinstance(kind, type) and kind.__module__ == self.__name__ and "main" in vars(kind):
+                    kind.main = _adapted(kind.main)  # type: ignore[attr-defined]
+        return types.ModuleType.__getattribute__(self, name)
+
+
+def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
+    def main(self: Any) -> None:
+        try:
+            if prepare(self) and type(self).__name__ == "ExportPointCloud":
+                _export_spectral_cloud(self)
+                return
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        original(self)
+
+    main.__doc__ = original.__doc__
+    return main
+
+
+def _export_spectral_cloud(options: Any) -> None:
+    """`export_cloud` with the options of nerfstudio's `ExportPointCloud`."""
+    from hsi_sc_nerf.export.description import run_name
+    from hsi_sc_nerf.export.options import CloudOptions
+    from hsi_sc_nerf.export.spectral_export import export_cloud
+    from hsi_sc_nerf.models.trained_run import open_run
+
+    cloud_options = CloudOptions.from_nerfstudio(options)
+    run = open_run(options.load_config)
+    export_cloud(run, options.output_dir, cloud_options, run_name(options.load_config))
+
+
+def prepare(command: Any) -> bool:
+    """Check and adapt one of nerfstudio's commands for a run of this package; those of other methods are left alone.
+
+    Args:
+        command: with the option ``load_config``.
+
+    Returns:
+        Whether the run is one of this package.
+
+    Raises:
+        InputError: the run cannot be read by this version, has no checkpoint where nerfstudio looks for it, or the
+            command cannot work with it.
+    """
+    name = type(command).__name__
+    path = command.load_config
+    if path.is_file() and "hsi_sc_nerf" not in path.read_text(encoding="utf-8", errors="replace"):
+        return False
+    config = read_config(path)
+    if not isinstance(config.pipeline.model, SpectralModelConfig):
+        return False
+    if name in _REFUSED:
+        raise InputError(_REFUSED[name])
+    if name == "DatasetRender" and command.downscale_factor is not None:
+        raise InputError(
+            "ns-render dataset --downscale-factor: this method renders frames at their own size; leave the option "
+            "out, or take `hsi-sc-nerf render`."
+        )
+    if name == "ExportPointCloud":  # opens runs that were moved as well
+        return True
+    checkpoints = config.get_checkpoint_dir()
+    if not checkpoints.is_dir():
+        raise InputError(
+            f"{checkpoints}: there is no such folder of checkpoints, which {path} names; call the command from the "
+            "folder that the run was trained from."
+        )
+    find_checkpoint(checkpoints)
+    no_normals = not config.pipeline.model.predict_normals
+    if name == "ExportPoissonMesh" and command.normal_method == "model_output" and no_normals:
+        CONSOLE.print("hsi-sc-nerf: the model predicts no normals; they are estimated from the points (open3d).")
+        command.normal_method = "open3d"
+    return True

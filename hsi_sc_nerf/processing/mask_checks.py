@@ -1,0 +1,202 @@
+"""Checks of foreground masks: against the image's border, each other, and the visual hull of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_erosion
+
+from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.processing.scene_box import hull_voxels
+
+MAX_EMPTY_FRACTION = 0.05
+"""Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
+MAX_CUT_FRACTION = 0.3
+"""Fraction of a mask's lines that may end at the side of the space where the object may be."""
+HULL_MISSED_FRACTION = 0.15
+"""Frames that may contradict a point of the hull: a few frames of another object must not carve it."""
+MAX_CONTRADICTION = 0.04
+"""Largest typical difference of mask and hull's silhouette (1 - intersection over union), to which a quarter of a
+pixel along the mask's outline is added. Good masks have half of it, because the hull is found by vote."""
+MAX_ODDITY = 0.015
+"""Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added."""
+STILL_OVERLAP = 0.97
+"""Intersection over union of all masks from which they stand still."""
+STILL_FRACTION = 0.7
+"""Fraction of the masks' edge that must not change for it to be the background's."""
+_MOST_NAMES = 8
+
+
+def check_masks(
+    masks: Bool[np.ndarray, "frames h w"],
+    names: Sequence[str],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    brightness: Float[np.ndarray, "frames h w"],
+    regions: Bool[np.ndarray, "frames h w"] | None = None,
+    min_z_m: float | None = None,
+) -> list[Finding]:
+    """What speaks against the masks; nothing for good ones.
+
+    Args:
+        masks: true on the object.
+        names: of the frames.
+        camera_to_worlds: poses, OpenGL axes.
+        intrinsics: of the one camera; lens distortion is neglected.
+        brightness: mean reflectance.
+        regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
+        min_z_m: height of the container's lid; None if unknown.
+
+    Example:
+        >>> refuse_red(check_masks(masks, names, poses, intrinsics, brightness), accepted=["masks-border"])
+    """
+    empty = ~masks.any(axis=(1, 2))
+    found = []
+    if empty.any():
+        too_many = empty.mean() > MAX_EMPTY_FRACTION
+        found.append(
+            Finding(
+                "masks-empty",
+                "red" if too_many else "amber",
+                f"Nothing of the object was found in {_named(names, empty)}; look at report/masks.png and "
+                "leave these frames out with --exclude NAME.",
+                {"frames": _list(names, empty)},
+            )
+        )
+    if empty.all():
+        return found
+    return [
+        *found,
+        *_border(masks[~empty], None if regions is None else regions[~empty]),
+        *_still(masks[~empty], brightness),
+        *_hull(masks, names, camera_to_worlds, intrinsics, min_z_m),
+    ]
+
+
+def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"] | None) -> list[Finding]:
+    """Masks that the image or the space above the lid cuts off."""
+    found = []
+    inner = np.zeros(masks.shape[1:], bool)
+    inner[1:-1, 1:-1] = True
+    touching = (masks & ~inner).any(axis=(1, 2))
+    if touching.any():
+        found.append(
+            Finding(
+                "masks-border",
+                "red" if touching.mean() > 0.5 else "amber",
+                f"The masks touch the image's border in {touching.sum()} of {len(masks)} frames: the object leaves "
+                "the image, or they are the wall's; look at report/masks.png.",
+                {"frames": int(touching.sum())},
+            )
+        )
+    if regions is not None:
+        sides = regions & ~binary_erosion(regions, np.ones((1, 1, 3), bool), border_value=1)
+        cut = (masks & sides).any(axis=2).sum(axis=1) / masks.any(axis=2).sum(axis=1)
+        if np.median(cut) > MAX_CUT_FRACTION:
+            found.append(
+                Finding(
+                    "masks-cut",
+                    "red",
+                    f"The masks end at the side of the space above the lid in {100 * np.median(cut):.0f} % of their "
+                    "lines: they are the wall's, or the object is wider than --masks.overhang allows; look at "
+                    "report/masks.png.",
+                    {"lines_fraction": float(np.median(cut))},
+                )
+            )
+    return found
+
+
+def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "frames h w"]) -> list[Finding]:
+    """Masks that are the same in all frames and show the same at their edge: of what does not turn."""
+    common, all_of_them = masks.all(axis=0), masks.any(axis=0)
+    overlap = common.sum() / all_of_them.sum()
+    if len(masks) < 3 or overlap < STILL_OVERLAP:
+        return []
+    width_px = max(2, round(0.03 * np.sqrt(common.sum())))
+    edge = common & ~binary_erosion(common, iterations=width_px)
+    # Median absolute differences of successive frames: lamps drift slowly, and a few pixels may flicker.
+    change = np.median(np.abs(np.diff(brightness, axis=0)), axis=0)
+    still = float((change[edge] <= 2.0 * np.median(change[~all_of_them])).mean())
+    if still < STILL_FRACTION:
+        return []
+    return [
+        Finding(
+            "masks-static",
+            "red",
+            "The masks and what they show at their edge stand still while the table turns, so they are "
+            "probably the wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body "
+            "of revolution.",
+            {"overlap": float(overlap), "still_fraction": still},
+        )
+    ]
+
+
+def _hull(
+    masks: Bool[np.ndarray, "frames h w"],
+    names: Sequence[str],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    min_z_m: float | None,
+) -> list[Finding]:
+    """Masks that contradict the visual hull, which is found by vote."""
+    filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
+    contradiction = hull_contradiction(masks, camera_to_worlds, intrinsics, min_z_m)
+    typical = float(np.median(contradiction[filled]))
+    outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
+    pixel = outline.sum() / masks.sum()
+    if typical > MAX_CONTRADICTION + 0.25 * pixel:
+        sentence = (
+            f"The masks contradict each other: a typical one differs by {100 * typical:.0f} % of its area from the "
+            "visual hull of all, so the masks or the poses are wrong; look at report/masks.png and report/poses.png."
+        )
+        return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
+    odd = (contradiction > typical + MAX_ODDITY + 0.125 * pixel) & filled
+    if not odd.any():
+        return []
+    return [
+        Finding(
+            "frames-hull",
+            "red",
+            f"The object in {_named(names, odd)} has another shape than in the other frames: it is another "
+            "object, or it was moved; leave these frames out with --exclude NAME.",
+            {"frames": {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}},
+        )
+    ]
+
+
+def hull_contradiction(
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    min_z_m: float | None = None,
+) -> Float[np.ndarray, "frames"]:
+    """Difference of each mask and the silhouette of the visual hull: 1 - intersection over union.
+
+    The hull is found by vote (`HULL_MISSED_FRACTION`). Arguments as in `check_masks`.
+    """
+    hull, _, size_px = hull_voxels(masks, camera_to_worlds, intrinsics, min_z_m, HULL_MISSED_FRACTION)
+    contradiction = np.empty(len(masks))
+    for index, (mask, pose) in enumerate(zip(masks, camera_to_worlds, strict=True)):
+        x, y = np.floor(project(hull, pose, intrinsics)[0]).astype(int).T
+        inside = (x >= 0) & (x < intrinsics.w) & (y >= 0) & (y < intrinsics.h)
+        silhouette = np.zeros(mask.shape, bool)
+        silhouette[y[inside], x[inside]] = True
+        # Dilation closes the gaps between voxels; erosion undoes it, and the dilation of the masks in `hull_voxels`.
+        silhouette = ~dilate(~dilate(silhouette, size_px), 2 * size_px - 1)
+        contradiction[index] = 1.0 - (mask & silhouette).sum() / max(1, (mask | silhouette).sum())
+    return contradiction
+
+
+def _list(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> list[str]:
+    return [name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen]
+
+
+def _named(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> str:
+    """The chosen names as part of a sentence."""
+    listed = _list(names, chosen)
+    more = f" and {len(listed) - _MOST_NAMES} more" if len(listed) > _MOST_NAMES else ""
+    return ", ".join(listed[:_MOST_NAMES]) + more

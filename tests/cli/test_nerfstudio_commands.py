@@ -1,0 +1,149 @@
+"""nerfstudio's own commands on a small run and a dataset of this package: the table of its how-to page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import ball_run
+import pytest
+import torch
+import tyro
+
+from hsi_sc_nerf.models.trained_run import TrainedRun
+from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
+
+pytestmark = pytest.mark.slow
+
+TEXTURE = ("--target-num-faces", "300", "--num-pixels-per-side", "64")
+CAMERA = {"camera_to_world": [1, 0, 0, 0, 0, 0, -1, -3, 0, 1, 0, 0.3, 0, 0, 0, 1], "fov": 30, "aspect": 1}
+
+
+@pytest.fixture(scope="module")
+def config_path(tmp_path_factory):
+    """A run whose model is a ball."""
+    folder = tmp_path_factory.mktemp("ball")
+    return ball_run.write_untrained_run(ball_run.write_ball_dataset(folder / "data"), folder / "runs")
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    from nerfstudio.scripts import eval, exporter, render
+
+    extend_nerfstudio_commands()  # as at the end of their import by a console script
+
+    def opens_ball(original):
+        def eval_setup(*arguments, **options):
+            config, pipeline, checkpoint, step = original(*arguments, **options)
+            ball_run.fill_with_ball(TrainedRun(pipeline.model, pipeline.datamanager))
+            return config, pipeline, checkpoint, step
+
+        return eval_setup
+
+    original = eval.eval_setup
+    for module in (eval, exporter, render):
+        module.eval_setup = opens_ball(original)
+    yield {"ns-eval": (eval, "ComputePSNR"), "ns-export": (exporter, "Commands"), "ns-render": (render, "Commands")}
+    for module in (eval, exporter, render):
+        module.eval_setup = original
+
+
+@pytest.fixture
+def call(scripts, config_path):
+    def called(program, *words):
+        module, commands = scripts[program]
+        split = 1 if commands == "Commands" else 0
+        arguments = [*words[:split], "--load-config", config_path, *words[split:]]
+        tyro.cli(getattr(module, commands), args=[str(word) for word in arguments]).main()
+
+    return called
+
+
+@pytest.fixture
+def ffmpeg(tmp_path, monkeypatch):
+    """nerfstudio looks for the program, and does not need it for pictures."""
+    if shutil.which("ffmpeg") is None:
+        program = tmp_path / "bin" / "ffmpeg"
+        program.parent.mkdir()
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", str(program.parent), prepend=":")
+
+
+def test_eval(call, tmp_path):
+    call("ns-eval", "--output-path", tmp_path / "eval.json")
+    assert 0 < json.loads((tmp_path / "eval.json").read_text())["results"]["sam"] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("words", "written"),
+    [
+        (("cameras",), "transforms_train.json"),
+        (("tsdf", "--resolution", "32", *TEXTURE), "tsdf_mesh.ply"),
+        (("poisson", "--num-points", "2000", "--num-rays-per-batch", "1024", *TEXTURE), "poisson_mesh.ply"),
+        (("pointcloud", "--num-points", "500"), "point_cloud.ply"),
+    ],
+)
+def test_exports(call, tmp_path, words, written):
+    call("ns-export", *words, "--output-dir", tmp_path)
+    assert (tmp_path / written).stat().st_size > 200
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "told"),
+    [
+        ("ns-export", ("marching-cubes", "--output-dir", "x"), "signed distance"),
+        ("ns-export", ("gaussian-splat", "--output-dir", "x"), "Gaussians"),
+        ("ns-render", ("dataset", "--downscale-factor", "8"), "hsi-sc-nerf render"),
+    ],
+)
+def test_what_cannot_work_is_one_sentence(call, tmp_path, monkeypatch, program, words, told):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{told}[^\n]*\.$"):
+        call(program, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_renders_of_the_dataset(call, tmp_path):
+    call("ns-render", "dataset", "--output-path", tmp_path, "--rendered-output-names", "rgb", "depth")
+    assert {path.name for path in (tmp_path / "test").iterdir()} == {"rgb", "depth"}
+
+
+@pytest.mark.parametrize("kind", ["interpolate", "camera-path", "spiral"])
+def test_renders_of_paths(call, ffmpeg, tmp_path, kind):
+    path = {"camera_type": "perspective", "render_height": 24, "render_width": 24, "camera_path": [CAMERA, CAMERA]}
+    (tmp_path / "path.json").write_text(json.dumps(path | {"fps": 2, "seconds": 1, "is_cycle": False}))
+    options = {
+        "interpolate": ("--interpolation-steps", "2", "--downscale-factor", "4"),
+        "camera-path": ("--camera-path-filename", tmp_path / "path.json"),
+        "spiral": ("--seconds", "0.1", "--downscale-factor", "4"),
+    }[kind]
+    call("ns-render", kind, *options, "--output-format", "images", "--output-path", tmp_path / "video.mp4")
+    assert len(list((tmp_path / "video").iterdir())) == 2
+
+
+def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path):
+    script = """
+import sys, torch, tyro
+import nerfstudio.models.nerfacto as nerfacto
+
+class NoDownload(torch.nn.Module):  # LPIPS would fetch a network
+    def __init__(self, **_):
+        super().__init__()
+
+nerfacto.LearnedPerceptualImagePatchSimilarity = NoDownload
+if __name__ == "__main__":
+    from nerfstudio.scripts.train import entrypoint
+    entrypoint()
+"""
+    (tmp_path / "train.py").write_text(script)
+    words = f"""nerfacto --data {tiny_dataset[0]} --output-dir {tmp_path} --timestamp run --vis tensorboard
+        --max-num-iterations 3 --machine.device-type cpu --pipeline.model.implementation torch
+        --pipeline.datamanager.train-num-rays-per-batch 64 --pipeline.model.log2-hashmap-size 10
+        hsi-sc-nerf-data""".split()
+    run = subprocess.run([sys.executable, str(tmp_path / "train.py"), *words], capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
+    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(checkpoint, weights_only=False)["step"] == 2

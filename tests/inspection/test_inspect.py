@@ -1,0 +1,165 @@
+"""Each mistake of a session is found, by its name; a good session has none."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from inspection_session import SIZE_PX, frame_picture, write_one, write_turntable
+
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
+from hsi_sc_nerf.inspection.picture import draw_inspection
+
+INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    return write_turntable(tmp_path_factory.mktemp("good") / "session", info=INFO)
+
+
+@pytest.fixture
+def session(good, tmp_path) -> Path:
+    """A copy that a test may spoil."""
+    return Path(shutil.copytree(good, tmp_path / "session"))
+
+
+def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:
+    inspection = inspect_session(open_session(path, skip_damaged=True))
+    return inspection, {finding.name: finding for finding in inspection.findings}
+
+
+def found(path: Path, level: str) -> dict[str, str]:
+    _, findings = inspect(path)
+    return {name: finding.sentence for name, finding in findings.items() if finding.level == level}
+
+
+def test_a_good_session_is_green(good, tmp_path):
+    inspection, findings = inspect(good)
+    assert {name: f.sentence for name, f in findings.items() if f.level != "green"} == {}
+    assert findings["turn"].values["direction"] == "ccw"
+    assert findings["turn"].values["usual_step_deg"] == pytest.approx(30.0, abs=0.5)
+    assert findings["frames"].values["frames"] == [f"fruit_{i:02d}" for i in range(12)]
+    draw_inspection(inspection, tmp_path / "inspection.png")
+    assert (tmp_path / "inspection.png").stat().st_size > 10_000
+    assert json.loads(json.dumps(inspection.report()))["findings"][0]["name"] == "frames"
+
+
+def test_a_frame_given_as_the_white(session):
+    (session / "session.json").write_text(json.dumps({**INFO, "white_reference": "fruit_03"}))
+    red = found(session, "red")
+    assert "white" in red
+    assert "white_reference" in red["white"]
+
+
+def test_frames_of_another_day(session):
+    image = np.rot90(frame_picture(np.full((SIZE_PX, SIZE_PX), 200.0)), 0)
+    for name in ("fruit_05", "fruit_06"):
+        write_one(session, name, image, seed=1, **{"acquisition date": "15-02-2021"})
+    red = found(session, "red")
+    for part in ("fruit_05, fruit_06", "15-02-2021", "--exclude fruit_05 --exclude fruit_06"):
+        assert part in red["dates"]
+
+
+def test_another_object_on_the_same_day(session):
+    gray = np.full((SIZE_PX, SIZE_PX), 0.35 * 255)
+    write_one(session, "fruit_07", frame_picture(gray, radius_px=40.0))
+    red = found(session, "red")
+    assert list(red) == ["other-object"]
+    assert "fruit_07" in red["other-object"]
+    assert "fruit_06" not in red["other-object"]
+
+
+@pytest.mark.parametrize("damage", ["no capture folder", "empty folder", "0 bytes"])
+def test_damaged_captures_are_named(session, damage):
+    folder = session / "fruit_04" / "capture"
+    if damage == "0 bytes":
+        (folder / "fruit_04.raw").write_bytes(b"")
+    elif damage == "no capture folder":
+        folder.rename(session / "fruit_04" / "cubes")
+    else:
+        shutil.rmtree(folder)
+    inspection, findings = inspect(session)
+    assert findings["damaged"].level == "red"
+    assert list(findings["damaged"].values) == ["fruit_04"]
+    assert len(inspection.looks) == 11
+
+
+def test_a_copied_frame(session):
+    for file in (session / "fruit_02" / "capture").iterdir():
+        shutil.copy(file, session / "fruit_09" / "capture" / file.name.replace("fruit_02", "fruit_09"))
+    red = found(session, "red")
+    assert "fruit_09 is a copy of fruit_02" in red["copies"]
+
+
+def test_exposures_that_differ_and_one_that_is_too_long(session):
+    gray = np.full((SIZE_PX, SIZE_PX), 0.35 * 255)
+    write_one(session, "fruit_08", 9.0 * frame_picture(gray), tint=90)
+    _, findings = inspect(session)
+    assert findings["integration-times"].values["others"] == {"fruit_08": 90.0}
+    assert findings["exposure"].level == "red"
+    assert "fruit_08" in findings["exposure"].sentence
+
+
+def test_a_blurred_frame_without_markers_is_amber(session):
+    image = frame_picture(np.full((SIZE_PX, SIZE_PX), 0.35 * 255))
+    smooth = np.stack(
+        [np.mean([np.roll(image[..., band], shift, 1) for shift in range(-7, 8)], 0) for band in range(9)]
+    )
+    write_one(session, "fruit_10", np.moveaxis(smooth, 0, -1))
+    amber = found(session, "amber")
+    assert "fruit_10" in amber["focus"]
+    assert "fruit_10" in amber["markers"]
+
+
+def test_without_session_json_it_is_written_for_the_user(good, tmp_path):
+    session = Path(shutil.copytree(good, tmp_path / "fruits"))
+    (session / "session.json").unlink()
+    inspection, findings = inspect(session)
+    assert findings["scale"].level == "red"
+    assert inspection.session_json == {
+        "object": "fruits",
+        "marker_dictionary": "DICT_5X5_50",
+        "marker_side_m": None,
+        "nominal_step_deg": 30.0,
+        "direction": "ccw",
+    }
+    assert inspect_session(open_session(session), poses="colmap").findings[-1].level == "amber"
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 3])
+def test_upright_is_measured_and_goes_before_the_instruments_habit(tmp_path, quarter_turns):
+    session = write_turntable(tmp_path / "s", info=INFO, quarter_turns=quarter_turns, clockwise=True)
+    for header in session.glob("fruit_*/capture/fruit_*.hdr"):
+        header.write_text(header.read_text() + "sensor type = SPECIM IQ\n")
+    opened = open_session(session)
+    assert opened.image_rotation_deg == 90
+    inspection, findings = inspect(session)
+    assert inspection.session.image_rotation_deg == 90 * quarter_turns
+    assert findings["turn"].values["direction"] == "cw"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name"),
+    [({"direction": "cw"}, "turn"), ({"image_rotation_deg": 90}, "upright")],
+)
+def test_session_json_that_the_markers_contradict(session, spoil, name):
+    (session / "session.json").write_text(json.dumps({**INFO, **spoil}))
+    _, findings = inspect(session)
+    assert findings[name].level == ("red" if name == "turn" else "amber")
+
+
+def test_a_turn_with_a_gap_and_a_stop(session):
+    for name in ("fruit_05", "fruit_06"):
+        shutil.rmtree(session / name)
+    for file in (session / "fruit_09" / "capture").iterdir():
+        shutil.copy(file, session / "fruit_10" / "capture" / file.name.replace("fruit_09", "fruit_10"))
+    _, findings = inspect(session)
+    assert findings["turn"].level == "amber"
+    assert "fruit_09 to fruit_10" in findings["turn"].sentence
+    assert findings["turn"].values["largest_gap_deg"] == pytest.approx(90.0, abs=6.0)

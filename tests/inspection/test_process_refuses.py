@@ -1,0 +1,72 @@
+"""``process`` makes the checks before anything else, and ``inspect`` exits by them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from inspection_session import SIZE_PX, frame_picture, write_one, write_turntable
+
+from hsi_sc_nerf.cli.inspect import InspectCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+
+INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    return write_turntable(tmp_path_factory.mktemp("good") / "session", info=INFO)
+
+
+@pytest.fixture
+def session(good, tmp_path) -> Path:
+    return Path(shutil.copytree(good, tmp_path / "session"))
+
+
+def reached(images, names, **_):
+    raise InputError(f"reached the poses of {len(names)} frames")
+
+
+def process(session: Path, output: Path, **settings) -> None:
+    process_session(session, output, ProcessConfig(**settings), progress=False, estimate_poses=reached)
+
+
+@pytest.mark.slow
+def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left_out(session, tmp_path):
+    image = frame_picture(np.full((SIZE_PX, SIZE_PX), 90.0))
+    write_one(session, "fruit_05", image, **{"acquisition date": "15-02-2021"})
+    with pytest.raises(InputError, match=r"fruit_05.*--accept dates"):
+        process(session, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(InputError, match="reached the poses of 12"):
+        process(session, tmp_path / "data", accept=("dates", "other-object"))
+    with pytest.raises(InputError, match="reached the poses of 11"):
+        process(session, tmp_path / "data", exclude=("fruit_05",))
+
+
+@pytest.mark.slow
+def test_all_damaged_captures_are_named_or_left_out(session, tmp_path):
+    (session / "fruit_02" / "capture" / "fruit_02.raw").write_bytes(b"")
+    shutil.rmtree(session / "fruit_08" / "capture")
+    with pytest.raises(InputError, match=r"fruit_08.*fruit_02.*0 bytes"):
+        process(session, tmp_path / "data")
+    with pytest.raises(InputError, match="reached the poses of 10"):
+        process(session, tmp_path / "data", skip_damaged=True)
+
+
+def test_inspect_prints_all_findings_and_a_session_json(session, tmp_path, capsys):
+    InspectCommand(session, output_dir=tmp_path / "out").main()
+    assert (tmp_path / "out" / "inspection.png").is_file()
+    findings = json.loads((tmp_path / "out" / "inspection.json").read_text())["findings"]
+    printed = capsys.readouterr().out
+    assert all(finding["name"] in printed for finding in findings)
+    assert "marker_dictionary" not in printed
+    (session / "session.json").unlink()
+    with pytest.raises(InputError, match="nothing gives a scale"):
+        InspectCommand(session).main()
+    printed = capsys.readouterr().out
+    assert json.loads(printed[printed.rindex("{") :])["marker_dictionary"] == "DICT_5X5_50"

@@ -1,0 +1,98 @@
+"""Checks of masks on silhouettes of a sphere and of walls, whose findings are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_pose
+
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.mask_checks import check_masks, hull_contradiction
+from hsi_sc_nerf.processing.masks import above_lid
+
+INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
+CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+FRAMES = 12
+POSES = np.stack([true_pose(angle) for angle in np.arange(FRAMES) * 360.0 / FRAMES])
+NAMES = [f"ball_{i}" for i in range(FRAMES)]
+REGIONS = np.stack([above_lid(INTRINSICS, np.zeros(4), pose, CONTAINER) for pose in POSES])
+
+
+def ball(pose, offset_m=(0.0, 0.0, 0.0), radius_m=SPHERE_RADIUS_M) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
+    origin, directions = pixel_rays(INTRINSICS, pose, np.stack([x, y], axis=-1))
+    towards = SPHERE_CENTRE_M + offset_m - origin
+    return towards @ towards - (directions @ towards) ** 2 < radius_m**2
+
+
+def good_masks(**options) -> np.ndarray:
+    return np.stack([ball(pose, **options) for pose in POSES])
+
+
+def seen(masks, change=0.05) -> np.ndarray:
+    """Brightness of a still wall with noise; what the masks show changes by more."""
+    rng = np.random.default_rng(0)
+    wall = rng.uniform(0.2, 0.8, masks.shape[1:])
+    return wall + rng.normal(0.0, 0.005, masks.shape) + masks * rng.normal(0.0, change, masks.shape)
+
+
+def findings(masks, brightness=None, regions=None) -> dict[str, str]:
+    brightness = seen(masks) if brightness is None else brightness
+    found = check_masks(masks, NAMES, POSES, INTRINSICS, brightness, regions, None)
+    return {finding.name: finding.level for finding in found}
+
+
+def test_good_masks_have_no_finding():
+    masks = good_masks()
+    np.testing.assert_array_equal(masks[0], sphere_mask(POSES[0], INTRINSICS))
+    assert findings(masks, regions=REGIONS) == {}
+    assert hull_contradiction(masks, POSES, INTRINSICS).max() < 0.08
+
+
+@pytest.mark.parametrize(("number", "level"), [(1, "red"), (12, "red")])
+def test_empty_masks_are_named(number, level):
+    masks = good_masks()
+    masks[:number] = False
+    (finding,) = [f for f in check_masks(masks, NAMES, POSES, INTRINSICS, seen(masks)) if f.name == "masks-empty"]
+    assert (finding.level, finding.values["frames"]) == (level, NAMES[:number])
+
+
+def test_a_mask_at_the_border_of_the_image():
+    masks = good_masks()
+    masks[0, :, :40] |= ball(POSES[0])[:, 24:]
+    masks[0, 0, 30] = True
+    assert findings(masks)["masks-border"] == "amber"
+    masks[:, 0, 30] = True
+    assert findings(masks)["masks-border"] == "red"
+
+
+def test_masks_of_a_wall_are_cut_by_the_space_above_the_lid():
+    wall = np.zeros((64, 64), bool)
+    wall[5:30, 2:-2] = True
+    assert findings(wall & REGIONS, regions=REGIONS)["masks-cut"] == "red"
+
+
+def test_masks_that_stand_still_show_the_wall():
+    still = np.broadcast_to(ball(POSES[0], offset_m=-SPHERE_CENTRE_M + [0, 0, 0.1]), (FRAMES, 64, 64))
+    assert findings(still, seen(still, change=0.0))["masks-static"] == "red"
+    assert "masks-static" not in findings(still, seen(still))
+    turning = good_masks()
+    assert "masks-static" not in findings(turning, seen(turning, change=0.0))
+
+
+def test_masks_that_contradict_each_other():
+    masks = good_masks()
+    patch = np.zeros((64, 64), bool)
+    patch[10:30, 10:24] = True
+    assert findings(masks | patch)["masks-hull"] == "red"
+
+
+@pytest.mark.parametrize("other", [{"offset_m": (0.0, 0.0, 0.012)}, {"radius_m": 0.034}, {"radius_m": 0.046}])
+def test_a_frame_of_another_object_is_named(other):
+    masks = good_masks()
+    masks[5] = ball(POSES[5], **other)
+    (finding,) = check_masks(masks, NAMES, POSES, INTRINSICS, seen(masks))
+    assert (finding.name, finding.level, list(finding.values["frames"])) == ("frames-hull", "red", ["ball_5"])
+    assert "ball_5" in finding.sentence
+    assert "--exclude" in finding.sentence

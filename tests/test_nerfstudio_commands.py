@@ -1,0 +1,110 @@
+"""Which commands of nerfstudio are adapted, and what they say to runs that they cannot work with."""
+
+from __future__ import annotations
+
+import copy
+import sys
+import types
+
+import pytest
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+
+from hsi_sc_nerf import nerfstudio_commands as adapter
+from hsi_sc_nerf.config import hsi_sc_nerf
+from hsi_sc_nerf.errors import InputError
+
+
+def command(kind, path, **options):
+    made = type(kind, (), {})()
+    made.load_config = path
+    vars(made).update(options)
+    return made
+
+
+@pytest.fixture
+def ours(tmp_path):
+    """The config.yml of a run of this package, with an empty folder of checkpoints."""
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "x", "run"
+    config.get_checkpoint_dir().mkdir(parents=True)
+    path = config.get_base_dir() / "config.yml"
+    path.write_text(yaml.dump(config))
+    return path
+
+
+def with_checkpoint(config_path):
+    (config_path.parent / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"")
+    return config_path
+
+
+@pytest.fixture
+def other(tmp_path):
+    path = tmp_path / "other.yml"
+    path.write_text(yaml.dump(TrainerConfig(method_name="nerfacto")))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "told"),
+    [
+        ("ExportMarchingCubesMesh", {}, "signed distance"),
+        ("ExportGaussianSplat", {}, "ns-export pointcloud"),
+        ("DatasetRender", {"downscale_factor": 8.0}, "--downscale-factor"),
+        ("ComputePSNR", {}, "holds no checkpoint"),
+    ],
+)
+def test_what_cannot_work_is_one_sentence(ours, other, kind, options, told):
+    with pytest.raises(InputError, match=rf"^[^\n]*{told}[^\n]*\.$"):
+        adapter.prepare(command(kind, ours, **options))
+    assert adapter.prepare(command(kind, other, **options)) is False
+
+
+def test_poisson_estimates_normals_where_the_model_has_none(ours):
+    made = command("ExportPoissonMesh", with_checkpoint(ours), normal_method="model_output")
+    assert adapter.prepare(made) is True
+    assert made.normal_method == "open3d"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("hsi_sc_nerf.models.stages.StageConfig", "hsi_sc_nerf.models.gone.StageConfig"),
+        ("hsi_sc_nerf.models.stages.StageConfig", "hsi_sc_nerf.models.stages.Gone"),
+        ("  learn_after: ", "  learned_after: "),
+        ("!!python/object", "[ !!python/object"),
+    ],
+)
+def test_a_config_of_another_version_is_one_sentence(ours, old, new):
+    text = ours.read_text()
+    assert old in text
+    ours.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=r"^[^\n]*config.yml: cannot be read[^\n]*\.$"):
+        adapter.prepare(command("ComputePSNR", ours))
+
+
+def test_a_script_under_import_is_adapted_once_complete(ours, other, monkeypatch):
+    calls = []
+    monkeypatch.setattr(adapter, "_export_spectral_cloud", lambda options: calls.append("spectral"))
+    name = "nerfstudio.scripts.exporter"
+    module = types.ModuleType(name)
+    monkeypatch.setitem(sys.modules, name, module)
+    adapter.extend_nerfstudio_commands()
+    assert not hasattr(module, "entrypoint")
+
+    class ExportPointCloud:
+        __module__ = name
+
+        def main(self):
+            calls.append("stock")
+
+    vars(module).update(ExportPointCloud=ExportPointCloud, entrypoint=print)
+    assert module.entrypoint is print
+    assert type(module) is types.ModuleType
+    made = ExportPointCloud()
+    for made.load_config in (ours, other):
+        made.main()
+    assert calls == ["spectral", "stock"]
+    made.load_config = ours.with_name("nowhere.yml")
+    with pytest.raises(SystemExit, match=r"hsi-sc-nerf: .*there is no such file"):
+        made.main()

@@ -1,0 +1,166 @@
+"""What pages and docstrings show works: Python blocks and examples run, command lines are parsed."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import doctest
+import re
+import shlex
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from random_cloud import random_cloud
+
+from hsi_sc_nerf.cli.main import Commands
+from hsi_sc_nerf.export.cloud import stream
+from hsi_sc_nerf.export.formats import write_cloud
+
+ROOT = Path(__file__).parents[1]
+PAGES = {page.relative_to(ROOT).as_posix(): page for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]}
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"(?:uv run )?((?:hsi-sc-nerf|ns-[a-z]+)\b.*)")
+
+
+def blocks(language: str) -> list[tuple[str, str]]:
+    """Page and text of each fenced block of a language."""
+    return [
+        (name, text)
+        for name, page in sorted(PAGES.items())
+        for found, text in BLOCK.findall(page.read_text(encoding="utf-8"))
+        if found == language
+    ]
+
+
+def command_lines() -> list[tuple[str, str]]:
+    """Page and text of each command line of ours or of nerfstudio's, continued lines joined."""
+    lines = [(name, line) for name, text in blocks("") for line in text.replace("\\\n", " ").splitlines()]
+    return [(name, match.group(1)) for name, line in lines if (match := COMMAND.match(line.strip()))]
+
+
+def nerfstudio_parsers() -> dict[str, Callable[[list[str]], object]]:
+    """What each of nerfstudio's commands parses its words with; training knows our methods only."""
+    from nerfstudio.scripts import eval as ns_eval
+    from nerfstudio.scripts import exporter, render
+    from nerfstudio.scripts.viewer.run_viewer import RunViewer
+
+    from hsi_sc_nerf import config
+
+    methods = {"hsi-sc-nerf": config.hsi_sc_nerf.config, "hsi-sc-nerf-paper": config.hsi_sc_nerf_paper.config}
+    kinds = {
+        "ns-train": tyro.conf.FlagConversionOff[tyro.extras.subcommand_type_from_defaults(methods)],
+        "ns-eval": ns_eval.ComputePSNR,
+        "ns-export": exporter.Commands,
+        "ns-render": render.Commands,
+        "ns-viewer": tyro.conf.FlagConversionOff[RunViewer],
+    }
+    return {name: lambda words, kind=kind: tyro.cli(kind, args=words) for name, kind in kinds.items()}
+
+
+def assert_parses(page: str, line: str, parse: Callable[[list[str]], object], capsys: pytest.CaptureFixture) -> None:
+    try:
+        parse(shlex.split(line, comments=True)[1:])
+    except SystemExit as stop:
+        if stop.code != 0:  # not --help
+            pytest.fail(f"{page}: {line}\n{capsys.readouterr().err}")
+
+
+def test_our_command_lines_parse(capsys: pytest.CaptureFixture) -> None:
+    parse = partial(tyro.cli, Commands)
+    ours = [(page, line) for page, line in command_lines() if line.startswith("hsi-sc-nerf")]
+    assert len(ours) > 20
+    for page, line in ours:
+        assert_parses(page, line, lambda words: parse(args=words), capsys)
+    with pytest.raises(pytest.fail.Exception, match="no-such-option"):
+        assert_parses("page", "hsi-sc-nerf demo --no-such-option", lambda words: parse(args=words), capsys)
+
+
+@pytest.mark.slow
+def test_nerfstudios_command_lines_parse(capsys: pytest.CaptureFixture) -> None:
+    parsers = nerfstudio_parsers()
+    theirs = [(page, line) for page, line in command_lines() if line.startswith("ns-")]
+    assert len(theirs) > 8
+    for page, line in theirs:
+        assert_parses(page, line, parsers[line.split()[0]], capsys)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with the files that snippets name."""
+    pytest.importorskip("h5netcdf")
+    cloud = random_cloud(30, np.linspace(397.32, 1003.58, 204))
+    for file_format in ("ply", "netcdf"):
+        write_cloud(tmp_path / "point_cloud", stream(cloud), file_format)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("python"), ids=lambda value: value.splitlines()[0])
+def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
+    exec(compile(text, page, "exec"), {})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "analysis.classes.classify",
+        "evaluation.spatial.precision_recall_f_score",
+        "export.description.comment_lines",
+        "export.formats.write_cloud",
+        "export.options.select_bands",
+        "export.ply.read_spectral_ply",
+        "export.ply.write_spectral_ply",
+        "fields.grid_size.grid_for_resolution",
+        "findings.refuse_red",
+        "meshes.mesh.Mesh",
+        "models.losses.hsi_loss",
+        "numerics.spectral_angle",
+        "spectra.indices.index_values",
+        "surface.surface_depth.opacity_crossing_depth",
+    ],
+)
+def test_examples_of_docstrings_hold(name: str, folder: Path) -> None:
+    module, _, attribute = name.rpartition(".")
+    namespace = vars(import_module(f"hsi_sc_nerf.{module}")) | {"np": np, "Path": Path, "stream": stream}
+    (example,) = doctest.DocTestFinder(recurse=False).find(namespace[attribute], name, globs=namespace)
+    namespace["read_spectral_ply"] = import_module("hsi_sc_nerf.export.ply").read_spectral_ply
+    results = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
+    assert results.attempted > 0
+    assert results.failed == 0
+
+
+def test_every_name_in_an_example_exists() -> None:
+    """Examples that need a trained run or a session are not run; what they call must be there all the same."""
+    modules = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hsi_sc_nerf").rglob("*.py")}
+    known = {name for module in modules.values() for node in module.body for name in defined_names(node)}
+    known |= {*vars(builtins), "np", "torch", "Path"}
+    found = 0
+    for path, module in modules.items():
+        for node in ast.walk(module):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
+                steps = doctest.DocTestParser().get_examples(ast.get_docstring(node) or "")
+                example = ast.parse("".join(step.source for step in steps))
+                names = [name for name in ast.walk(example) if isinstance(name, ast.Name)]
+                own = {name.id for name in names if isinstance(name.ctx, ast.Store)}
+                own |= {argument.arg for argument in ast.walk(example) if isinstance(argument, ast.arg)}
+                unknown = {name.id for name in names} - own - known
+                assert not unknown, (
+                    f"{path.relative_to(ROOT)}: the example of {getattr(node, 'name', '')} uses {unknown}"
+                )
+                found += bool(steps)
+    assert found > 30
+
+
+def defined_names(node: ast.stmt) -> list[str]:
+    """Names that a statement at the top of a module defines; those from other packages too."""
+    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+        return [node.name]
+    if isinstance(node, (ast.Import, ast.ImportFrom)):
+        ours = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hsi_sc_nerf")
+        return [] if ours else [alias.asname or alias.name for alias in node.names]
+    return [name.id for name in ast.walk(node) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)]
