@@ -85,13 +85,14 @@ def poses_from_features(
         )
     found = adjust_tracks(start, free.tracks)
     found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
+    known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(
         angles=not hold_angles,
         known_focal=None if camera is None else (camera.intrinsics.fl_x, _FOCAL_SIGMA),
-        known_angles=None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg)),
+        known_angles=None if hold_angles else known_angles,
     )
-    if hold_angles and parameters.known_angles is not None:
-        held = replace(found.turntable, angles_rad=parameters.known_angles[0])
+    if hold_angles and known_angles is not None:
+        held = replace(found.turntable, angles_rad=known_angles[0])
         found = adjust_tracks(held, free.tracks, free=parameters)
     if camera is not None and info.camera_distance_m is None:
         info = replace(info, camera_distance_m=camera.distance_m)
