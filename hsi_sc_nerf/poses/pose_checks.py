@@ -20,8 +20,10 @@ _DISTANCE_PERCENT = 5.0
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
 _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
+# Given angles differ from found ones by up to this.
+_ANGLE_DEG = 1.0
 # Standard deviations, degrees, millimetres and percent of the scale: the goal, and what spoils a reconstruction.
-_GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 3.0)
+_GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 5.0)
 # So many frames that are left out for one reason are named in the finding; poses.json has all.
 _MOST_NAMES = 8
 
@@ -89,6 +91,15 @@ def _angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
             f"session.json says that the turntable turns {info.direction}, the images show {direction}; correct it."
         )
         found.append(Finding("poses-direction", "red", sentence, {"given": info.direction, "found": direction}))
+    if info.frame_angles_deg is not None and len(info.frame_angles_deg) == len(poses.used):
+        given = np.copysign(1.0, median) * np.abs(np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
+        away = (poses.angles_deg - given)[poses.used]
+        away = np.abs((away - np.median(away) + 180.0) % 360.0 - 180.0)
+        if away.max() > _ANGLE_DEG:
+            level: Level = "red" if np.median(away) > _ANGLE_DEG else "amber"
+            sentence = f"Angles depart from frame_angles_deg by {np.median(away):.1f} to {away.max():.1f} degrees."
+            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": float(away.max())}))
+        return found
     nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info)
     if nominal is None or deviation is None:
         return found
