@@ -12,11 +12,12 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
+from hsi_sc_nerf.poses.container_outline import container_radius
 from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import disc_height, lie_on_disc, scale_of
 from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
@@ -84,20 +85,21 @@ def poses_from_features(
         )
     found = adjust_tracks(start, free.tracks)
     found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
+    known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(
         angles=not hold_angles,
         known_focal=None if camera is None else (camera.intrinsics.fl_x, _FOCAL_SIGMA),
-        known_angles=None if angles_deg is None else _prior_of_angles(found.turntable, np.deg2rad(angles_deg)),
+        known_angles=None if hold_angles else known_angles,
     )
-    if hold_angles and parameters.known_angles is not None:
-        held = replace(found.turntable, angles_rad=parameters.known_angles[0])
+    if hold_angles and known_angles is not None:
+        held = replace(found.turntable, angles_rad=known_angles[0])
         found = adjust_tracks(held, free.tracks, free=parameters)
     if camera is not None and info.camera_distance_m is None:
         info = replace(info, camera_distance_m=camera.distance_m)
     return _posed(found, images, names, info, parameters, camera)
 
 
-def _prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "f"], float]:
+def prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "f"], float]:
     """Known angles of the turntable's frames, from its first angle on and in its direction, and their uncertainty.
 
     Steps that are found to be uneven count for little, even ones for much.
@@ -129,12 +131,13 @@ def _posed(
     if markers is None and camera is None:
         adjusted, findings = _with_halves(adjusted, found, parameters)
     if camera is not None:
-        findings = _camera_findings(adjusted, found, camera)
+        findings = check_camera(adjusted, found, camera)
     height, width = images[0].shape
-    if scale_of(adjusted.turntable, info)[0] is None:
+    outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
+    if scale_of(adjusted.turntable, info, None if outline is None else outline[0])[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
-            "give marker_side_m, or give camera_distance_m in session.json."
+            "give marker_side_m, or give camera_distance_m or the container's size in session.json."
         )
         findings.append(Finding("poses-no-scale", "amber", sentence))
     if not lie_on_disc(adjusted.turntable.corners()).any():
@@ -146,6 +149,7 @@ def _posed(
         names,
         (width, height),
         info,
+        outline,
         reprojection_error_px=turntable.over_session(found.frame_errors_px(), n),
         dropped={
             names[i]: "it shares too few features with other frames"
@@ -157,6 +161,16 @@ def _posed(
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
+    )
+
+
+def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> tuple[float, float] | None:
+    """The container's radius; its lid is where the features end."""
+    if info.container_diameter_m is None or info.container_height_m is None:
+        return None
+    grays = SessionPictures.of(images).named(GRAY)
+    return container_radius(
+        grays, turntable, disc_height(turntable), info.container_height_m / info.container_diameter_m
     )
 
 
@@ -173,7 +187,7 @@ def _with_halves(
     return replace(adjusted, inflation=float(inflation)), []
 
 
-def _camera_findings(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
+def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
     """Whether the features contradict the camera of the earlier session."""
     stated = pose_uncertainty(adjusted, adjusted.covariance())
     # What the images alone would state, without the known focal length.

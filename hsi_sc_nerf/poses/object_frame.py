@@ -1,7 +1,7 @@
 """The object frame and its scale: origin on the disc, x towards the first frame's camera, z along the axis, metres.
 
-Markers determine the disc. The scale comes from the markers' side, from the container that carries markers, or from
-the camera's distance.
+Markers determine the disc. The scale comes from the markers' side, from the container that carries markers, from its
+outline, or from the camera's distance.
 """
 
 from __future__ import annotations
@@ -133,14 +133,24 @@ def apparent_sides(
     return np.exp(logs - logs.mean()), np.sqrt(inverse[:, 6, 6])
 
 
-def scale_of(turntable: Turntable, info: SessionInfo) -> tuple[ScaleSource | None, float]:
-    """What gives the scale, None if nothing does; and the length of the turntable's unit in metres, 1 if unknown."""
+def scale_of(
+    turntable: Turntable, info: SessionInfo, container_radius: float | None = None
+) -> tuple[ScaleSource | None, float]:
+    """What gives the scale, None if nothing does; and the length of the turntable's unit in metres, 1 if unknown.
+
+    Args:
+        turntable: adjusted.
+        info: the markers' side, the container's diameter, the camera's distance.
+        container_radius: by its outline, in the turntable's unit.
+    """
     if len(turntable.markers):
         if info.marker_side_m is not None:
             return "markers", info.marker_side_m / turntable.side
         diameter = container_diameter(turntable, None)
         if info.container_diameter_m is not None and diameter is not None:
             return "container", info.container_diameter_m / diameter
+    if info.container_diameter_m is not None and container_radius is not None:
+        return "outline", info.container_diameter_m / (2.0 * container_radius)
     if info.camera_distance_m is not None:
         return "distance", info.camera_distance_m / turntable.distance
     return None, 1.0

@@ -14,12 +14,16 @@ REPROJECTION_TARGET_PX = 1.0
 _SIGMAS = 3.0
 # A plaque that carries a marker stands off the container's wall: the container is found wider by up to this.
 _LARGEST_PLAQUE_PERCENT = 2.5
+# A distance measured by tape, from a lens whose centre is inside, is good to this.
+_DISTANCE_PERCENT = 5.0
 # A marker's side is odd if it differs by this and by so many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
 _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
+# Given angles differ from found ones by up to this.
+_ANGLE_DEG = 1.0
 # Standard deviations, degrees, millimetres and percent of the scale: the goal, and what spoils a reconstruction.
-_GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 3.0)
+_GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 5.0)
 # So many frames that are left out for one reason are named in the finding; poses.json has all.
 _MOST_NAMES = 8
 
@@ -48,7 +52,7 @@ def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     if poses.wobble_deg is not None:
         sentence = f"The table wobbles by {poses.wobble_deg:.2f} degrees (RMS), so each frame has its own pose."
         found.append(Finding("poses-wobble", "amber", sentence))
-    return [*found, *_uncertainty(poses), *_angles(poses, info), *_scale(poses)]
+    return [*found, *_uncertainty(poses), *_angles(poses, info), *_scale(poses), *_distance(poses, info)]
 
 
 def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None:
@@ -87,6 +91,15 @@ def _angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
             f"session.json says that the turntable turns {info.direction}, the images show {direction}; correct it."
         )
         found.append(Finding("poses-direction", "red", sentence, {"given": info.direction, "found": direction}))
+    if info.frame_angles_deg is not None and len(info.frame_angles_deg) == len(poses.used):
+        given = np.copysign(1.0, median) * np.abs(np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
+        away = (poses.angles_deg - given)[poses.used]
+        away = np.abs((away - np.median(away) + 180.0) % 360.0 - 180.0)
+        if away.max() > _ANGLE_DEG:
+            level: Level = "red" if np.median(away) > _ANGLE_DEG else "amber"
+            sentence = f"Angles depart from frame_angles_deg by {np.median(away):.1f} to {away.max():.1f} degrees."
+            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": float(away.max())}))
+        return found
     nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info)
     if nominal is None or deviation is None:
         return found
@@ -126,6 +139,23 @@ def _scale(poses: TurntablePoses) -> list[Finding]:
             )
             found.append(Finding("poses-markers", "amber", sentence, {"marker": marker, "relative_side": side}))
     return found
+
+
+def _distance(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
+    """Whether the camera stands as far from the axis as is given, where something else gives the scale."""
+    if info.camera_distance_m is None or poses.scale is None or poses.scale.source == "distance":
+        return []
+    found_m = float(np.linalg.norm(poses.camera_to_world[poses.used][0, :2, 3]))
+    sigma = 0.0 if poses.uncertainty is None else poses.uncertainty.distance
+    percent = 100.0 * (found_m / info.camera_distance_m - 1.0)
+    values = {"difference_percent": percent, "uncertainty_percent": 100.0 * sigma}
+    if abs(percent) <= max(100.0 * _SIGMAS * sigma, _DISTANCE_PERCENT):
+        return []
+    sentence = (
+        f"The camera is {1e3 * found_m:.0f} mm from the axis by the poses, but camera_distance_m is "
+        f"{info.camera_distance_m:g}; measure it, the markers and the container again."
+    )
+    return [Finding("poses-scale", "red", sentence, values)]
 
 
 def _left_out(poses: TurntablePoses) -> str:

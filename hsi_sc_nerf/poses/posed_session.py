@@ -31,6 +31,7 @@ def in_object_frame(
     names: Sequence[str],
     size_px: tuple[int, int],
     info: SessionInfo,
+    outline: tuple[float, float] | None = None,
     **specific: Any,
 ) -> TurntablePoses:
     """The adjusted turntable in the object frame and in metres, frame by frame.
@@ -41,14 +42,20 @@ def in_object_frame(
         names: of the session's frames.
         size_px: width and height of the images.
         info: what is known of the session.
+        outline: the container's radius in the turntable's unit, and its standard deviation as a fraction.
         specific: what the method itself knows for ``TurntablePoses``.
     """
-    source, metres = scale_of(adjusted.turntable, info)
+    source, metres = scale_of(adjusted.turntable, info, None if outline is None else outline[0])
     turntable, n = adjusted.turntable.resized(metres), len(names)
     to_object = to_object_frame(turntable, disc_height(turntable))
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
     uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres)
+    if source == "outline" and outline is not None:
+        # What the focal length leaves open in the object's size is now open in the camera's distance.
+        away = float(np.hypot(uncertainty.size, outline[1]))
+        position_m = float(np.hypot(uncertainty.position_m, away * turntable.distance))
+        uncertainty = replace(uncertainty, size=outline[1], distance=away, position_m=position_m)
     return TurntablePoses(
         names=tuple(names),
         intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),

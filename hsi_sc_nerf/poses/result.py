@@ -23,7 +23,7 @@ class RejectedMarker:
     why: str
 
 
-ScaleSource: TypeAlias = Literal["markers", "container", "distance"]
+ScaleSource: TypeAlias = Literal["markers", "container", "outline", "distance"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Scale:
     """What gives the scale, and how well it is known. Fractions are of a length on the turntable."""
 
     source: ScaleSource
-    """The markers' side, the container that carries markers, or the given distance of the camera."""
+    """The markers' side, the container that carries markers, its outline, or the given distance of the camera."""
     marker_side_m: float | None
     """As given, or as measured; None without markers."""
     uncertainty: float

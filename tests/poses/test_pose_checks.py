@@ -10,11 +10,13 @@ from capture_factory import true_poses
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.poses.pose_checks import check_poses
-from hsi_sc_nerf.poses.result import Scale
+from hsi_sc_nerf.poses.result import Scale, Uncertainty
 
 GOOD = true_poses([None] * 4, list("abcd"))
 SCALE = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.0905)
 ODD = replace(SCALE, marker_sides={3: 1.02, 4: 0.98}, marker_side_sigmas={3: 0.002, 4: 0.02})
+OUTLINE = replace(SCALE, source="outline", measured_container_diameter_m=None)
+KNOWN = Uncertainty(0.001, 0.001, 0.001, np.zeros(4), 0.1, 0.0005)
 STEPS = SessionInfo(nominal_step_deg=90.0, direction="ccw")
 
 
@@ -32,6 +34,10 @@ def levels(poses, info=STEPS):
         (GOOD, replace(STEPS, direction="cw"), {"poses-direction": "red"}),
         (GOOD, replace(STEPS, nominal_step_deg=80.0), {"poses-angles": "red"}),
         (replace(GOOD, angles_deg=np.array([0.0, 90, 210, 270])), STEPS, {"poses-angles": "amber"}),
+        (GOOD, SessionInfo(frame_angles_deg=(5.0, 95.0, 185.0, 275.5)), {}),
+        (GOOD, SessionInfo(frame_angles_deg=(0.0, -90.0, -180.0, -270.0)), {}),
+        (GOOD, SessionInfo(frame_angles_deg=(0.0, 90.0, 180.0, 280.0)), {"poses-angles": "amber"}),
+        (GOOD, SessionInfo(frame_angles_deg=(0.0, 80.0, 160.0, 240.0)), {"poses-angles": "red"}),
         (replace(GOOD, used=np.array([True, False, True, True])), STEPS, {}),
         (replace(GOOD, scale=SCALE), STEPS, {"poses-scale": "green"}),
         (replace(GOOD, scale=replace(SCALE, measured_container_diameter_m=0.0958)), STEPS, {"poses-scale": "red"}),

@@ -1,0 +1,67 @@
+"""Prior knowledge beside features: an earlier camera, known angles, markers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
+from scipy.spatial.transform import Rotation
+from turntable_scene import MarkerScene
+
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
+from hsi_sc_nerf.poses.feature_poses import check_camera, prior_of_angles
+from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
+
+
+@pytest.fixture(scope="module")
+def session():
+    """A turntable with a few markers, and features that are biased as by a focal length that is 1.5 % too short."""
+    scene = MarkerScene(size_px=256, frames=18, disc_markers=2, side_markers=0)
+    true = point_turntable(marker_turntable(scene), 200)
+    biased = replace(true, focal_px=0.985 * true.focal_px, distance=0.985 * true.distance)
+    tracks = point_tracks(true)
+    noise = np.random.default_rng(0).normal(0.0, 0.05, tracks.pixels.shape)
+    tracks = replace(tracks, pixels=biased.reproject(tracks) + noise)
+    alone = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+    found = adjust_tracks(alone, tracks)
+    assert found.turntable.focal_px < 0.995 * true.focal_px
+    return scene, true, found
+
+
+def known_camera(scene, zoom=1.0):
+    lens = scene.intrinsics
+    lens = PinholeIntrinsics(lens.w, lens.h, zoom * lens.fl_x, zoom * lens.fl_y, lens.cx, lens.cy)
+    return KnownCamera(lens, (0.0, 0.0, 0.0, 0.0), scene.first_camera_to_world.copy())
+
+
+def test_two_markers_outweigh_biased_features(session):
+    _, true, found = session
+    adjusted, markers = adjust_together(found, marker_observations(true), FreeParameters())
+    assert len(markers) > 10
+    scale = true.side / adjusted.turntable.side
+    assert adjusted.turntable.focal_px == pytest.approx(true.focal_px, rel=0.005)
+    assert scale * adjusted.turntable.distance == pytest.approx(true.distance, rel=0.005)
+
+
+def test_an_earlier_camera_holds_and_is_contradicted_where_it_zoomed(session):
+    scene, true, found = session
+    for zoom, levels in ((1.2, ["red"]), (1.0, [])):
+        free = FreeParameters(known_focal=(zoom * true.focal_px, 0.002))
+        adjusted, _ = adjust_together(found, None, free)
+        assert adjusted.turntable.focal_px == pytest.approx(zoom * true.focal_px, rel=0.004)
+        assert [finding.level for finding in check_camera(adjusted, found, known_camera(scene, zoom))] == levels
+    leaning = known_camera(scene, zoom)
+    leaning.camera_to_world[:3, :3] = leaning.camera_to_world[:3, :3] @ Rotation.from_euler("z", 0.3).as_matrix()
+    assert [finding.level for finding in check_camera(adjusted, found, leaning)] == ["red"]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_known_angles_are_trusted_as_far_as_they_are_even(session, sign):
+    _, true, found = session
+    known, sigma = prior_of_angles(found.turntable, sign * true.angles_rad)
+    np.testing.assert_allclose(known, found.turntable.angles_rad, atol=0.01)
+    assert sigma < 0.003
+    uneven = true.angles_rad + np.tile([0.02, -0.02], len(true.angles_rad) // 2)
+    assert prior_of_angles(found.turntable, uneven)[1] == pytest.approx(0.02, rel=0.1)
