@@ -49,10 +49,7 @@ class Inspection:
         """Content of ``inspection.json``."""
         return {
             "session": str(self.session.path),
-            "findings": [
-                {"name": f.name, "level": f.level, "sentence": f.sentence, "values": dict(f.values)}
-                for f in self.findings
-            ],
+            "findings": [finding.as_json() for finding in self.findings],
             "session_json": self.session_json,
         }
 
