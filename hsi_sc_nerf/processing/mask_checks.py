@@ -63,7 +63,7 @@ def check_masks(
                 "masks-empty",
                 "red" if too_many else "amber",
                 f"Nothing of the object was found in {_named(names, empty)}; look at report/masks.png and "
-                "leave these frames out with --exclude NAME.",
+                f"leave these frames out with {_excluding(names, empty)}.",
                 {"frames": _list(names, empty)},
             )
         )
@@ -162,7 +162,7 @@ def _hull(
             "frames-hull",
             "red",
             f"The object in {_named(names, odd)} has another shape than in the other frames: it is another "
-            "object, or it was moved; leave these frames out with --exclude NAME.",
+            f"object, or it was moved; leave these frames out with {_excluding(names, odd)}.",
             {"frames": {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}},
         )
     ]
@@ -200,3 +200,8 @@ def _named(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> str:
     listed = _list(names, chosen)
     more = f" and {len(listed) - _MOST_NAMES} more" if len(listed) > _MOST_NAMES else ""
     return ", ".join(listed[:_MOST_NAMES]) + more
+
+
+def _excluding(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> str:
+    """The options that leave the chosen frames out."""
+    return " ".join(f"--exclude {name}" for name in _list(names, chosen))
