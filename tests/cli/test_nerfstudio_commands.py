@@ -127,13 +127,13 @@ def test_renders_of_paths(call, ffmpeg, tmp_path, kind):
 def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path):
     script = """
 import sys, torch, tyro
-import nerfstudio.models.nerfacto as nerfacto
+import torchmetrics.image.lpip as lpip
 
 class NoDownload(torch.nn.Module):  # LPIPS would fetch a network
     def __init__(self, **_):
         super().__init__()
 
-nerfacto.LearnedPerceptualImagePatchSimilarity = NoDownload
+lpip.LearnedPerceptualImagePatchSimilarity = NoDownload
 if __name__ == "__main__":
     from nerfstudio.scripts.train import entrypoint
     entrypoint()
