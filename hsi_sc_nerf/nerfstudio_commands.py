@@ -16,10 +16,12 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.checkpoints import find_checkpoint
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.trained_run import read_config
+from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 
 _SCRIPTS = tuple(f"nerfstudio.scripts.{name}" for name in ("eval", "exporter", "render", "viewer.run_viewer"))
 _REFUSED = {
@@ -109,6 +111,11 @@ def prepare(command: Any) -> bool:
             "ns-render dataset --downscale-factor: this method renders frames at their own size; leave the option "
             "out, or take `hsi-sc-nerf render`."
         )
+    if name == "RenderInterpolated" and command.pose_source == "eval" and _held_out_views(config) == 1:
+        raise InputError(
+            "ns-render interpolate goes from held-out view to held-out view, and this dataset has one; add "
+            "--pose-source train."
+        )
     if name == "ExportPointCloud":  # opens runs that were moved as well
         return True
     checkpoints = config.get_checkpoint_dir()
@@ -127,6 +134,15 @@ def prepare(command: Any) -> bool:
         CONSOLE.print("hsi-sc-nerf: the model predicts no normals; they are estimated from the points (open3d).")
         command.normal_method = "open3d"
     return True
+
+
+def _held_out_views(config: Any) -> int | None:
+    """Number of held-out views of a run's dataset; None where it is a session, or gone."""
+    manager = config.pipeline.datamanager
+    data = manager.data or manager.dataparser.data
+    if not is_packed(data):
+        return None
+    return len(split_frames(len(open_packed(data).frames), manager.dataparser.train_split_fraction)[1])
 
 
 def _write_mesh(mesh: Any, filename: str) -> None:

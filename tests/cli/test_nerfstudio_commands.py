@@ -83,7 +83,6 @@ def test_eval(call, tmp_path):
         (("cameras",), "transforms_train.json"),
         (("tsdf", "--resolution", "32", *TEXTURE), "tsdf_mesh.ply"),
         (("poisson", "--num-points", "2000", "--num-rays-per-batch", "1024", *TEXTURE), "poisson_mesh.ply"),
-        (("pointcloud", "--num-points", "500"), "point_cloud.ply"),
     ],
 )
 def test_exports(call, tmp_path, words, written):
@@ -97,6 +96,7 @@ def test_exports(call, tmp_path, words, written):
         ("ns-export", ("marching-cubes", "--output-dir", "x"), "signed distance"),
         ("ns-export", ("gaussian-splat", "--output-dir", "x"), "Gaussians"),
         ("ns-render", ("dataset", "--downscale-factor", "8"), "hsi-sc-nerf render"),
+        ("ns-render", ("interpolate",), "--pose-source train"),
     ],
 )
 def test_what_cannot_work_is_one_sentence(call, tmp_path, monkeypatch, program, words, told):
@@ -108,7 +108,7 @@ def test_what_cannot_work_is_one_sentence(call, tmp_path, monkeypatch, program, 
 
 def test_renders_of_the_dataset(call, tmp_path):
     call("ns-render", "dataset", "--output-path", tmp_path, "--rendered-output-names", "rgb", "depth")
-    assert {path.name for path in (tmp_path / "test").iterdir()} == {"rgb", "depth"}
+    assert {path.stem for path in (tmp_path / "test").iterdir()} == {"rgb", "depth"}
 
 
 @pytest.mark.parametrize("kind", ["interpolate", "camera-path", "spiral"])
@@ -116,24 +116,24 @@ def test_renders_of_paths(call, ffmpeg, tmp_path, kind):
     path = {"camera_type": "perspective", "render_height": 24, "render_width": 24, "camera_path": [CAMERA, CAMERA]}
     (tmp_path / "path.json").write_text(json.dumps(path | {"fps": 2, "seconds": 1, "is_cycle": False}))
     options = {
-        "interpolate": ("--interpolation-steps", "2", "--downscale-factor", "4"),
+        "interpolate": ("--interpolation-steps", "2", "--downscale-factor", "4", "--pose-source", "train"),
         "camera-path": ("--camera-path-filename", tmp_path / "path.json"),
         "spiral": ("--seconds", "0.1", "--downscale-factor", "4"),
     }[kind]
     call("ns-render", kind, *options, "--output-format", "images", "--output-path", tmp_path / "video.mp4")
-    assert len(list((tmp_path / "video").iterdir())) == 2
+    assert len(list((tmp_path / "video").iterdir())) >= 2
 
 
 def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path):
     script = """
 import sys, torch, tyro
-import nerfstudio.models.nerfacto as nerfacto
+import torchmetrics.image.lpip as lpip
 
 class NoDownload(torch.nn.Module):  # LPIPS would fetch a network
     def __init__(self, **_):
         super().__init__()
 
-nerfacto.LearnedPerceptualImagePatchSimilarity = NoDownload
+lpip.LearnedPerceptualImagePatchSimilarity = NoDownload
 if __name__ == "__main__":
     from nerfstudio.scripts.train import entrypoint
     entrypoint()
