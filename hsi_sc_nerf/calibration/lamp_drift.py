@@ -31,8 +31,11 @@ BINS = 12
 """Bins of bands in which static pixels are searched for."""
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a band in the curve's fit."""
-DEGREE = 2
-"""Degree of the curve over 1 / wavelength. Changes of output and of colour temperature are linear in it."""
+DEGREE, MIN_BANDS = 5, 3
+"""Largest degree of the curve over 1 / wavelength, and fewest bands: a change of output and of colour temperature is
+linear in it, but lamps may lose more in the blue alone."""
+RANK_MARGIN = 1.5
+"""Singular values of the drift count from this many times the largest of pure noise."""
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
@@ -99,7 +102,7 @@ def measure_lamp_drift(
     """
     if frames < 2:
         return NotMeasurable("there is a single frame")
-    if len(wavelengths_nm) <= DEGREE:
+    if len(wavelengths_nm) < MIN_BANDS:
         return NotMeasurable(f"{len(wavelengths_nm)} bands are too few for a curve over the wavelength")
     survey = _Survey(read_lines, frames, dark, noise, saturation_counts, dead)
     counts, variance, unusable = survey.read_bins(_bins(wavelengths_nm))
@@ -113,9 +116,9 @@ def measure_lamp_drift(
     deviation, scatter, grey_error = grey_deviation(courses, image, common)
     total, variance = survey.sum_over(image, unusable, np.exp(-deviation))
     lit = (total > MIN_SIGNAL * np.sqrt(variance)).all(axis=0)
-    if lit.sum() <= DEGREE:
+    if lit.sum() < MIN_BANDS:
         return NotMeasurable("what stands still in the image is too dark")
-    basis = smooth_basis(wavelengths_nm, lit, DEGREE)
+    basis = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
     measured = np.full(total.shape, np.nan)
     measured[:, lit] = total[:, lit] / total[0, lit]
     coefficients, covariance = fit_over_wavelength(
@@ -123,9 +126,10 @@ def measure_lamp_drift(
     )
     # The first term is constant over the bands, as the grey level's error is.
     covariance[0, 0] += grey_error**2
-    factor = np.exp((coefficients - coefficients[0]) @ basis.T)
+    smooth, variance = common_courses(coefficients, covariance, basis)
+    factor = np.exp(smooth - smooth[0])
     # The first frame's error is part of all the others.
-    standard_error = factor * np.sqrt(2.0 * np.einsum("bi,ij,bj->b", basis, covariance, basis))
+    standard_error = factor * np.sqrt(variance + variance[0])
     standard_error[0] = 0.0
     p_value = drift_p_value(coefficients, covariance)
     return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
@@ -183,6 +187,28 @@ def fit_over_wavelength(
     degrees = (len(log_light) - 1) * max(1, basis.shape[0] - basis.shape[1])
     scatter = float((residual**2 / variance).sum()) / degrees
     return coefficients, covariance * max(1.0, scatter)
+
+
+def common_courses(
+    coefficients: Float[np.ndarray, "frames terms"],
+    covariance: Float[np.ndarray, "terms terms"],
+    basis: Float[np.ndarray, "bands terms"],
+) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
+    """The curves of all frames as few courses over the session, each with one spectrum; and their variance.
+
+    Lamps drift with one course or two, so that the frames tell the spectrum of the drift together. The courses are
+    the singular vectors of the coefficients, in units of their errors, that exceed noise, at least the first. The
+    variance is to first order that of a truncated singular value decomposition.
+    """
+    root = np.linalg.cholesky(covariance)
+    left, singular, right = np.linalg.svd(np.linalg.solve(root, coefficients.T).T, full_matrices=False)
+    of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
+    rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
+    curves = ((left[:, :rank] * singular[:rank]) @ right[:rank]) @ root.T @ basis.T
+    of_band = basis @ root
+    leverage = np.square(left[:, :rank]).sum(axis=1)[:, None]
+    within = np.square(of_band @ right[:rank].T).sum(axis=1)
+    return curves, leverage * np.square(of_band).sum(axis=1) + (1.0 - leverage) * within
 
 
 def drift_p_value(

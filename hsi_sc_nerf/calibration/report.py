@@ -146,7 +146,7 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
     top = np.percentile(white.deviation, 99.0)
     shown = axes["deviation"].imshow(white.deviation, cmap="viridis", extent=extent, vmin=0.0, vmax=top)
     figure.colorbar(shown, ax=axes["deviation"], extend="max", shrink=0.8)
-    axes["deviation"].set_title(f"Deviation D from the mean spectrum, median {np.median(white.deviation):.4f}")
+    axes["deviation"].set_title(f"Deviation D from the mean, median {np.median(white.deviation):.4f}")
     for name, step in {"lower": -PERCENTILE_STEP, "used": 0.0, "higher": PERCENTILE_STEP}.items():
         percentile = min(paper.WHITE_PERCENTILE + step, 100.0)
         mask = white_mask(white.deviation, percentile=percentile, kernel_px=white.kernel_px)
