@@ -118,8 +118,23 @@ def prepare(command: Any) -> bool:
             "folder that the run was trained from."
         )
     find_checkpoint(checkpoints)
+    if name == "ExportTSDFMesh":
+        from nerfstudio.exporter.tsdf_utils import TSDF
+
+        TSDF.export_mesh = staticmethod(_write_mesh)  # type: ignore[method-assign, assignment]
     no_normals = not config.pipeline.model.predict_normals
     if name == "ExportPoissonMesh" and command.normal_method == "model_output" and no_normals:
         CONSOLE.print("hsi-sc-nerf: the model predicts no normals; they are estimated from the points (open3d).")
         command.normal_method = "open3d"
     return True
+
+
+def _write_mesh(mesh: Any, filename: str) -> None:
+    """What `TSDF.export_mesh` does by pymeshlab, which dies when it is given arrays of NumPy 2."""
+    import trimesh
+
+    vertices, faces, normals, colours = (
+        values.cpu().numpy() for values in (mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
+    )
+    rgb = (255 * colours.clip(0.0, 1.0)).astype("uint8")
+    trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=rgb, process=False).export(filename)

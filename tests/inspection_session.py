@@ -14,6 +14,7 @@ from hsi_sc_nerf.capture.envi import write_cube
 WAVELENGTHS_NM = np.linspace(420.0, 900.0, 9)
 LAMP = 1500.0 + 200.0 * np.arange(9)
 DARK = 100
+READ_NOISE_COUNTS = 4
 SIZE_PX = 128
 
 
@@ -36,8 +37,8 @@ def frame_picture(
 def write_one(folder: Path, name: str, reflectance: np.ndarray, *, seed: int = 0, **fields) -> None:
     """A capture with a dark cube, with read noise."""
     rng = np.random.default_rng([seed, sum(name.encode())])
-    counts = np.clip(reflectance * LAMP + DARK + rng.normal(0, 4, reflectance.shape), 0, 4095)
-    dark = rng.normal(DARK, 4, (2, *reflectance.shape[1:]))
+    counts = np.clip(reflectance * LAMP + DARK + rng.normal(0, READ_NOISE_COUNTS, reflectance.shape), 0, 4095)
+    dark = rng.normal(DARK, READ_NOISE_COUNTS, (2, *reflectance.shape[1:]))
     for prefix, cube in (("", counts), ("DARKREF_", dark)):
         write_cube(
             folder / name / "capture" / f"{prefix}{name}.hdr",

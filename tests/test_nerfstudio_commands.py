@@ -71,7 +71,7 @@ def test_poisson_estimates_normals_where_the_model_has_none(ours):
     [
         ("hsi_sc_nerf.models.stages.StageConfig", "hsi_sc_nerf.models.gone.StageConfig"),
         ("hsi_sc_nerf.models.stages.StageConfig", "hsi_sc_nerf.models.stages.Gone"),
-        ("  learn_after: ", "  learned_after: "),
+        ("learn_after:", "learned_after:"),
         ("!!python/object", "[ !!python/object"),
     ],
 )

@@ -14,12 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import tyro
 from random_cloud import random_cloud
 
 from hsi_sc_nerf.cli.main import Commands
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.formats import write_cloud
+from hsi_sc_nerf.export.ply import read_spectral_ply
 
 ROOT = Path(__file__).parents[1]
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]}
@@ -108,14 +110,13 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "analysis.classes.classify",
         "evaluation.spatial.precision_recall_f_score",
         "export.description.comment_lines",
         "export.formats.write_cloud",
         "export.options.select_bands",
         "export.ply.read_spectral_ply",
         "export.ply.write_spectral_ply",
-        "fields.grid_size.grid_for_resolution",
+        "fields.hash_grid.grid_for_resolution",
         "findings.refuse_red",
         "meshes.mesh.Mesh",
         "models.losses.hsi_loss",
@@ -126,33 +127,32 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
 )
 def test_examples_of_docstrings_hold(name: str, folder: Path) -> None:
     module, _, attribute = name.rpartition(".")
-    namespace = vars(import_module(f"hsi_sc_nerf.{module}")) | {"np": np, "Path": Path, "stream": stream}
-    (example,) = doctest.DocTestFinder(recurse=False).find(namespace[attribute], name, globs=namespace)
-    namespace["read_spectral_ply"] = import_module("hsi_sc_nerf.export.ply").read_spectral_ply
+    namespace = vars(import_module(f"hsi_sc_nerf.{module}"))
+    context = {"np": np, "torch": torch, "Path": Path, "stream": stream, "read_spectral_ply": read_spectral_ply}
+    finder = doctest.DocTestFinder(recurse=False)
+    (example,) = finder.find(namespace[attribute], name, globs=context | namespace)
     results = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
     assert results.attempted > 0
     assert results.failed == 0
 
 
-def test_every_name_in_an_example_exists() -> None:
+def test_every_function_that_an_example_calls_exists() -> None:
     """Examples that need a trained run or a session are not run; what they call must be there all the same."""
     modules = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hsi_sc_nerf").rglob("*.py")}
     known = {name for module in modules.values() for node in module.body for name in defined_names(node)}
-    known |= {*vars(builtins), "np", "torch", "Path"}
+    known |= {*vars(builtins), "Path"}
     found = 0
-    for path, module in modules.items():
-        for node in ast.walk(module):
-            if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
-                steps = doctest.DocTestParser().get_examples(ast.get_docstring(node) or "")
-                example = ast.parse("".join(step.source for step in steps))
-                names = [name for name in ast.walk(example) if isinstance(name, ast.Name)]
-                own = {name.id for name in names if isinstance(name.ctx, ast.Store)}
-                own |= {argument.arg for argument in ast.walk(example) if isinstance(argument, ast.arg)}
-                unknown = {name.id for name in names} - own - known
-                assert not unknown, (
-                    f"{path.relative_to(ROOT)}: the example of {getattr(node, 'name', '')} uses {unknown}"
-                )
-                found += bool(steps)
+    for path, node in ((path, node) for path, module in modules.items() for node in ast.walk(module)):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
+            steps = doctest.DocTestParser().get_examples(ast.get_docstring(node) or "")
+            example = list(ast.walk(ast.parse("".join(step.source for step in steps))))
+            called = {
+                node.func.id for node in example if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+            }
+            own = {node.id for node in example if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+            unknown = called - own - known
+            assert not unknown, f"{path.relative_to(ROOT)}: an example calls {unknown}"
+            found += bool(steps)
     assert found > 30
 
 

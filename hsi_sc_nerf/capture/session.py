@@ -23,6 +23,8 @@ from hsi_sc_nerf.errors import InputError
 
 # Headers list centres to about 0.01 nm; two captures of one instrument agree to that.
 _SAME_WAVELENGTH_NM = 0.01
+# Words in the name of a white reference that nobody named in session.json.
+_WHITE_WORDS = ("white", "tarp", "spectralon", "panel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +189,10 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
     kept = [files for files in found.captures if files.name not in exclude]
     captures = open_captures(kept, info, path, damaged)
+    info = replace(info, white_reference=_white_name(info, [*(files.name for files in kept), *damaged]))
     white_name = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
-    if broken_white is None and not captures:  # all for the same reason, most likely
+    if broken_white is None and damaged and not captures:  # all for the same reason, most likely
         broken_white = next(iter(damaged.values()))
     if broken_white is not None:
         raise InputError(f"{broken_white}.")
@@ -213,6 +216,15 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     return Session(
         path, info, tarp, tuple(frames), rotation_deg, damaged=damaged, skipped=found.skipped, excluded=tuple(exclude)
     )
+
+
+def _white_name(info: SessionInfo, names: list[str]) -> str:
+    """The stated name of the white reference; of the default, the one capture whose name says that it is a white."""
+    stated = info.white_reference != SessionInfo.white_reference
+    if stated or info.white_reference in (name.lower() for name in names):
+        return info.white_reference
+    telling = [name for name in names if any(word in name.lower() for word in _WHITE_WORDS)]
+    return telling[0] if len(telling) == 1 else info.white_reference
 
 
 def in_short(damaged: Mapping[str, str]) -> str:

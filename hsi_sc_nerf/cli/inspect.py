@@ -13,7 +13,7 @@ from rich.markup import escape
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
+from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, inspect_session
 from hsi_sc_nerf.inspection.picture import draw_inspection
 from hsi_sc_nerf.inspection.session_json import suggestion
 from hsi_sc_nerf.inspection.watch import Watch
@@ -54,7 +54,7 @@ class InspectCommand:
         inspection = inspect_session(session)
         show_findings(console, inspection)
         if self.output_dir is not None:
-            write_json(self.output_dir / "inspection.json", inspection.report())
+            write_json(self.output_dir / INSPECTION_NAME, inspection.report())
             draw_inspection(inspection, self.output_dir / "inspection.png")
             console.print(f"{self.output_dir}: inspection.json and inspection.png are written.", highlight=False)
         red = [finding.sentence for finding in inspection.findings if finding.level == "red"]

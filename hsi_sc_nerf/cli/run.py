@@ -82,17 +82,19 @@ class RunCommand:
         """Run the steps that are not up to date and print what was found.
 
         Raises:
-            InputError: a step failed, or the output folder holds something else.
+            InputError: a step failed, there is no session, or the output folder holds something else.
         """
         check_options(self)
-        steps = self._steps()
         out = self.output_dir
+        if not self.session.is_dir():
+            raise InputError(f"{self.session}: is no folder; give that of a capture session.")
         if out.resolve() == self.session.resolve():
             raise InputError(f"{out}: is the session itself; choose another --output-dir.")
         make_folder(out)
         if not (out / STEPS_NAME).is_file() and any(out.iterdir()):
             raise InputError(f"{out}: holds something other than a run of `hsi-sc-nerf run`; choose another folder.")
         console = Console(highlight=False, soft_wrap=True)
+        steps = self._steps()
         for number, step in enumerate(steps, start=1):
             self._bring_up_to_date(step, console, f"[bold]{number}/{len(steps)} {step.name}[/bold]")
         _show_results(out, console)

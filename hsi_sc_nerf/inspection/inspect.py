@@ -20,6 +20,7 @@ from hsi_sc_nerf.inspection.session_json import check_scale, filled_in
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.upright import rotation_from_corners
 
+INSPECTION_NAME = "inspection.json"
 UPRIGHT_FRAMES = 6
 """Frames from whose markers the upright direction is measured."""
 FEWEST_SIGHTINGS = 4
@@ -48,10 +49,7 @@ class Inspection:
         """Content of ``inspection.json``."""
         return {
             "session": str(self.session.path),
-            "findings": [
-                {"name": f.name, "level": f.level, "sentence": f.sentence, "values": dict(f.values)}
-                for f in self.findings
-            ],
+            "findings": [finding.as_json() for finding in self.findings],
             "session_json": self.session_json,
         }
 

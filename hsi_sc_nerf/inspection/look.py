@@ -112,6 +112,18 @@ def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
 
+def reflectance_noise(session: Session) -> float:
+    """Upper limit of the standard deviation of one value's reflectance, the median over the bands.
+
+    It is measured between the first two frames. A change of the lamps does not count; what turns does, so that the
+    limit is 1.3 times the noise where a third of the picture turns, and twice where half does.
+    """
+    first, second = (_light(frame, _some_lines(frame.cube.memmap()))[0] for frame in session.frames[:2])
+    change = (second - first) / white_level(session)
+    away = np.abs(change - np.median(change, axis=(0, 1)))
+    return float(np.median(1.4826 * np.median(away, axis=(0, 1))) / np.sqrt(2.0))
+
+
 def saturation_level(session: Session, looks: Sequence[Look]) -> float | None:
     """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
     brightest = sorted(range(len(looks)), key=lambda index: -looks[index].top_counts)[:3]

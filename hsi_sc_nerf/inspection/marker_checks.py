@@ -14,7 +14,7 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.inspection.file_checks import names_in_short
-from hsi_sc_nerf.inspection.look import WORKERS, Look
+from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
 from hsi_sc_nerf.inspection.turn import frame_angles_deg
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
@@ -103,7 +103,7 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:
     """The findings ``markers``, ``turn`` and ``expected-accuracy``."""
-    return [_seen(session, markers), _turn(session, markers), _expected(markers)]
+    return [_seen(session, markers), _turn(session, markers), _expected(session, markers)]
 
 
 def _seen(session: Session, markers: Markers) -> Finding:
@@ -172,8 +172,9 @@ def _turn(session: Session, markers: Markers) -> Finding:
     return Finding("turn", "green", f"Turn: {told}, a whole turn.", values)
 
 
-def _expected(markers: Markers) -> Finding:
-    spectra = "the uncertainty of spectra is not known before calibration"
+def _expected(session: Session, markers: Markers) -> Finding:
+    noise = reflectance_noise(session)
+    spectra = f"one value of a pixel's reflectance has a noise of at most {noise:.2g}, measured between two frames"
     if markers.dictionary is None:
         poses = "what poses are worth is not known without markers"
     elif np.median([len(seen) for seen in markers.detections]) == 0 or markers.side_px < EXPECTED[-1][0]:
@@ -184,4 +185,4 @@ def _expected(markers: Markers) -> Finding:
             f"simulated sessions with such markers have poses within {rotation_deg:g} degrees and {position_mm:g} mm "
             "(docs/validation/poses.md)"
         )
-    return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.")
+    return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.", {"reflectance_noise": noise})

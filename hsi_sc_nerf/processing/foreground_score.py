@@ -22,7 +22,7 @@ SMOOTHING_PX = 0.5
 MAX_COMPONENTS = 6
 """Largest number of principal components of the background: boards with two paints have three."""
 BORDER_FRACTION = 1 / 8
-"""Width of the margin that shows the background where the container is not known, of the image's shorter side."""
+"""Width of the margins that show the background where the container is not known, of the image's shorter side."""
 # The smallest subspace is taken that separates object and background by this fraction of the best.
 _OF_BEST_SEPARATION = 0.8
 _SAMPLED_PIXELS = 200_000
@@ -68,12 +68,12 @@ def background_subspace(
     Args:
         bins: of each frame (`smoothed_bins`).
         regions: pixels of each frame that may be the object's; the background is learned from the others. Without
-            them it is learned from the margins on the left, on the right and at the top.
+            them it is learned from the margins on the left and on the right.
     """
     shape = bins[0].shape[1:]
     margin = np.ones(shape, bool)
     width = max(1, round(BORDER_FRACTION * min(shape)))
-    margin[width:, width:-width] = False
+    margin[:, width:-width] = False  # the object may reach the top
     step = max(1, len(bins) * margin.size // _SAMPLED_PIXELS)
     spectra, outside = [], []
     for index, image in enumerate(bins):

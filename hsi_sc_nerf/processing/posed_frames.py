@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.findings import refuse_red
+from hsi_sc_nerf.findings import Finding, refuse_red
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
 from hsi_sc_nerf.poses.known_camera import KnownCamera
@@ -42,7 +42,7 @@ def pose_frames(
     console: Console,
     find_poses: PoseFunction,
     marker_range_nm: tuple[float, float] = (450.0, 700.0),
-    accepted: Collection[str] = (),
+    check: Callable[[Sequence[Finding]], None] = refuse_red,
 ) -> TurntablePoses:
     """Find and check the poses, write ``poses.json`` and its figure, and print what was found.
 
@@ -51,11 +51,11 @@ def pose_frames(
         images: the mean over ``marker_range_nm`` of each frame.
         info: what is known of the session, settings included.
         camera: of an earlier session, if it is known.
-        method, config, find_poses: how poses are found.
+        method, find_poses: how poses are found.
         output_dir: the dataset.
         console: prints.
         marker_range_nm: range in which the markers' ink is visible.
-        accepted: names of checks whose red findings the user accepts.
+        check: called with the findings on the poses; raises where one is red.
 
     Raises:
         InputError: no method finds poses, a check of them is red, or the operating system refused to write.
@@ -95,11 +95,11 @@ def pose_frames(
         if best.keys() != {GRAY}:
             seen_in = ", ".join(f"{name} ({count} frames)" for name, count in best.most_common())
             console.print(f"Markers stand out best in {seen_in}.", highlight=False)
-    for warning in (*report["warnings"], *_lying_on_its_side(session, report["axis_tilt_in_image_deg"])):
+    for warning in _lying_on_its_side(session, report["axis_tilt_in_image_deg"]):
         console.print(f"Warning: {warning}", highlight=False)
     for name in np.array(names)[~poses.used]:
         _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
-    refuse_red(findings, accepted)
+    check(findings)
     return poses
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.calibration.calibration_checks import check_calibration
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
@@ -26,7 +26,7 @@ from hsi_sc_nerf.capture.session import Session, in_short, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.findings import refuse_red
-from hsi_sc_nerf.inspection.inspect import inspect_session
+from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
 from hsi_sc_nerf.inspection.session_json import suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
@@ -53,9 +53,8 @@ from hsi_sc_nerf.processing.posed_frames import (
 )
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
+from hsi_sc_nerf.processing.session_checks import SessionChecks
 from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -135,10 +134,13 @@ def process_session(
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    session = _checked(session, config, console)
+    inspection = _checked(session, config, console)
+    session = inspection.session
     _remove_transforms(output_dir)
+    checks = SessionChecks(inspection, config.accept, output_dir)
 
     calibration = _calibrate(session, config, output_dir, console)
+    checks.add(check_calibration(session, calibration))
     caches = pack_frames(
         session,
         calibration,
@@ -161,12 +163,12 @@ def process_session(
         console,
         estimate_poses,
         config.marker_range_nm,
-        config.accept,
+        checks.add,
     )
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
-    masks = _write_masks(caches, frames, poses, container, config, output_dir, console)
+    masks = _write_masks(caches, frames, poses, container, config.masks, output_dir, console, checks)
     object_box_m, scene_box_m = _boxes(session, frames, masks, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
@@ -200,8 +202,8 @@ def process_session(
     return output_dir
 
 
-def _checked(session: Session, config: ProcessConfig, console: Console) -> Session:
-    """The session, upright, after the checks of `inspect_session`.
+def _checked(session: Session, config: ProcessConfig, console: Console) -> Inspection:
+    """The checks of `inspect_session`, with the session upright.
 
     Raises:
         InputError: a finding is red and not accepted.
@@ -218,7 +220,7 @@ def _checked(session: Session, config: ProcessConfig, console: Console) -> Sessi
         if finding.name == "scale" and finding.level == "red" and not session.info_path.is_file():
             console.print(suggestion(session, inspection.session_json), highlight=False)
     refuse_red(findings, config.accept)
-    return inspection.session
+    return inspection
 
 
 def _named_files(config: ProcessConfig) -> list[Path]:
@@ -263,9 +265,10 @@ def _write_masks(
     frames: Sequence[PackedFrame],
     poses: TurntablePoses,
     container: Container | None,
-    config: ProcessConfig,
+    config: MaskConfig,
     output_dir: Path,
     console: Console,
+    checks: SessionChecks,
 ) -> Bool[np.ndarray, "frames h w"]:
     """Find, write, draw and check the foreground masks of the posed frames.
 
@@ -277,11 +280,11 @@ def _write_masks(
         distortion = np.array(poses.distortion, dtype=float)
         regions = np.stack(
             [
-                above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.masks.overhang)
+                above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
                 for frame in frames
             ]
         )
-    masks = foreground_masks([cache.bins for cache in caches], config.masks, regions)
+    masks = foreground_masks([cache.bins for cache in caches], config, regions)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
     images, names = [frame.pseudo_rgb() for frame in frames], [frame.capture for frame in frames]
@@ -296,10 +299,7 @@ def _write_masks(
         regions,
         None if container is None else container.height_m,
     )
-    for finding in findings:
-        if finding.level == "amber" or finding.name in config.accept:
-            _log.warning("%s: %s", finding.name, finding.sentence)
-    refuse_red(findings, config.accept)
+    checks.add(findings)
     return masks
 
 

@@ -272,11 +272,13 @@ class SpectralPanel(torch.nn.Module):
         rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
         ahead = rotation.as_matrix()[:, 2] * views.distance(view) * VISER_NERFSTUDIO_SCALE_RATIO
         position = views.centres[view].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO
+        # A browser that is still laying out its page says 0 or NaN.
+        aspect = client.camera.aspect if client.camera.aspect > 0.0 else 1.0
         with client.atomic():
             client.camera.position = position - behind * ahead
             client.camera.look_at = position + ahead
             client.camera.wxyz = rotation.wxyz
-            client.camera.fov = views.vertical_fov(view, client.camera.aspect)
+            client.camera.fov = views.vertical_fov(view, aspect)
 
     def _switch_picking(self, checkbox: ViewerCheckbox) -> None:
         if checkbox.value:

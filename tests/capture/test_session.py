@@ -153,6 +153,18 @@ def test_a_cube_without_header_is_named(tmp_path):
     assert list(open_session(tmp_path, skip_damaged=True).damaged) == ["ball_3.raw"]
 
 
+@pytest.mark.parametrize(("others", "white"), [((), "Tarp_2"), (("panel",), None)])
+def test_a_white_is_known_by_its_name_if_it_is_the_only_one(tmp_path, others, white):
+    for name in ("a", "b", "Tarp_2", *others):
+        write_capture(tmp_path, name, COUNTS)
+    if white is None:
+        with pytest.raises(InputError, match="no capture called white_reference"):
+            open_session(tmp_path)
+    else:
+        session = open_session(tmp_path)
+        assert (session.white.name, session.info.white_reference) == (white, white)
+
+
 def test_opening_reads_no_data(tmp_path, monkeypatch):
     write_session(tmp_path)
     monkeypatch.setattr(np, "memmap", None)

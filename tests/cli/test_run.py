@@ -22,13 +22,13 @@ TRAIN = " ".join(
 )
 
 
-def words(session, out, iterations):
-    options = ["--max-num-iterations", str(iterations), "--num-points", "3000", f"--train={TRAIN}"]
+def words(session, out):
+    options = ["--max-num-iterations", "150", "--num-points", "3000", f"--train={TRAIN}"]
     return [sys.executable, "-m", "hsi_sc_nerf.cli.main", "run", str(session), "--output-dir", str(out), *options]
 
 
-def run(session, out, iterations=150):
-    made = subprocess.run(words(session, out, iterations), capture_output=True, text=True)
+def run(session, out):
+    made = subprocess.run(words(session, out), capture_output=True, text=True)
     assert made.returncode == 0, made.stdout + made.stderr
     return made.stdout
 
@@ -39,16 +39,34 @@ def done(printed):
 
 
 @pytest.fixture(scope="module")
-def whole(tiny_dataset, tmp_path_factory):
+def killed(tiny_dataset, tmp_path_factory):
+    """A run that was killed in its training, after the first checkpoint."""
     out = tmp_path_factory.mktemp("run") / "out"
-    return tiny_dataset[1], out, run(tiny_dataset[1], out)
+    process = subprocess.Popen(words(tiny_dataset[1], out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    weights = out / "training" / "hsi-sc-nerf" / "run" / "nerfstudio_models"
+    started = time.monotonic()
+    while not any(weights.glob("*.ckpt")):
+        assert process.poll() is None
+        assert time.monotonic() - started < 600
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not json.loads((out / STEPS_NAME).read_text())["train"]["finished"]
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_dataset, killed):
+    """The run brought to its end by a second call."""
+    return tiny_dataset[1], killed, run(tiny_dataset[1], killed)
 
 
 @pytest.mark.slow
-def test_every_step_is_run_and_its_command_shown(whole):
-    session, out, printed = whole
-    assert done(printed) == ALL
-    assert f"hsi-sc-nerf process {session} --output-dir {out / 'data'}" in printed
+def test_a_killed_run_goes_on_and_shows_its_commands(whole):
+    _, out, printed = whole
+    assert done(printed) == ALL[1:]
+    assert f"--load-dir {out / 'training' / 'hsi-sc-nerf' / 'run' / 'nerfstudio_models'}" in printed
+    assert "Going on from" in (out / "logs" / "train.log").read_text()
     for command in ("ns-train hsi-sc-nerf --data", "ns-eval --load-config", "ns-export pointcloud", "report.html"):
         assert command in printed
     assert "SAM 0." in printed
@@ -65,25 +83,6 @@ def test_a_second_call_does_nothing_and_a_removed_cloud_is_made_again(whole):
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()} == files
     (out / "point_cloud.ply").unlink()
     assert done(run(session, out)) == ["export", "traits", "report"]
-
-
-@pytest.mark.slow
-def test_a_killed_training_goes_on(tiny_dataset, tmp_path):
-    out = tmp_path / "out"
-    process = subprocess.Popen(words(tiny_dataset[1], out, 400), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    weights = out / "training" / "hsi-sc-nerf" / "run" / "nerfstudio_models"
-    started = time.monotonic()
-    while not any(weights.glob("*.ckpt")):
-        assert process.poll() is None
-        assert time.monotonic() - started < 300
-        time.sleep(0.1)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not json.loads((out / STEPS_NAME).read_text())["train"]["finished"]
-    printed = run(tiny_dataset[1], out, 400)
-    assert done(printed) == ALL[1:]
-    assert f"--load-dir {weights}" in printed
-    assert "Going on from" in (out / "logs" / "train.log").read_text()
 
 
 def test_a_step_depends_on_its_words_and_files(tmp_path):
@@ -103,7 +102,9 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("x")
-    for session, told in ((tmp_path / "session", "something other"), (out, "is the session itself")):
+    (tmp_path / "session").mkdir()
+    nowhere = tmp_path / "nowhere"
+    for session, told in ((tmp_path / "session", "something other"), (out, "session itself"), (nowhere, "no folder")):
         with pytest.raises(InputError, match=told):
             RunCommand(session, out, max_num_iterations=5).main()
     assert [path.name for path in out.iterdir()] == ["thesis.txt"]

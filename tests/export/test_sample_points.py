@@ -206,7 +206,7 @@ def test_what_is_no_run_is_refused_in_a_sentence(tmp_path, run_config):
         trained_run.open_run(tmp_path / "config.yml")
     other = tmp_path / "config.yml"
     other.write_text("a: 1\n")
-    with pytest.raises(InputError, match=r"is no run of hsi-sc-nerf"):
+    with pytest.raises(InputError, match=r"config\.yml: .*give the config\.yml of a run"):
         trained_run.open_run(other)
     alone = tmp_path / "alone.yml"
     alone.write_text(run_config.read_text())

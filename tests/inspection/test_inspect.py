@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inspection_session import SIZE_PX, frame_picture, write_one, write_turntable
+from inspection_session import LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_picture, write_one, write_turntable
 
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.findings import Finding
@@ -44,6 +44,8 @@ def test_a_good_session_is_green(good, tmp_path):
     assert {name: f.sentence for name, f in findings.items() if f.level != "green"} == {}
     assert findings["turn"].values["direction"] == "ccw"
     assert findings["turn"].values["usual_step_deg"] == pytest.approx(30.0, abs=0.5)
+    noise = float(np.median(READ_NOISE_COUNTS / (0.98 * LAMP)))
+    assert noise < findings["expected-accuracy"].values["reflectance_noise"] < 2.0 * noise
     assert findings["frames"].values["frames"] == [f"fruit_{i:02d}" for i in range(12)]
     draw_inspection(inspection, tmp_path / "inspection.png")
     assert (tmp_path / "inspection.png").stat().st_size > 10_000

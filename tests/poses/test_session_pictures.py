@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from turntable_scene import MarkerScene
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.poses.known_camera import KnownCamera
@@ -338,5 +340,5 @@ def test_pictures_are_not_read_where_nothing_is_measured(tmp_path):
     cw = replace(info, direction="cw")
     with pytest.raises(InputError, match="--accept poses-direction"):
         pose_frames(session, blank, cw, camera, "angles", tmp_path, Console(quiet=True), poses)
-    accepted = ["poses-direction"]
-    pose_frames(session, blank, cw, camera, "angles", tmp_path, Console(quiet=True), poses, accepted=accepted)
+    check = partial(refuse_red, accepted=["poses-direction"])
+    pose_frames(session, blank, cw, camera, "angles", tmp_path, Console(quiet=True), poses, check=check)

@@ -316,3 +316,14 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
     with pytest.raises(InputError, match="another kind of dataset"):
         run(session, tmp_path / "data")
     assert other.read_text() == '{"frames": []}'
+
+
+@pytest.mark.slow
+def test_wrong_masks_are_refused_after_their_picture_is_drawn(session, tmp_path):
+    everything = MaskConfig(threshold=-1.0)
+    with pytest.raises(InputError, match="--accept masks-cut"):
+        run(session, tmp_path / "data", ProcessConfig(masks=everything))
+    assert (tmp_path / "data" / "report" / "masks.png").is_file()
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    accepted = ProcessConfig(masks=everything, accept=("masks-border", "masks-cut", "masks-static", "masks-hull"))
+    assert open_packed(run(session, tmp_path / "data", accepted)).frames[0].mask().mean() > 0.1

@@ -183,7 +183,7 @@ def picked_mm(page):
 @needs_browser
 def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
     """Colours that follow from the numbers, the spectrum of the point under a click."""
-    with opened(report, viewport={"width": 700, "height": 600}) as page:
+    with opened(report, viewport={"width": 700, "height": 900}) as page:
         canvas = page.locator("#cloud canvas")
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")

@@ -61,16 +61,6 @@ def light_below(lighting, points, camera_to_world=None):
     return dict(zip(colours, weights.T, strict=True))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", ["lamp", "{chamber_shading: {directions: 8}}"])
-def test_true_fractions_of_materials_do_not_change(effect):
-    small = {"size_px": 32, "bands": 4, "frames": 2}
-    plain = Simulation(override(load_scene("sphere"), **small, effects=[])).frame(1)
-    lit = Simulation(override(load_scene("sphere"), **small, effects=[effect])).frame(1)
-    np.testing.assert_allclose(lit.material_weights, plain.material_weights, atol=1 / 1024)
-    assert not np.allclose(lit.light.radiance(), plain.light.radiance(), atol=0.05)
-
-
 def test_what_stands_before_the_chamber_is_seen_through_the_light_as_well():
     effects = ["lamp", "textured_background"]
     frame = Simulation(override(load_scene("sphere"), size_px=32, bands=4, frames=1, effects=effects)).frame(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from seen_markers import detected_corners
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, rotation_about_z
 from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.effects import image
 from hsi_sc_nerf.simulate.effects.detector import white_signal
@@ -153,18 +152,6 @@ def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
         np.testing.assert_allclose(simulation.camera_to_world[i], np.linalg.inv(to_room) @ camera, atol=1e-12)
 
 
-def test_a_wobble_of_one_cycle_is_a_disc_askew_on_a_steady_axis():
-    """Then, and only then, all poses lie on one circle about an axis of the object."""
-
-    def off_circle(cycles):
-        poses = Simulation(scene(f"{{wobble: {{amplitude_deg: 2, cycles_per_turn: {cycles}}}}}")).camera_to_world
-        steps = [b @ np.linalg.inv(a) for a, b in pairwise(poses)]
-        return max(rotation_angle_deg(steps[0], step) for step in steps)
-
-    assert off_circle(1) < 1e-6
-    assert off_circle(2) > 1.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
@@ -275,18 +262,6 @@ def test_drift_is_what_is_left_after_dividing_truth_out():
     np.testing.assert_array_equal(simulation.frame(0).counts, even.frame(0).counts)
 
 
-def test_drift_is_smooth_and_ends_at_its_strength():
-    drift = image.DriftingLamps(percent=8.0)
-    nm = np.array([500.0, 700.0])
-    course = np.array([drift.factor(8, nm, 3000.0, e)[0, 0, 0] for e in np.linspace(0.0, 1.0, 101)])
-    assert (course[0], course[-1]) == (1.0, pytest.approx(1.08))
-    rate = np.diff(course)
-    assert (rate > 0.0).all()
-    assert (np.diff(rate) < 1e-7).all()
-    steady = image.DriftingLamps(percent=8.0, settling=100.0)
-    assert steady.factor(8, nm, 3000.0, 0.5)[0, 0, 1] == pytest.approx(1.04, abs=2e-4)
-
-
 def test_falloff_is_what_is_left_after_dividing_truth_out():
     simulation = Simulation(scene("{illumination_falloff: {edge_loss: 0.3}}"))
     size = SMALL["size_px"]
@@ -308,14 +283,6 @@ def test_falloff_is_what_is_left_after_dividing_truth_out():
     factor = image.IlluminationFalloff(0.3).factor(1001, np.array([700.0]), 3000.0, 0.0)
     assert factor[500, 500, 0] == 1.0
     assert factor[0, 0, 0] == pytest.approx(0.7, abs=1e-3)
-
-
-def test_truth_keeps_the_illumination(tmp_path):
-    names = ["{lamp_drift: {percent: -10, temperature_change_k: 60}}", "{illumination_falloff: {edge_loss: 0.3}}"]
-    simulation = Simulation(scene(*names))
-    truth = load_truth(simulate_session(scene(*names), tmp_path / "s", False))
-    counts = truth.light("cylinder_002").radiance(None, white(simulation))
-    assert np.abs(signal(simulation, simulation.frame(2)) - counts).max() <= 0.501
 
 
 # --- surroundings ---------------------------------------------------------------------------------------------------

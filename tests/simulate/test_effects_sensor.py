@@ -67,15 +67,6 @@ def test_photon_transfer_curve():
     assert offset_error < 0.03 * read_noise
 
 
-def test_photon_noise_is_only_in_light_and_read_noise_everywhere():
-    assert (Simulation(scene(photon_noise={})).white().dark == DARK).all()
-    dark = Simulation(scene(size_px=64, read_noise={"electrons": 60.0})).white().dark.astype(float)
-    degrees = dark.size - 1
-    expected = (60.0 / ELECTRONS_PER_COUNT) ** 2 + 1.0 / 12.0
-    assert dark.var(ddof=1) == pytest.approx(expected, rel=ALL_BUT_A_MILLIONTH * np.sqrt(2.0 / degrees))
-    assert dark.mean() == pytest.approx(DARK, abs=ALL_BUT_A_MILLIONTH * np.sqrt(expected / dark.size))
-
-
 def test_every_exposure_has_noise_of_its_own_and_the_same_seed_the_same():
     simulation = Simulation(scene(photon_noise={}, read_noise={}))
     first, second, again = simulation.frame(0), simulation.frame(1), Simulation(simulation.scene).frame(0)
@@ -208,13 +199,6 @@ def test_a_sharp_edge_of_a_spectrum_shifts_by_the_smiles_parabola():
     np.testing.assert_array_equal(simulation.wavelengths_nm, sensor.band_centres_nm(204))
 
 
-def test_smile_leaves_the_middle_of_the_line_as_it_is():
-    smile, quiet = Simulation(scene(size_px=33, spectral_smile={"shift_nm": 5.0})), Simulation(scene(size_px=33))
-    for with_smile, without in ((smile.frame(0), quiet.frame(0)), (smile.white(), quiet.white())):
-        np.testing.assert_array_equal(with_smile.counts[:, 16], without.counts[:, 16])
-        assert (with_smile.counts[:, 0] != without.counts[:, 0]).any()
-
-
 # Exposure
 
 
@@ -229,16 +213,6 @@ def test_tarp_of_its_own_integration_time():
     # Each rounded on its own.
     assert np.abs(signal - expected).max() <= 0.5 + 0.4 * 0.5 + 1e-3
     np.testing.assert_array_equal(white.dark, usual.white().dark)
-
-
-@pytest.mark.slow
-def test_both_exposures_multiply():
-    both = Simulation(scene(saturation={"exposure_factor": 2.0}, tarp_exposure={"exposure_factor": 0.5}))
-    np.testing.assert_array_equal(both.white().counts, Simulation(scene()).white().counts)
-    longer = Simulation(scene(saturation={"exposure_factor": 2.0}))
-    np.testing.assert_array_equal(both.frame(0).counts, longer.frame(0).counts)
-    assert both.white().integration_time_ms == paper.INTEGRATION_TIME_MS
-    assert both.frame(0).integration_time_ms == longer.white().integration_time_ms == 2.0 * paper.INTEGRATION_TIME_MS
 
 
 def test_dead_bands_come_on_top_of_the_other_bad_pixels():

@@ -60,12 +60,6 @@ def test_blush_absorbs_green_and_a_bruise_is_dark_in_the_infrared():
     assert at("bruise", 850.0)[0] < 0.8 * at("apple_skin", 850.0)[0]
 
 
-def test_chamber_is_a_nearly_flat_white():
-    chamber = endmembers(["chamber"], WAVELENGTHS_NM)[0]
-    assert (chamber >= 0.95).all()
-    assert (chamber <= 0.97).all()
-
-
 def test_lamp_is_plancks_law():
     # Wien's displacement law for photons: the peak is at 3669.7 um K / T.
     nm = np.arange(300.0, 3000.0)

@@ -116,8 +116,6 @@ MESH = "{shape: mesh, mesh_file: a.ply, materials: [matte_grey]}"
     [
         ("matte_white", "skim", "material 'skim' is not defined"),
         ("matte_white", "3", "object.material is 3, but must be a text"),
-        ("shape: sphere, ", "", "object.shape is missing"),
-        ("sphere", "cube", "object.shape is 'cube', but must be one of pear, apple, maize, sphere, cylinder, mesh"),
         ("sphere", "[sphere]", "object.shape is ['sphere'], but must be one of"),
         ("{shape: sphere, height_m: 0.07, material: matte_white}", "5", "object must hold `key: value` lines"),
         ("{shape: sphere, height_m: 0.07, material: matte_white}", "{shape: mesh, mesh_file: a.ply, materials: []}",
@@ -146,7 +144,6 @@ def test_bad_objects_get_one_sentence(tmp_path, old, new, sentence):
     [
         ("3", "materials must hold `name: definition` lines"),
         ("{disc: {level: 0.2}}", "materials.disc is {'level': 0.2}, but must be one of `plant"),
-        ("{disc: 0.2}", "materials.disc is 0.2, but must be one of `plant"),
         ("{disc: {plain: {level: 20}}}", "materials.disc.plain.level is 20, but must lie between 0 and 1"),
         ("{disc: {plain: {}}}", "materials.disc.plain.level is missing"),
         ("{disc: {plant: {plateau: 0.5, green: 1}}}", "materials.disc.plant.green is not a known key"),
@@ -168,8 +165,6 @@ def test_bad_materials_get_one_sentence(tmp_path, definition, sentence):
         ("", "not a table of numbers with the columns wavelength_nm and reflectance|must cover"),
         ("nm,r\n390,0.1\n1010,0.2\n", "not a table of numbers with the columns"),
         ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "not a table of numbers"),
-        ("wavelength_nm,reflectance\n390,0.1\n1010\n", "not a table of numbers"),
-        ("wavelength_nm,reflectance\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n400,0.1\n1010,0.2\n", "must cover 397.32 to 1003.58 nm"),
         ("wavelength_nm,reflectance\n1010,0.1\n390,0.2\n", "wavelengths must increase"),
         ("wavelength_nm,reflectance\n390,10\n1010,20\n", "divide by 100"),

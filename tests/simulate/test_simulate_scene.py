@@ -81,11 +81,6 @@ def test_bad_scene_files_get_one_sentence(text, sentence):
     assert "\n" not in message
 
 
-def test_a_scene_that_does_not_exist_is_named():
-    with pytest.raises(InputError, match=r"pineapple: neither a shipped scene .*pear, apple, maize"):
-        load_scene("pineapple")
-
-
 @pytest.mark.parametrize("wrong", [{"frames": 0}, {"size_px": 1}, {"bands": 0}, {"seed": -1}])
 def test_overrides_are_checked_as_well(wrong):
     with pytest.raises(InputError, match="must lie between"):

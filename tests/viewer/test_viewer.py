@@ -252,8 +252,11 @@ def test_the_camera_stands_where_a_view_was_taken_and_sees_all_of_it(attached, p
     assert half * aspect == pytest.approx(float(frame.width / 2 / frame.fx))
 
 
-def test_a_browser_opens_behind_the_first_camera_and_turns_around_the_object(attached, pipeline):
+@pytest.mark.parametrize("aspect", [1.5, 0.0, math.nan])
+def test_a_browser_opens_behind_the_first_camera_and_turns_around_the_object(attached, pipeline, aspect):
+    """Also one that does not know its window's shape yet."""
     _, server, viewer = attached
+    server.camera.aspect = aspect
     (opened,) = server.opened
     opened(server.client)
     frame = pipeline.datamanager.train_dataset.cameras[0]

@@ -76,7 +76,7 @@ def test_pictures_and_spectra_of_a_ball_from_the_state_it_opens_in(address):
         page.get_by_label("Click for spectrum").check()
         answer = page.get_by_text(re.compile(r"x -?[\d.]+, y .* mm, opacity"))
         for _ in range(60):  # the browser listens to clicks only when the server has told it to
-            page.mouse.click(*ON_THE_BALL)
+            page.mouse.click(ON_THE_BALL[0] + 30, ON_THE_BALL[1] + 30)  # the mark of the point covers it
             page.wait_for_timeout(1000)
             if answer.count():
                 break
@@ -86,5 +86,5 @@ def test_pictures_and_spectra_of_a_ball_from_the_state_it_opens_in(address):
         assert np.linalg.norm(point_mm / 1000.0 - factory.SPHERE_CENTRE_M) == pytest.approx(0.04, abs=0.002)
         assert opacity > 0.98
         choose("Output type", "band")
-        assert shows(255 * np.array(matplotlib.colormaps["turbo"].colors[int(low)]))
+        assert shows(255 * np.array(matplotlib.colormaps["turbo"].colors[0]))  # nerfstudio normalises: the darkest
         browser.close()

@@ -1,0 +1,54 @@
+"""The findings of a session's processing: told, kept in one file, and refused where they are red."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.findings import Finding, refuse_red
+from hsi_sc_nerf.inspection.inspect import Inspection
+
+_log = logging.getLogger(__name__)
+
+CHECKS_PATH = Path("report") / "inspection.json"
+"""In the dataset; the inspection's content and the findings of all later steps."""
+
+
+class SessionChecks:
+    """Collects the findings of one step after the other.
+
+    Args:
+        inspection: of the session before anything was computed; its findings are the first.
+        accepted: names of checks whose red findings the user accepts.
+        output_dir: the dataset.
+
+    Example:
+        >>> checks = SessionChecks(inspect_session(session), ["masks-static"], Path("apple_01-data"))
+        >>> checks.add(check_calibration(session, calibration))
+    """
+
+    def __init__(self, inspection: Inspection, accepted: Collection[str], output_dir: Path) -> None:
+        self._report = inspection.report()
+        self._findings = list(inspection.findings)
+        self._accepted = accepted
+        self._path = output_dir / CHECKS_PATH
+        self._write()
+
+    def add(self, findings: Sequence[Finding]) -> None:
+        """Warn of what is amber or accepted, keep all, and stop at what is red.
+
+        Raises:
+            InputError: a finding is red and not accepted, or the file cannot be written.
+        """
+        for finding in findings:
+            if finding.level == "amber" or (finding.level == "red" and finding.name in self._accepted):
+                _log.warning("Warning (%s): %s", finding.name, finding.sentence)
+        self._findings += findings
+        self._write()
+        refuse_red(findings, self._accepted)
+
+    def _write(self) -> None:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self._path, {**self._report, "findings": [finding.as_json() for finding in self._findings]})
