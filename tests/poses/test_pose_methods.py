@@ -144,7 +144,7 @@ def test_a_camera_that_no_one_has_is_not_believed():
     poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
     for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
         found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
-        options = {"method": "colmap", "from_features": lambda *_, found=found: found}
+        options = {"method": "colmap", "from_features": lambda *_, found=found, **__: found}
         if believed:
             assert find_poses(BLANK, list("abcd"), SessionInfo(), **options).intrinsics.fl_x == focal_px
             continue
