@@ -76,7 +76,8 @@ def _uncertainty(poses: TurntablePoses) -> list[Finding]:
         level = worse if (known > limits).any() else level
     place = f"{known[1]:.2g} mm" if poses.metric else f"{0.1 * known[1]:.2g} % of the camera's distance"
     sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, the scale to {known[2]:.2g} %"
-    advice = "; show markers on the turntable, or give --camera, an earlier dataset of the same camera."
+    show = "larger markers" if poses.method == "markers" else "markers on the turntable"
+    advice = f"; show {show}, or give --camera, an earlier dataset of the same camera."
     values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": known[2]}
     return [Finding("poses-uncertain", level, sentence + ("." if level == "green" else advice), values)]
 

@@ -9,21 +9,19 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
-from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.processing.scene_box import hull_voxels
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.processing.hull_silhouettes import hull_silhouettes
 
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
 MAX_CUT_FRACTION = 0.3
 """Fraction of a mask's lines that may end at the side of the space where the object may be."""
-HULL_MISSED_FRACTION = 0.15
-"""Frames that may contradict a point of the hull: a few frames of another object must not carve it."""
 MAX_CONTRADICTION = 0.04
 """Largest typical difference of mask and hull's silhouette (1 - intersection over union), to which a quarter of a
 pixel along the mask's outline is added. Good masks have half of it, because the hull is found by vote."""
-MAX_ODDITY = 0.015
-"""Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added."""
+MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
+"""Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
+in standard deviations of the frames' differences, for noise frays masks."""
 STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
@@ -144,8 +142,11 @@ def _hull(
 ) -> list[Finding]:
     """Masks that contradict the visual hull, which is found by vote."""
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
-    contradiction = hull_contradiction(masks, camera_to_worlds, intrinsics, min_z_m)
+    silhouettes = hull_silhouettes(masks, camera_to_worlds, intrinsics, min_z_m)
+    union = (masks | silhouettes).sum(axis=(1, 2))
+    contradiction = 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
     typical = float(np.median(contradiction[filled]))
+    scatter = 1.4826 * float(np.median(np.abs(contradiction[filled] - typical)))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
     pixel = outline.sum() / masks.sum()
     if typical > MAX_CONTRADICTION + 0.25 * pixel:
@@ -154,7 +155,7 @@ def _hull(
             "visual hull of all, so the masks or the poses are wrong; look at report/masks.png and report/poses.png."
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
-    odd = (contradiction > typical + MAX_ODDITY + 0.125 * pixel) & filled
+    odd = (contradiction > typical + max(MAX_ODDITY + 0.125 * pixel, ODDITY_SIGMAS * scatter)) & filled
     if not odd.any():
         return []
     return [
@@ -166,29 +167,6 @@ def _hull(
             {"frames": {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}},
         )
     ]
-
-
-def hull_contradiction(
-    masks: Bool[np.ndarray, "frames h w"],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    min_z_m: float | None = None,
-) -> Float[np.ndarray, "frames"]:
-    """Difference of each mask and the silhouette of the visual hull: 1 - intersection over union.
-
-    The hull is found by vote (`HULL_MISSED_FRACTION`). Arguments as in `check_masks`.
-    """
-    hull, _, size_px = hull_voxels(masks, camera_to_worlds, intrinsics, min_z_m, HULL_MISSED_FRACTION)
-    contradiction = np.empty(len(masks))
-    for index, (mask, pose) in enumerate(zip(masks, camera_to_worlds, strict=True)):
-        x, y = np.floor(project(hull, pose, intrinsics)[0]).astype(int).T
-        inside = (x >= 0) & (x < intrinsics.w) & (y >= 0) & (y < intrinsics.h)
-        silhouette = np.zeros(mask.shape, bool)
-        silhouette[y[inside], x[inside]] = True
-        # Dilation closes the gaps between voxels; erosion undoes it, and the dilation of the masks in `hull_voxels`.
-        silhouette = ~dilate(~dilate(silhouette, size_px), 2 * size_px - 1)
-        contradiction[index] = 1.0 - (mask & silhouette).sum() / max(1, (mask | silhouette).sum())
-    return contradiction
 
 
 def _list(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> list[str]:

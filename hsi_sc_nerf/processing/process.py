@@ -42,6 +42,7 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
+from hsi_sc_nerf.processing.hull_silhouettes import trim_to_hull
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
@@ -285,20 +286,18 @@ def _write_masks(
             ]
         )
     masks = foreground_masks([cache.bins for cache in caches], config, regions)
+    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
+    brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
+    lid_z_m = None if container is None else container.height_m
+    names = [frame.capture for frame in frames]
+    findings = check_masks(masks, names, camera_to_worlds, poses.intrinsics, brightness, regions, lid_z_m)
+    if all(finding.level != "red" for finding in findings):
+        masks = trim_to_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
-    images, names = [frame.pseudo_rgb() for frame in frames], [frame.capture for frame in frames]
+    images = [frame.pseudo_rgb() for frame in frames]
     mask_picture(output_dir / "report" / "masks.png", images, list(masks), names)
     console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
-    findings = check_masks(
-        masks,
-        names,
-        np.stack([frame.camera_to_world for frame in frames]),
-        poses.intrinsics,
-        np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches]),
-        regions,
-        None if container is None else container.height_m,
-    )
     checks.add(findings)
     return masks
 

@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays
-from hsi_sc_nerf.geometry.visual_hull import MAX_MISSED_FRACTION, visual_hull
-from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.hull_silhouettes import hull_voxels
 
 OBJECT_MARGIN_M = 0.003
 """The object's box is widened by this: masks and poses are uncertain by a pixel or two."""
@@ -20,8 +19,6 @@ DISC_OVER_MARKERS = 1.1
 DISC_OVER_CONTAINER = 2.3
 """Diameter of the disc as a multiple of the container's, where no marker shows it; the simulator's is 205 mm under a
 container of 90 mm."""
-GRID_CELLS = 48
-"""The visual hull is computed on this number of voxels along each axis."""
 
 
 def object_box(
@@ -57,39 +54,6 @@ def object_box(
     if min_z_m is not None:
         box[0, 2] = max(box[0, 2], min_z_m)
     return box
-
-
-def hull_voxels(
-    masks: Bool[np.ndarray, "frames h w"],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    min_z_m: float | None = None,
-    max_missed_fraction: float = MAX_MISSED_FRACTION,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"], int]:
-    """Voxels of the masks' visual hull: their centres (n may be 0), their sides, and the diameter of one in px.
-
-    The hull is computed on a grid twice: in the cube that the cameras see, then in the bounds found there. Masks are
-    dilated by half a voxel's diagonal, so that parts thinner than a voxel are kept. Arguments are those of
-    `object_box` and of `visual_hull`.
-    """
-    # The point that all frames look at.
-    (centre,), _ = closest_point_to_rays(camera_to_worlds[:, :3, 3], camera_to_worlds[:, :3, 2])
-    distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).min()
-    reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
-    low, high = centre - reach, centre + reach
-    for _ in range(2):
-        step = (high - low) / GRID_CELLS
-        ticks = [low[k] + step[k] * (np.arange(GRID_CELLS) + 0.5) for k in range(3)]
-        points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        if min_z_m is not None:
-            points = points[points[:, 2] >= min_z_m - step[2] / 2.0]
-        size_px = 2 * int(np.ceil(intrinsics.fl_x * np.linalg.norm(step) / 2.0 / distance)) + 1
-        dilated = np.stack([dilate(mask, size_px) for mask in masks])
-        hull = visual_hull(points, dilated, camera_to_worlds, intrinsics, max_missed_fraction)
-        if len(hull) == 0:
-            break
-        low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
-    return hull, step, size_px
 
 
 def scene_box(
