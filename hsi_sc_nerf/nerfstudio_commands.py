@@ -128,7 +128,7 @@ def prepare(command: Any) -> bool:
     if name == "ExportTSDFMesh":
         from nerfstudio.exporter.tsdf_utils import TSDF
 
-        TSDF.export_mesh = staticmethod(_write_mesh)  # type: ignore[method-assign, assignment]
+        TSDF.export_mesh = staticmethod(_write_mesh)  # type: ignore[method-assign]
     no_normals = not config.pipeline.model.predict_normals
     if name == "ExportPoissonMesh" and command.normal_method == "model_output" and no_normals:
         CONSOLE.print("hsi-sc-nerf: the model predicts no normals; they are estimated from the points (open3d).")

@@ -170,7 +170,7 @@ def _nm(name: str) -> str:
 def _plain(value: MeanAndSd) -> dict[str, Any]:
     """Ready for JSON."""
     numbers = {"mean": np.asarray(value.mean, float), "sd": np.asarray(value.sd, float)}
-    return {key: np.where(np.isfinite(array), array, None).tolist() for key, array in numbers.items()}
+    return {key: np.where(np.isfinite(array), array, np.array(None)).tolist() for key, array in numbers.items()}
 
 
 def _mean_and_sd(value: Mapping[str, Any]) -> str:

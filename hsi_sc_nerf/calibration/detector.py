@@ -220,11 +220,11 @@ def _neighbours_share(
     for cube in cubes:
         one, other = cube[:, 1:][:, live_pairs], cube[:, :-1][:, live_pairs]
         either = (one == top) | (other == top)
-        top_pairs += np.count_nonzero(either)
-        both_at_top += np.count_nonzero(either & (one == other))
+        top_pairs += int(np.count_nonzero(either))
+        both_at_top += int(np.count_nonzero(either & (one == other)))
         bright = ~either & (np.minimum(one, other) > BRIGHT * top)
-        bright_pairs += np.count_nonzero(bright)
-        equal_pairs += np.count_nonzero(bright & (one == other))
+        bright_pairs += int(np.count_nonzero(bright))
+        equal_pairs += int(np.count_nonzero(bright & (one == other)))
     if both_at_top < MIN_TOP_PAIRS or 4 * bright_pairs < top_pairs:
         return False
     fraction_both, fraction_equal = both_at_top / top_pairs, equal_pairs / bright_pairs

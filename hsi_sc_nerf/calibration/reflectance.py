@@ -189,7 +189,8 @@ def pack_counts(
 
     def count(name: str, marked: Bool[np.ndarray, "kept samples"]) -> None:
         marked.reshape(-1)[dead_at] = False
-        counted[name] += cv2.reduce(marked.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S)[:, 0]
+        sums = np.asarray(cv2.reduce(marked.view(np.uint8), 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
+        counted[name] += sums[:, 0].astype(np.int64)
 
     values = np.empty((kept, samples), np.float32)
     numbers = np.empty((kept, samples), np.uint16)

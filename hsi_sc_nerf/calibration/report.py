@@ -135,9 +135,10 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
     counts = fill_no_data(cube.memmap()[..., bands], cube.ignore_value).astype(float)
     image = to_8_bit(counts / np.maximum(np.percentile(counts, 95.0, axis=(0, 1)), 1e-9))
     figure = new_figure(12.0, 10.0)
-    rows = [["image", "image", "image", "deviation", "deviation", "deviation"]]
-    rows += [["lower"] * 2 + ["used"] * 2 + ["higher"] * 2, ["spectrum"] * 6]
-    axes = figure.subplot_mosaic(rows, height_ratios=[4.0, 4.0, 3.0])
+    # A letter for each panel, six columns wide.
+    panels = {"i": "image", "d": "deviation", "l": "lower", "u": "used", "h": "higher", "s": "spectrum"}
+    mosaic = figure.subplot_mosaic("iiiddd;lluuhh;ssssss", height_ratios=[4.0, 4.0, 3.0])
+    axes = {panel: mosaic[letter] for letter, panel in panels.items()}
     axes["image"].imshow(draw_outline(image, white.region(image.shape[:2])))
     region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2)
     axes["image"].add_patch(region)

@@ -177,14 +177,14 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
         group.attrs.update(_table_attributes(cloud))
 
-        def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: dict[str, str]) -> Any:
+        def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: Mapping[str, str]) -> Any:
             return group.create_array(
                 name,
                 shape=tuple(sizes[dimension] for dimension in dimensions),
                 chunks=tuple(chunk_sizes[dimension] for dimension in dimensions),
                 dtype=dtype,
                 dimension_names=dimensions,
-                attributes=attributes,
+                attributes=dict(attributes),
             )
 
         create("wavelength", "<f8", ("wavelength",), _WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm

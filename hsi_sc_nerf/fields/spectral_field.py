@@ -91,7 +91,7 @@ class SpectralField(NerfactoField):
         hidden = self.mlp_base(in_grid.view(-1, 3))
         hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
         # The logarithm of the density up to a constant; normals are its gradients.
-        self._density_before_activation = hidden[..., :1]  # type: ignore[assignment]
+        self._density_before_activation = hidden[..., :1]
         density = self.average_init_density * trunc_exp(hidden[..., :1].to(inside)) * inside
         return density, hidden[..., 1:]
 

@@ -54,8 +54,8 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     over the frames, and weighs little.
     """
     side = (COMPARED_PX, COMPARED_PX)
-    small = np.stack([cv2.resize(picture, side, interpolation=cv2.INTER_AREA) for picture in pictures])
-    small = np.clip(small, 0.0, 1.5)
+    resized = [np.asarray(cv2.resize(picture, side, interpolation=cv2.INTER_AREA), float) for picture in pictures]
+    small = np.clip(np.stack(resized), 0.0, 1.5)
     small /= np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
     away = np.abs(small - np.median(small, axis=0))
     spread = np.maximum(1.4826 * np.median(away, axis=0), LEAST_SPREAD)

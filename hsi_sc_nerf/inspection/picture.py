@@ -32,7 +32,7 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     for index, thumbnail in enumerate(thumbnails):
         top, left = index // COLUMNS * height, index % COLUMNS * width
         sheet[top : top + height, left : left + width] = thumbnail
-    lines = {
+    lines: dict[str, Sequence[float]] = {
         "brightness": [float(look.picture.mean()) for look in looks],
         "sharpness, 1/px": [look.sharpness_per_px for look in looks],
         "markers": [len(seen) for seen in inspection.markers.detections],

@@ -96,13 +96,12 @@ def read_config(load_config: Path) -> TrainerConfig:
     """
     if not load_config.is_file():
         raise InputError(f"{load_config}: there is no such file; give the config.yml of a trained run.")
+    reason: Exception | None = None
     try:
         config = yaml.load(load_config.read_text(encoding="utf-8"), Loader=yaml.Loader)
     # Old files name modules and classes that are gone, which fails in as many ways as they can be missing.
     except (yaml.YAMLError, UnicodeDecodeError, AttributeError, ImportError, TypeError) as error:
         config, reason = None, error
-    else:
-        reason = None
     if not isinstance(config, TrainerConfig) or _missing_settings(config):
         raise InputError(
             f"{load_config}: cannot be read; give the config.yml of a run that this version of hsi-sc-nerf trained."

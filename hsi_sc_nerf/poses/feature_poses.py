@@ -127,7 +127,7 @@ def _posed(
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
     adjusted, markers = adjust_together(found, markers, parameters)
-    findings = []
+    findings: list[Finding] = []
     if markers is None and camera is None:
         adjusted, findings = _with_halves(adjusted, found, parameters)
     if camera is not None:

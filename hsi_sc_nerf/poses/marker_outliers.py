@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -156,5 +157,5 @@ def _rejected(
     return [RejectedMarker(f, m, e if np.isfinite(e) else None, why) for f, m, e in rows]
 
 
-def _rejected_frames(observations: MarkerObservations, errors_px: dict[int, float]) -> list[RejectedMarker]:
+def _rejected_frames(observations: MarkerObservations, errors_px: Mapping[int, float]) -> list[RejectedMarker]:
     return _rejected(observations, DISPLACED, np.array([errors_px[f] for f in observations.frame.tolist()]))

@@ -54,9 +54,9 @@ def marker_sheets(marker_side_m: float, dictionary: str, ids: Sequence[int], pap
     rows = int((height - 2.0 * _MARGIN_MM - _HEAD_MM - _RULER_ZONE_MM) // down)
     if columns < 1 or rows < 1:
         raise InputError(f"a marker of {side:g} mm does not fit on {paper} paper; make --marker-side-m smaller.")
-    sheets = []
+    sheets: list[Figure] = []
     for start in range(0, len(ids), columns * rows):
-        axes = _empty_sheet(width, height)
+        figure, axes = _empty_sheet(width, height)
         top = height - _MARGIN_MM
         title = f'{dictionary}, black squares of {side:g} mm: "marker_side_m": {marker_side_m:g} in session.json'
         axes.text(_MARGIN_MM, top, title, va="top", size=10)
@@ -71,7 +71,7 @@ def marker_sheets(marker_side_m: float, dictionary: str, ids: Sequence[int], pap
             axes.add_patch(cut)
             axes.text(left, upper - side - quiet - 1.0, f"{number}   {side:g} mm", va="top", size=7, color="0.4")
         _draw_ruler(axes)
-        sheets.append(axes.figure)
+        sheets.append(figure)
     return sheets
 
 
@@ -88,12 +88,12 @@ def write_marker_sheets(path: Path, sheets: Sequence[Figure]) -> None:
             pages.savefig(sheet)
 
 
-def _empty_sheet(width_mm: float, height_mm: float) -> Axes:
+def _empty_sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
     """Axes in millimetres from the lower left corner of a sheet."""
     figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, width_mm), ylim=(0.0, height_mm))
     axes.axis("off")
-    return axes
+    return figure, axes
 
 
 def _draw_marker(axes: Axes, pattern: np.ndarray, left: float, upper: float, side: float) -> None:

@@ -71,9 +71,7 @@ def _uncertainty(poses: TurntablePoses) -> list[Finding]:
         return []
     scale = 0.0 if poses.scale is None else poses.scale.uncertainty
     known = np.array([poses.uncertainty.rotation_deg, 1e3 * poses.uncertainty.position_m, 100.0 * scale])
-    level: Level = "green"
-    for worse, limits in (("amber", _GOAL), ("red", _UNUSABLE)):
-        level = worse if (known > limits).any() else level
+    level: Level = "red" if (known > _UNUSABLE).any() else "amber" if (known > _GOAL).any() else "green"
     place = f"{known[1]:.2g} mm" if poses.metric else f"{0.1 * known[1]:.2g} % of the camera's distance"
     sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, the scale to {known[2]:.2g} %"
     show = "larger markers" if poses.method == "markers" else "markers on the turntable"
@@ -118,7 +116,8 @@ def _angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
 
 
 def _scale(poses: TurntablePoses) -> list[Finding]:
-    scale, found = poses.scale, []
+    scale = poses.scale
+    found: list[Finding] = []
     if scale is None:
         return found
     percent = scale.disagreement_percent

@@ -109,14 +109,13 @@ class MarkerResiduals(Residuals):
         """By a marker's parameters: a small rotation in the object's axes, a shift, and the log of its side."""
         pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
         pixel = replace(pixel, hidden=self.hidden)
-        whitened = {name: None if by is None else self._whiten(by) for name, by in vars(pixel).items()}
         offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
         parts = [np.zeros((len(offset), 2, 0))]
         if self.free:
             parts += [pixel.point @ -cross_matrix(offset), pixel.point]
         if self.free_sides:
             parts.append(pixel.point @ offset[:, :, None])
-        return Jacobian(**whitened), self._whiten(np.concatenate(parts, axis=-1))
+        return pixel.mapped(self._whiten), self._whiten(np.concatenate(parts, axis=-1))
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "m d"]) -> Turntable:
         """The turntable with its markers turned and shifted."""
@@ -156,8 +155,8 @@ class PointResiduals(Residuals):
         """By the point's coordinates."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
         pixel = projection_jacobian(turntable, self.frame, projection)
-        scaled = {name: None if by is None else by / self.sigma_px for name, by in vars(pixel).items()}
-        return Jacobian(**scaled), scaled["point"]
+        scaled = pixel.mapped(lambda by: by / self.sigma_px)
+        return scaled, scaled.point
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:
         """The turntable with its points shifted."""

@@ -192,8 +192,8 @@ def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:
 def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     """The turntable with the markers that its rays determine, in its unit of length, all of one side."""
     poses, marker_corners = turntable.camera_to_world(), {}
-    size = np.array(turntable.centre_px) * 2.0
-    camera = PinholeIntrinsics(*size.astype(int).tolist(), *[turntable.focal_px] * 2, *turntable.centre_px)
+    width, height = (int(2.0 * centre) for centre in turntable.centre_px)
+    camera = PinholeIntrinsics(width, height, turntable.focal_px, turntable.focal_px, *turntable.centre_px)
     for marker in np.unique(seen.marker).tolist():
         rows = np.flatnonzero((seen.marker == marker) & np.isin(seen.frame, turntable.frames))
         frames = np.searchsorted(turntable.frames, seen.frame[rows])

@@ -10,6 +10,7 @@ where tilt_i and the shift s_i are small motions of a wobbling table; a perfect 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -232,6 +233,10 @@ class Jacobian:
     """By the point, in the object's axes."""
     hidden: Float[np.ndarray, "n 2 k"] | None = None
     """By the amplitudes of displacements that the residuals hardly show."""
+
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Jacobian:
+        """The derivatives after ``function``, which acts on the pixels' axes."""
+        return Jacobian(**{name: None if by is None else function(by) for name, by in vars(self).items()})  # type: ignore[arg-type]
 
 
 def project(turntable: Turntable, frame: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]) -> Projection:

@@ -109,7 +109,7 @@ def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, f
     top = max(float(score.max()) for score in scores)
     if not top > 0.0:
         return 0.0, 0.0, 0.0
-    counts = sum(np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores)
+    counts = np.sum([np.histogram(score, bins=_HISTOGRAM_BINS, range=(0.0, top))[0] for score in scores], axis=0)
     centres = (np.arange(_HISTOGRAM_BINS) + 0.5) * top / _HISTOGRAM_BINS
     threshold = threshold_otsu(hist=(counts, centres))
     high = centres > threshold

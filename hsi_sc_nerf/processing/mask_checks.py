@@ -52,7 +52,7 @@ def check_masks(
     Example:
         >>> refuse_red(check_masks(masks, names, poses, intrinsics, brightness), accepted=["masks-border"])
     """
-    empty = ~masks.any(axis=(1, 2))
+    empty = np.logical_not(masks.any(axis=(1, 2)))
     found = []
     if empty.any():
         too_many = empty.mean() > MAX_EMPTY_FRACTION

@@ -285,7 +285,7 @@ def _write_masks(
                 for frame in frames
             ]
         )
-    masks = foreground_masks([cache.bins for cache in caches], config, regions)
+    masks = foreground_masks([cache.bins for cache in caches], config, None if regions is None else list(regions))
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
     brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
     lid_z_m = None if container is None else container.height_m

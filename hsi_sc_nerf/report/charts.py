@@ -153,8 +153,15 @@ def _draw_marks(axes: Axes, marks: Mapping[str, float]) -> None:
             axes.axvline(value, color=_FAINT, linewidth=0.8, linestyle=(0.0, (3.0, 3.0)))
             side = "right" if value > (low + high) / 2.0 else "left"
             offset_pt = (3 if side == "left" else -3, -9 - 10 * row)
-            top = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
-            axes.annotate(name, (value, 1.0), offset_pt, ha=side, color=_FAINT, **top)
+            axes.annotate(
+                name,
+                (value, 1.0),
+                offset_pt,
+                xycoords=axes.get_xaxis_transform(),
+                textcoords="offset points",
+                ha=side,
+                color=_FAINT,
+            )
 
 
 def _inline_svg(figure: Figure, alt: str) -> Markup:
