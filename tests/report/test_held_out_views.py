@@ -156,7 +156,7 @@ def test_views_are_scored_as_the_model_scores_them(run, flagged_dataset):
     with torch.no_grad():
         metrics, images = run.model.get_image_metrics_and_images(run.model.get_outputs_for_camera(camera), batch)
     assert view.scores.metrics == pytest.approx(metrics, rel=1e-5)
-    pictured = np.concatenate([view.measured_rgb, view.rendered_rgb], axis=1) / 255.0
+    pictured = np.concatenate([view.measured_rgb, view.rendered_rgb], axis=1).clip(0.0, 1.0)
     np.testing.assert_allclose(pictured, images["img"].numpy(), atol=0.003)
 
     frame = next(f for f in open_packed(flagged_dataset).frames if f.capture == view.scores.name)
