@@ -39,6 +39,8 @@ RANK_MARGIN = 1.5
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
+SHARED_ERROR = 1.5
+"""Factor on the standard errors: pixels share errors, such as reflections, that their scatter does not show."""
 SIGNIFICANCE = 0.001
 """p-value below which a drift is significant."""
 
@@ -129,7 +131,7 @@ def measure_lamp_drift(
     smooth, variance = common_courses(coefficients, covariance, basis)
     factor = np.exp(smooth - smooth[0])
     # The first frame's error is part of all the others.
-    standard_error = factor * np.sqrt(variance + variance[0])
+    standard_error = SHARED_ERROR * factor * np.sqrt(variance + variance[0])
     standard_error[0] = 0.0
     p_value = drift_p_value(coefficients, covariance)
     return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
