@@ -12,6 +12,7 @@ from turntable_scene import MarkerScene
 from hsi_sc_nerf.capture.envi import write_cube
 
 WAVELENGTHS_NM = np.linspace(420.0, 900.0, 9)
+INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
 LAMP = 1500.0 + 200.0 * np.arange(9)
 DARK = 100
 READ_NOISE_COUNTS = 4

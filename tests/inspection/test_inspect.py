@@ -8,25 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inspection_session import LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_picture, write_one, write_turntable
+from inspection_session import INFO, LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_picture, write_one, write_turntable
 
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
 from hsi_sc_nerf.inspection.picture import draw_inspection
-
-INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory) -> Path:
-    return write_turntable(tmp_path_factory.mktemp("good") / "session", info=INFO)
-
-
-@pytest.fixture
-def session(good, tmp_path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(good, tmp_path / "session"))
 
 
 def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:

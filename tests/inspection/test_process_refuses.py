@@ -8,23 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inspection_session import SIZE_PX, frame_picture, write_one, write_turntable
+from inspection_session import SIZE_PX, frame_picture, write_one
 
 from hsi_sc_nerf.cli.inspect import InspectCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
-
-INFO = {"object": "fruit", "marker_side_m": 0.03, "marker_dictionary": "DICT_5X5_50"}
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory) -> Path:
-    return write_turntable(tmp_path_factory.mktemp("good") / "session", info=INFO)
-
-
-@pytest.fixture
-def session(good, tmp_path) -> Path:
-    return Path(shutil.copytree(good, tmp_path / "session"))
 
 
 def reached(images, names, **_):
