@@ -12,7 +12,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.interpolate import CubicSpline
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import over, smooth_noise, smoothstep
 from hsi_sc_nerf.simulate.mesh import revolve
 

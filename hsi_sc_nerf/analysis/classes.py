@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 from trimesh.graph import connected_component_labels
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
 
 UNCLASSIFIED = -1

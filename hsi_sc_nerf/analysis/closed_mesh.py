@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.settings_file import between
 
 # Smoothing radius over the spacing of thinned points: about thirty points determine a quadric.

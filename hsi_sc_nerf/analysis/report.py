@@ -14,7 +14,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, Traits
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.spectra.bands import COMPOSITES
 from hsi_sc_nerf.tables import markdown_table
 
 # Name, unit, and the unit's factor on metres, square metres or litres.

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 
 SPREAD_DEPTH = 6
 """Octree depth of the meshes of half-samples, which is enough for their spread and saves two thirds of the time."""

@@ -14,8 +14,8 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
-from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands, to_8_bit
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.spectra.bands import nearest_bands, to_8_bit
 
 NEIGHBOURS = 8
 _CHUNK_VERTICES = 1 << 13

@@ -61,7 +61,7 @@ class RenderCommand:
         from hsi_sc_nerf.rendering.cubes import render_view, write_view
         from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
         from hsi_sc_nerf.rendering.views import views_of_frames, views_of_orbit, views_of_path
-        from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+        from hsi_sc_nerf.spectra.bands import to_8_bit
 
         run = open_run(self.load_config)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]

@@ -22,7 +22,7 @@ from hsi_sc_nerf.evaluation.spatial import (
     sample_surface,
     threshold_curves,
 )
-from hsi_sc_nerf.meshes.mesh import ply_triangles
+from hsi_sc_nerf.geometry.mesh import ply_triangles
 
 Alignment = Literal["features", "icp", "none"]
 Track = Callable[[Sequence[Any], str], Iterable[Any]]

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.meshes.mesh import ray_scene
+from hsi_sc_nerf.geometry.mesh import ray_scene
 from hsi_sc_nerf.paper import F_SCORE_THRESHOLD_M
 
 

@@ -16,8 +16,8 @@ from hsi_sc_nerf.export.description import comment_lines
 from hsi_sc_nerf.export.ply import band_property_names
 from hsi_sc_nerf.export.sample_points import PointSpectra
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.meshes.mesh import Mesh
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.spectra.bands import to_8_bit
 
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")

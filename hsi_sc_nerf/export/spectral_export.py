@@ -27,7 +27,7 @@ from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.progress import progress_bar
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.spectra.bands import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.regions import (
     EVERYWHERE,

@@ -16,8 +16,7 @@ from torch import Tensor
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS, coloured
 from hsi_sc_nerf.rendering.cubes import RenderedView
-from hsi_sc_nerf.spectra.bands import require_bands
-from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
+from hsi_sc_nerf.spectra.bands import COMPOSITES, composite, require_bands
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 
 _CONSTANT_RATE_FACTOR = "18"

@@ -21,7 +21,7 @@ from hsi_sc_nerf.report.held_out_views import (
 )
 from hsi_sc_nerf.report.judgements import judge_bands, judge_spectra, judge_views
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.spectra.bands import to_8_bit
 
 PICTURED_VIEWS = 4
 _ERROR_COLOURS = "viridis"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh, plants, target
 from hsi_sc_nerf.simulate.effect import effect_rng, of_kind
 from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import snapped, welded
 from hsi_sc_nerf.simulate.scene import OwnMesh
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import over, smooth_noise, smoothstep
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, revolve, steps
 from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar

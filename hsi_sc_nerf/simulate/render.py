@@ -12,7 +12,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
-from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19

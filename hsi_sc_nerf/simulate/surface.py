@@ -10,7 +10,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
 CREASE_DEG = 40.0

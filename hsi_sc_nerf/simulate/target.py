@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import quads
 from hsi_sc_nerf.simulate.scene import ContainerSettings, MarkerSettings, TurntableSettings
 

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part

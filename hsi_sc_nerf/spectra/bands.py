@@ -1,15 +1,17 @@
-"""Bands of an instrument for the wavelengths of a formula."""
+"""Bands of an instrument: those nearest to wavelengths, 8-bit values, and named composites of three."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import ArrayLike
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.pseudo_rgb import nearest_bands
 
 if TYPE_CHECKING:
     from torch import Tensor  # takes seconds, and the commands' help does without it
@@ -53,3 +55,67 @@ def require_bands(
             "give more bands."
         )
     return nearest_bands(wavelengths_nm, targets_nm)
+
+
+def nearest_bands(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: ArrayLike) -> Int[np.ndarray, "targets"]:
+    """Index of the band whose centre is nearest to each target."""
+    return np.abs(wavelengths_nm[None, :] - np.asarray(targets_nm, float)[:, None]).argmin(axis=1)
+
+
+def bands_within(
+    wavelengths_nm: Float[np.ndarray, "bands"], range_nm: tuple[float, float]
+) -> Int[np.ndarray, "inside"]:
+    """Indices of the bands in ``range_nm``, or of all bands if none is in it."""
+    inside = (wavelengths_nm >= range_nm[0]) & (wavelengths_nm <= range_nm[1])
+    return np.flatnonzero(inside if inside.any() else np.ones_like(inside))
+
+
+def to_8_bit(reflectance: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Reflectance 0 to 1 as 0 to 255, linear (no gamma), rounded and clipped."""
+    return np.rint(np.clip(reflectance, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Composite:
+    """Three bands shown as red, green and blue."""
+
+    name: str
+    wavelengths_nm: tuple[float, float, float]
+    """Shown as red, green, blue."""
+    shows: str
+    """What it makes visible."""
+
+
+COMPOSITES = {
+    composite.name: composite
+    for composite in (
+        Composite("pseudo-RGB", paper.PSEUDO_RGB_NM, "the paper's picture for the eye"),
+        # Paper, section "Example Applications" and its figures.
+        Composite("apple", (801.0, 708.0, 551.0), "bruises"),
+        Composite("maize visible", (650.0, 540.0, 470.0), "kernels as the eye sees them"),
+        Composite("maize", (850.0, 580.0, 490.0), "dryness and starch, carotenoids, pigments of kernels"),
+        Composite("pear", (980.0, 710.0, 550.0), "water status, maturity, peel colour"),
+        # The classical colour-infrared film: near infrared, red, green.
+        Composite("CIR", (800.0, 670.0, 550.0), "living green tissue, which appears red"),
+    )
+}
+"""By name."""
+
+
+def available_composites(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Composite]:
+    """The named composites that these band centres can show."""
+    return [one for one in COMPOSITES.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
+
+
+def composite(
+    spectra: Float[Spectra, "*shape bands"],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    rgb_nm: Sequence[float],
+    name: str = "the composite",
+) -> Float[Spectra, "*shape 3"]:
+    """Reflectance at the bands nearest to the wavelengths for red, green and blue; linear and not clipped.
+
+    Raises:
+        InputError: a wavelength has no band near it; the message names the composite.
+    """
+    return spectra[..., require_bands(wavelengths_nm, rgb_nm, name).tolist()]

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import in_box
 

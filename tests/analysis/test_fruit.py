@@ -15,7 +15,7 @@ from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights

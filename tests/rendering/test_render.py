@@ -18,7 +18,7 @@ from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.cubes import RenderedView, write_view
 from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import views_of_orbit, views_of_path
-from hsi_sc_nerf.spectra.composites import COMPOSITES
+from hsi_sc_nerf.spectra.bands import COMPOSITES
 from hsi_sc_nerf.spectra.indices import INDICES
 
 NM = factory.WAVELENGTHS_NM

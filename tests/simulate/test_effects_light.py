@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.effects.light import ChamberShading, Gloss, InterReflection, Lamp, fresnel, mean_fresnel
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.light import Lighting, colour_spectra, even_light, render

@@ -7,7 +7,7 @@ import trimesh
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene

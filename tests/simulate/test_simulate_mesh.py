@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import plants
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 

@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.specim_iq import read_metadata
 from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
-from hsi_sc_nerf.meshes.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
 from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.materials import endmembers

@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.bands import covered, require_bands
-from hsi_sc_nerf.spectra.composites import COMPOSITES, composite
+from hsi_sc_nerf.spectra.bands import COMPOSITES, composite, covered, require_bands
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

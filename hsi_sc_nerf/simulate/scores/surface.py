@@ -18,10 +18,9 @@ from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, s
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
-from hsi_sc_nerf.meshes.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
-from hsi_sc_nerf.spectra.composites import composite
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.spectra.bands import composite, to_8_bit
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene

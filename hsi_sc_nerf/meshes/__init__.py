@@ -1,1 +1,0 @@
-"""Triangle meshes as plain arrays."""
