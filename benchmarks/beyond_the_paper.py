@@ -24,7 +24,7 @@ from results_table import write_results
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
-from hsi_sc_nerf.cli.steps import nerfstudio_command, run_step
+from hsi_sc_nerf.benchmark.steps import nerfstudio_command, run_step
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics

@@ -26,7 +26,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate.effects.detector import band_centres_nm
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
-from hsi_sc_nerf.tables import screen_table
+from hsi_sc_nerf.terminal import screen_table
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt

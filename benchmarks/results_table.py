@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.tables import screen_table
+from hsi_sc_nerf.terminal import screen_table
 
 RESULTS = Path(__file__).parent / "results"
 SOURCE_COLUMNS = ("commit", "seed", "machine")

@@ -29,7 +29,7 @@ from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
-from hsi_sc_nerf.tables import screen_table
+from hsi_sc_nerf.terminal import screen_table
 
 EVERY_KTH_CAMERA = 5
 SIZES = {

@@ -13,7 +13,6 @@ from nerfstudio.plugins.types import MethodSpecification
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataManagerConfig
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
-from hsi_sc_nerf.library_warnings import ignore_library_warnings
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
@@ -21,6 +20,7 @@ from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
+from hsi_sc_nerf.terminal import ignore_library_warnings
 from hsi_sc_nerf.viewer.panel import attach_spectral_panel
 
 ignore_library_warnings()

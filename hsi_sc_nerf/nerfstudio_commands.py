@@ -74,7 +74,7 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
 
 def _export_spectral_cloud(options: Any) -> None:
     """`export_cloud` with the options of nerfstudio's `ExportPointCloud`."""
-    from hsi_sc_nerf.export.description import run_name
+    from hsi_sc_nerf.export.cloud import run_name
     from hsi_sc_nerf.export.options import CloudOptions
     from hsi_sc_nerf.export.spectral_export import export_cloud
     from hsi_sc_nerf.models.trained_run import open_run

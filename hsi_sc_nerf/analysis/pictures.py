@@ -16,8 +16,7 @@ from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
-from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
+from hsi_sc_nerf.plotting.figures import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.spectra.bands import available_composites, composite
 from hsi_sc_nerf.spectra.indices import available_indices, index_values
 

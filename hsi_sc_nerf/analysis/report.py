@@ -15,7 +15,7 @@ from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, Traits
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.spectra.bands import COMPOSITES
-from hsi_sc_nerf.tables import markdown_table
+from hsi_sc_nerf.terminal import markdown_table
 
 # Name, unit, and the unit's factor on metres, square metres or litres.
 _SIZES = {

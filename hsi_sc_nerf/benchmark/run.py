@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hsi_sc_nerf.benchmark.configurations import training_config
-from hsi_sc_nerf.benchmark.machine import peak_memory_mib
+from hsi_sc_nerf.benchmark.steps import peak_memory_mib
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, write_json
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """A capture session on disk: its frames, its white tarp, and the cubes of each capture.
 
-``layout.py`` finds the files of a SPECIM IQ or of a plain folder of ENVI pairs; ``session_info.py`` reads
+``instrument.py`` finds the files of a SPECIM IQ or of a plain folder of ENVI pairs; ``session_info.py`` reads
 ``session.json``.
 """
 
@@ -15,10 +15,16 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.capture.envi import Cube, open_cube
 from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
-from hsi_sc_nerf.capture.layout import CaptureFiles, list_captures
+from hsi_sc_nerf.capture.instrument import (
+    CaptureFiles,
+    SpecimMetadata,
+    dark_of_white,
+    list_captures,
+    read_metadata,
+    usual_rotation_deg,
+)
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_band_centres, read_session_info
-from hsi_sc_nerf.capture.specim_iq import SpecimMetadata, dark_of_white, read_metadata, usual_rotation_deg
 from hsi_sc_nerf.errors import InputError
 
 # Headers list centres to about 0.01 nm; two captures of one instrument agree to that.

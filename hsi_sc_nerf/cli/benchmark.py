@@ -26,10 +26,9 @@ from hsi_sc_nerf.benchmark.configurations import (
     split_words,
     training_config,
 )
-from hsi_sc_nerf.benchmark.machine import available_cores, describe_machine
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock, Job
+from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
 from hsi_sc_nerf.capture.session import is_session
-from hsi_sc_nerf.cli.steps import run_step
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, write_json
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed

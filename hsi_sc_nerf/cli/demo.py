@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hsi_sc_nerf.cli.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
+from hsi_sc_nerf.benchmark.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder
 

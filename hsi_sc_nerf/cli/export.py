@@ -34,7 +34,7 @@ class ExportCommand:
         Raises:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
-        from hsi_sc_nerf.export.description import run_name
+        from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud
         from hsi_sc_nerf.models.trained_run import open_run
 

@@ -13,11 +13,9 @@ from rich.markup import escape
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, inspect_session
-from hsi_sc_nerf.inspection.picture import draw_inspection
-from hsi_sc_nerf.inspection.session_json import suggestion
+from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, draw_inspection, inspect_session, suggestion
 from hsi_sc_nerf.inspection.watch import Watch
-from hsi_sc_nerf.tables import screen_table
+from hsi_sc_nerf.terminal import screen_table
 
 POLL_S = 2.0
 """A folder that is watched is looked at so often."""

@@ -23,7 +23,7 @@ from hsi_sc_nerf.cli.sample import SampleCommand
 from hsi_sc_nerf.cli.simulate import SimulateCommand
 from hsi_sc_nerf.cli.traits import TraitsCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.library_warnings import ignore_library_warnings
+from hsi_sc_nerf.terminal import ignore_library_warnings
 
 Commands = (
     Annotated[DemoCommand, tyro.conf.subcommand("demo")]

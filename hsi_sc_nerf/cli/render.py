@@ -56,12 +56,17 @@ class RenderCommand:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
-        from hsi_sc_nerf.progress import progress_bar
         from hsi_sc_nerf.rendering.comparison import compare, write_report
-        from hsi_sc_nerf.rendering.cubes import render_view, write_view
         from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
-        from hsi_sc_nerf.rendering.views import views_of_frames, views_of_orbit, views_of_path
+        from hsi_sc_nerf.rendering.views import (
+            render_view,
+            views_of_frames,
+            views_of_orbit,
+            views_of_path,
+            write_view,
+        )
         from hsi_sc_nerf.spectra.bands import to_8_bit
+        from hsi_sc_nerf.terminal import progress_bar
 
         run = open_run(self.load_config)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]

@@ -18,7 +18,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.benchmark.configurations import split_words
-from hsi_sc_nerf.cli.steps import run_step, typed_command
+from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import make_folder, write_json
 from hsi_sc_nerf.settings_file import between, check_options

@@ -47,9 +47,8 @@ class SampleCommand:
                 written.
         """
         check_options(self)
-        from hsi_sc_nerf.export.description import run_name
-        from hsi_sc_nerf.export.sample_points import sample_points
-        from hsi_sc_nerf.export.sampled_ply import read_points, write_sampled_ply
+        from hsi_sc_nerf.export.cloud import run_name
+        from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_run
 
         given = read_points(self.points)

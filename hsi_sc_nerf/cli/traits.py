@@ -70,7 +70,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
-        from hsi_sc_nerf.progress import progress_bar
+        from hsi_sc_nerf.terminal import progress_bar
 
         check_options(self)
         if self.classes and self.library is None:

@@ -20,8 +20,7 @@ import numpy as np
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import CHUNK_POINTS, CloudStream
-from hsi_sc_nerf.export.description import COLUMNS, REFLECTANCE, cloud_attributes, comment_lines
+from hsi_sc_nerf.export.cloud import CHUNK_POINTS, COLUMNS, REFLECTANCE, CloudStream, cloud_attributes, comment_lines
 from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, make_folder
 

@@ -17,8 +17,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, stream
-from hsi_sc_nerf.export.description import comment_lines
+from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, comment_lines, stream
 from hsi_sc_nerf.files import atomic_write
 
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")

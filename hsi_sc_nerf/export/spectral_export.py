@@ -26,9 +26,8 @@ from hsi_sc_nerf.export.cloud import (
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.models.trained_run import TrainedRun
-from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.spectra.bands import to_8_bit
-from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
+from hsi_sc_nerf.surface.depth_renders import STATISTICS, DepthRenders, render_depth_maps, view_statistics
 from hsi_sc_nerf.surface.regions import (
     EVERYWHERE,
     Region,
@@ -40,9 +39,9 @@ from hsi_sc_nerf.surface.regions import (
 )
 from hsi_sc_nerf.surface.surface_depth import camera_rays, render_object
 from hsi_sc_nerf.surface.surface_points import SurfacePoints, sample_surface_points
-from hsi_sc_nerf.surface.view_statistics import COLUMNS, view_statistics
+from hsi_sc_nerf.terminal import progress_bar
 
-EXTRA = ("opacity", INCIDENCE, *COLUMNS)
+EXTRA = ("opacity", INCIDENCE, *STATISTICS)
 
 
 def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name: str = "") -> Path:

@@ -1,22 +1,27 @@
-"""All checks of a session, in the order of their cost."""
+"""All checks of a session in the order of their cost, their picture, and the ``session.json`` that they suggest."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
+from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.white_check import check_white
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.file_checks import check_files
 from hsi_sc_nerf.inspection.frame_checks import check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
-from hsi_sc_nerf.inspection.session_json import check_scale, filled_in
+from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.upright import rotation_from_corners
 
@@ -25,6 +30,11 @@ UPRIGHT_FRAMES = 6
 """Frames from whose markers the upright direction is measured."""
 FEWEST_SIGHTINGS = 4
 """Fewest markers, over these frames, that can show it."""
+WHOLE_TURN_DEG = 0.05
+"""Frames that fill a turn to this fraction are taken for one whole turn."""
+THUMBNAIL_COLUMNS = 12
+THUMBNAIL_PX = 112
+THUMBNAIL_GAMMA = 1.0 / 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,3 +128,106 @@ def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
         return session, Finding("upright", "amber", sentence, values)
     sentence = f"Upright: images are rotated by {measured} degrees, as the markers show."
     return replace(session, image_rotation_deg=measured), Finding("upright", "green", sentence, values)
+
+
+def filled_in(session: Session, markers: Markers) -> dict[str, object]:
+    """Content of ``session.json``: what it states, what the markers show, and None for a scale that is not known."""
+    default = SessionInfo()
+    stated = {
+        field.name: getattr(session.info, field.name)
+        for field in fields(SessionInfo)
+        if getattr(session.info, field.name) != getattr(default, field.name)
+    }
+    content: dict[str, object] = {"object": session.path.resolve().name}
+    if markers.dictionary is not None:
+        content |= {"marker_dictionary": markers.dictionary, "marker_side_m": None}
+    step = markers.usual_step_deg
+    if step is not None:
+        turn = abs(step) * len(session.frames)
+        whole = abs(turn / 360.0 - 1.0) < WHOLE_TURN_DEG
+        content["nominal_step_deg"] = round(360.0 / len(session.frames), 3) if whole else round(2.0 * abs(step)) / 2.0
+        content["direction"] = "ccw" if step > 0.0 else "cw"
+    return content | stated
+
+
+def suggestion(session: Session, content: dict[str, object]) -> str:
+    """Lines that show a ``session.json`` to copy."""
+    missing = [key for key, value in content.items() if value is None]
+    ask = f" with {', '.join(missing)} in the place of null" if missing else ""
+    return f"This is what the frames show; write it to {session.info_path}{ask}:\n{json.dumps(content, indent=2)}"
+
+
+def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Finding:
+    """The finding ``scale``: whether anything gives the size of what is seen.
+
+    Args:
+        session: the session.
+        poses: how poses will be found; from features or angles they may do without a scale.
+        scale_known: whether something beside ``session.json`` gives it.
+    """
+    info = session.info
+    known = {
+        name: value
+        for name in ("marker_side_m", "container_diameter_m", "camera_distance_m")
+        if (value := getattr(info, name)) is not None
+    }
+    if known or scale_known:
+        return Finding("scale", "green", f"Scale: {', '.join(known) or 'an option'} gives it.", known)
+    where = f"{session.info_path}: does not give" if session.info_path.is_file() else f"{session.path}: nothing gives"
+    sentence = (
+        f"{where} a scale; state marker_side_m, the side of a marker's black square in metres, in session.json or "
+        "by --marker-side-m, or do without a scale by --poses colmap."
+    )
+    return Finding("scale", "red" if poses in ("auto", "markers") else "amber", sentence)
+
+
+def draw_inspection(inspection: Inspection, path: Path) -> None:
+    """Draw the picture.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    looks, session = inspection.looks, inspection.session
+    names = [look.name for look in looks]
+    red = " ".join(finding.sentence for finding in inspection.findings if finding.level == "red")
+    rows = -(-len(looks) // THUMBNAIL_COLUMNS)
+    thumbnails = [_thumbnail(np.rot90(look.picture, session.quarter_turns)) for look in looks]
+    height, width = thumbnails[0].shape[:2]
+    sheet = np.ones((rows * height, THUMBNAIL_COLUMNS * width, 3), np.float32)
+    for index, thumbnail in enumerate(thumbnails):
+        top, left = index // THUMBNAIL_COLUMNS * height, index % THUMBNAIL_COLUMNS * width
+        sheet[top : top + height, left : left + width] = thumbnail
+    lines: dict[str, Sequence[float]] = {
+        "brightness": [float(look.picture.mean()) for look in looks],
+        "sharpness, 1/px": [look.sharpness_per_px for look in looks],
+        "markers": [len(seen) for seen in inspection.markers.detections],
+    }
+    with rc_context(STYLE):
+        figure = new_figure(11.0, 1.0 + 11.0 / THUMBNAIL_COLUMNS * rows * height / width + 3.6)
+        parts = figure.subplots(1 + len(lines), 1, height_ratios=[max(1.2 * rows, 1.2), 1, 1, 1])
+        show_image(parts[0], sheet)
+        parts[0].set_title(session.path.resolve().name)
+        for index, name in enumerate(names):
+            parts[0].text(
+                index % THUMBNAIL_COLUMNS * width + 3,
+                index // THUMBNAIL_COLUMNS * height + 3,
+                name,
+                fontsize=6,
+                va="top",
+                color="white",
+                bbox={"color": COLOURS[1] if name in red.replace(",", " ").split() else "0.2", "pad": 1},
+            )
+        for axes, (label, values) in zip(parts[1:], lines.items(), strict=True):
+            axes.plot(values, marker=".", color=COLOURS[0])
+            axes.set(ylabel=label, ylim=(0, 1.1 * max(max(values), 1e-9)))
+            shown = range(0, len(names), max(1, len(names) // 12))
+            labels = [names[index] for index in shown] if axes is parts[-1] else []
+            axes.set_xticks(list(shown), labels or [""] * len(shown), rotation=30, ha="right", fontsize=7)
+        save_figure(figure, path)
+
+
+def _thumbnail(picture: np.ndarray) -> np.ndarray:
+    """A small picture, brightened as a photograph, with a white border at the right and below."""
+    scale = THUMBNAIL_PX / max(picture.shape[:2])
+    small = cv2.resize(np.ascontiguousarray(picture), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.pad(np.clip(small, 0.0, 1.0) ** THUMBNAIL_GAMMA, ((0, 3), (0, 3), (0, 0)), constant_values=1.0)

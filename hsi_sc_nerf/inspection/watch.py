@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hsi_sc_nerf.capture.layout import CaptureFiles, list_captures
+from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
 from hsi_sc_nerf.capture.session_info import read_session_info
 from hsi_sc_nerf.inspection.file_checks import acquisition_day

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from hsi_sc_nerf.models.stages import Stage
-from hsi_sc_nerf.progress import timed_progress
+from hsi_sc_nerf.terminal import timed_progress
 
 # Metrics of the paper's table.
 _SUMMARY = {"sam": "SAM {:.4f} rad", "rmse": "RMSE {:.4f}", "ssim": "SSIM {:.3f}", "psnr": "PSNR {:.1f} dB"}

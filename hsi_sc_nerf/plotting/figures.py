@@ -1,4 +1,4 @@
-"""Figure set-up shared by all pictures: size, style, colours, saving.
+"""Figure set-up and false colours shared by all pictures: size, style, colours, saving.
 
 Figures are drawn without a display and without pyplot's global state.
 
@@ -12,15 +12,20 @@ Example:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hsi_sc_nerf.files import atomic_write
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 STYLE: Any = {
     "font.size": 9,
@@ -39,6 +44,16 @@ STYLE: Any = {
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, which colour-blind readers can distinguish; without yellow, which is faint on white."""
 DPI = 160
+INDEX_COLOURS = "viridis"
+"""matplotlib colour map of spectral indices, errors and distances."""
+ANGLE_COLOURS = "magma"
+"""matplotlib colour map of spectral angles."""
+ANGLE_DRAWN_RAD = (0.0, 0.2)
+"""Spectral angles at the ends of the colour map; ENVI's usual threshold for another material is in the middle."""
+ERROR_DRAWN = (0.0, 0.1)
+"""Root mean squared errors over the bands, reflectance, at the ends of the colour map."""
+BLANK = (0.25, 0.25, 0.25)
+"""Colour of missing values."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -71,3 +86,27 @@ def show_image(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
     if image.ndim == 3 and image.dtype != np.uint8:
         image = np.clip(image, 0, 1)
     return axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **options)
+
+
+def coloured(
+    values: Float[Tensor, "*shape"], drawn_range: tuple[float, float], colours: str
+) -> Float[Tensor, "*shape 3"]:
+    """Colours (RGB in [0, 1]) of values.
+
+    Args:
+        values: clipped to ``drawn_range``; NaN becomes ``BLANK``.
+        drawn_range: values at the two ends of the colour map.
+        colours: name of a matplotlib colour map.
+
+    Example:
+        >>> ndvi = torch.tensor([[0.2, 0.8], [0.5, torch.nan]])
+        >>> coloured(ndvi, (0.0, 1.0), INDEX_COLOURS).shape
+        torch.Size([2, 2, 3])
+    """
+    import torch  # takes seconds, and most figures do without it
+
+    low, high = drawn_range
+    table = torch.as_tensor(matplotlib.colormaps[colours](np.arange(256))[:, :3]).to(values)
+    missing = values.isnan()
+    position = ((values - low) / (high - low)).clamp(0.0, 1.0).masked_fill(missing, 0.0)
+    return torch.where(missing[..., None], table.new_tensor(BLANK), table[(position * 256.0).long().clamp_max(255)])

@@ -26,8 +26,7 @@ from hsi_sc_nerf.capture.session import Session, in_short, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.findings import refuse_red
-from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
-from hsi_sc_nerf.inspection.session_json import suggestion
+from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session, suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
     Container,

@@ -14,10 +14,18 @@ from torch import Tensor
 
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map, spectral_metrics, squared_error_map
 from hsi_sc_nerf.files import atomic_write, write_json
-from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, INDEX_COLOURS
-from hsi_sc_nerf.plotting.figures import STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.rendering.cubes import RenderedView
-from hsi_sc_nerf.tables import markdown_table
+from hsi_sc_nerf.plotting.figures import (
+    ANGLE_COLOURS,
+    ANGLE_DRAWN_RAD,
+    ERROR_DRAWN,
+    INDEX_COLOURS,
+    STYLE,
+    new_figure,
+    save_figure,
+    show_image,
+)
+from hsi_sc_nerf.rendering.views import RenderedView
+from hsi_sc_nerf.terminal import markdown_table
 
 _PANEL_IN = 2.2
 _COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {

@@ -14,8 +14,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS, coloured
-from hsi_sc_nerf.rendering.cubes import RenderedView
+from hsi_sc_nerf.plotting.figures import INDEX_COLOURS, coloured
+from hsi_sc_nerf.rendering.views import RenderedView
 from hsi_sc_nerf.spectra.bands import COMPOSITES, composite, require_bands
 from hsi_sc_nerf.spectra.indices import INDICES, index_values
 

@@ -13,7 +13,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.progress import progress_bar
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.dataset_sections import (
     calibration_section,
@@ -40,6 +39,7 @@ from hsi_sc_nerf.report.view_sections import (
     views_section,
     white_of,
 )
+from hsi_sc_nerf.terminal import progress_bar
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -168,7 +168,7 @@ def _settings(folder: Path) -> Section:
     import yaml
     from nerfstudio.configs.method_configs import all_methods
 
-    from hsi_sc_nerf.benchmark.machine import describe_machine
+    from hsi_sc_nerf.benchmark.steps import describe_machine
 
     config = yaml.load((folder / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
     # A run may have a name of its own (--method-name); then every setting is shown.

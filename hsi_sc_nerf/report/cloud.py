@@ -13,7 +13,7 @@ from matplotlib import colormaps
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
-from hsi_sc_nerf.plotting.false_colour import INDEX_COLOURS
+from hsi_sc_nerf.plotting.figures import INDEX_COLOURS
 from hsi_sc_nerf.spectra.bands import available_composites
 from hsi_sc_nerf.spectra.indices import available_indices, index_values
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from hsi_sc_nerf.plotting.false_colour import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
+from hsi_sc_nerf.plotting.figures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,

@@ -12,8 +12,7 @@ from inspection_session import INFO, LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_pic
 
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session
-from hsi_sc_nerf.inspection.picture import draw_inspection
+from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session
 
 
 def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:

@@ -5,7 +5,7 @@ import pytest
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.inspection.turn import frame_angles_deg
+from hsi_sc_nerf.inspection.marker_checks import frame_angles_deg
 
 
 def exact_detections(scene: MarkerScene, noise_px: float = 0.0) -> list[dict]:

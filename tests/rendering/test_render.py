@@ -15,9 +15,8 @@ from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
 from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.rendering.cubes import RenderedView, write_view
 from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
-from hsi_sc_nerf.rendering.views import views_of_orbit, views_of_path
+from hsi_sc_nerf.rendering.views import RenderedView, views_of_orbit, views_of_path, write_view
 from hsi_sc_nerf.spectra.bands import COMPOSITES
 from hsi_sc_nerf.spectra.indices import INDICES
 
@@ -178,10 +177,10 @@ def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
 
 
 def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
-    from hsi_sc_nerf.rendering import cubes as render_cubes
+    from hsi_sc_nerf.rendering import views as render_views
 
     monkeypatch.setattr(trained_run, "open_run", lambda _: run)
-    render_view, seen = render_cubes.render_view, []
+    render_view, seen = render_views.render_view, []
 
     def fail_at_the_second(model, camera):
         seen.append(camera)
@@ -189,7 +188,7 @@ def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
             raise KeyboardInterrupt
         return render_view(model, camera)
 
-    monkeypatch.setattr(render_cubes, "render_view", fail_at_the_second)
+    monkeypatch.setattr(render_views, "render_view", fail_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         RenderCommand(tmp_path, tmp_path, views="orbit", orbit_views=3, orbit_size=0.3, video=("pseudo-RGB",)).main()
     assert {path.name for path in tmp_path.iterdir()} == {

@@ -5,8 +5,7 @@ import pytest
 
 from hsi_sc_nerf.surface import surface_points
 from hsi_sc_nerf.surface.regions import EVERYWHERE, box_region
-from hsi_sc_nerf.surface.surface_points import SurfacePoints, even_points
-from hsi_sc_nerf.surface.tsdf_fusion import SurfaceMesh
+from hsi_sc_nerf.surface.surface_points import SurfaceMesh, SurfacePoints, even_points
 
 
 def at(points: np.ndarray) -> SurfacePoints:

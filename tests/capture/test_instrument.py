@@ -10,8 +10,8 @@ import pytest
 from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
 
 from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.instrument import read_metadata
 from hsi_sc_nerf.capture.session import open_session
-from hsi_sc_nerf.capture.specim_iq import read_metadata
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.fingerprint import capture_files, session_files, shared_files
 

@@ -1,21 +1,28 @@
-"""Runs commands as steps in processes of their own, and measures their time and memory."""
+"""Commands as steps in processes of their own: what they cost, and on which machine."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hsi_sc_nerf.benchmark.machine import peak_memory_mib
 from hsi_sc_nerf.errors import InputError
 
+if TYPE_CHECKING:
+    from resource import struct_rusage
+
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
+_RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
 @dataclass(frozen=True)
@@ -93,3 +100,41 @@ def typed_command(words: Sequence[str]) -> list[str]:
 def _end_with_parent() -> None:
     """In a new process: end when the process that started it is killed (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def peak_memory_mib(usage: struct_rusage | None = None) -> float:
+    """The most memory that a process held at once; without its ``usage``, of this one."""
+    import resource  # not on Windows, where the commands that measure no memory run
+
+    usage = usage or resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_maxrss * _RSS_UNIT_BYTES / 2**20
+
+
+def describe_machine() -> dict[str, str]:
+    """System, processor, cores, accelerator and versions, in words."""
+    import torch
+
+    machine = {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": str(available_cores()),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
+        "python": platform.python_version(),
+    }
+    return machine | {package: version(package) for package in _PACKAGES}
+
+
+def _processor() -> str:
+    """Model name of the processor where the system tells it (Linux), otherwise what Python calls it."""
+    facts = Path("/proc/cpuinfo")
+    if facts.is_file():
+        for line in facts.read_text(encoding="utf-8").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    return platform.processor() or "unknown"
