@@ -26,8 +26,8 @@ from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calib
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import Capture, open_session
 from hsi_sc_nerf.processing.frames import pack_frames
+from hsi_sc_nerf.simulate.processing_score import CalibrationScore, lamp_output, score_calibration
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.scores.processing import CalibrationScore, lamp_output, score_calibration
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 

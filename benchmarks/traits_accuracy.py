@@ -27,7 +27,7 @@ from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spe
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.numerics import spectral_angle
-from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.terminal import screen_table
 

@@ -51,3 +51,18 @@ def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> N
         sentences = " ".join(finding.sentence for finding in refused)
         accept = " ".join(f"--accept {name}" for name in dict.fromkeys(finding.name for finding in refused))
         raise InputError(f"{sentences} (To go on in spite of this: {accept}.)")
+
+
+def judged(name: str, value: float, limits: tuple[float, float], sentence: str, advice: str) -> Finding:
+    """The finding on a value: green up to the first limit, amber up to the second, red above.
+
+    Args:
+        name: of the check.
+        value: measured.
+        limits: of green and of amber, in the value's unit.
+        sentence: what is so, without a full stop.
+        advice: what to do, given unless it is green.
+    """
+    good, usable = limits
+    level: Level = "green" if value <= good else "amber" if value <= usable else "red"
+    return Finding(name, level, f"{sentence}{'' if level == 'green' else f'; {advice}'}.", {"value": float(value)})

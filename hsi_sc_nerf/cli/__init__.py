@@ -1,1 +1,1 @@
-"""Command line: one file a command."""
+"""Command line: the commands, by what they work on."""

@@ -26,7 +26,7 @@ from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed
 from hsi_sc_nerf.plotting.result_pictures import draw_cloud, draw_spectra, draw_views
-from hsi_sc_nerf.simulate.scores.processing import ProcessingScore, score_processing
+from hsi_sc_nerf.simulate.processing_score import ProcessingScore, score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
 SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")

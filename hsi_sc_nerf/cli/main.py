@@ -10,18 +10,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
-from hsi_sc_nerf.cli.compare import CompareCommand
+from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
 from hsi_sc_nerf.cli.demo import DemoCommand
-from hsi_sc_nerf.cli.export import ExportCommand
-from hsi_sc_nerf.cli.inspect import InspectCommand
-from hsi_sc_nerf.cli.markers import MarkersCommand
-from hsi_sc_nerf.cli.process import ProcessCommand
-from hsi_sc_nerf.cli.render import RenderCommand
-from hsi_sc_nerf.cli.report import ReportCommand
 from hsi_sc_nerf.cli.run import RunCommand
-from hsi_sc_nerf.cli.sample import SampleCommand
-from hsi_sc_nerf.cli.simulate import SimulateCommand
-from hsi_sc_nerf.cli.traits import TraitsCommand
+from hsi_sc_nerf.cli.sessions import InspectCommand, MarkersCommand, ProcessCommand, SimulateCommand
+from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.terminal import ignore_library_warnings
 

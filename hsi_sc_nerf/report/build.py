@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG
 from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.dataset_sections import (
@@ -22,7 +24,6 @@ from hsi_sc_nerf.report.dataset_sections import (
     read_json,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.judgements import judge_cloud
 from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
 from hsi_sc_nerf.report.result_sections import comparison_key_figure, comparison_section, traits_section
 from hsi_sc_nerf.report.run_sections import (
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
 
 CLOUD_POINTS = 50_000
+_OBLIQUE_FRACTION = 0.1
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,19 @@ def object_section(cloud: SpectralCloud, points: int) -> Section:
         f"which changes reflectance by {spectra.rmse:.1e} (root mean square; at most {spectra.largest_error:.1e})."
     )
     return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)], judge_cloud(cloud))
+
+
+def judge_cloud(cloud: SpectralCloud) -> list[Finding]:
+    """How much of the surface was seen only obliquely; nothing without that column."""
+    if INCIDENCE not in cloud.extra:
+        return []
+    fraction = float(np.mean(cloud.extra[INCIDENCE] > MAX_INCIDENCE_DEG))
+    sentence = (
+        f"{fraction:.1%} of the points are seen at more than {MAX_INCIDENCE_DEG:g}° from the front (good up to "
+        f"{_OBLIQUE_FRACTION:.0%})"
+    )
+    advice = f"show the column {INCIDENCE} to see where their spectra are mixed"
+    return [judged("oblique", fraction, (_OBLIQUE_FRACTION, np.inf), sentence, advice)]
 
 
 def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,9 @@ from jaxtyping import Float, Int
 from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.judgements import judge_calibration, judge_masks, judge_poses
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
@@ -27,6 +26,11 @@ _FLAGGED = {
     "dead": "dead element",
     "no_data": "no data",
 }
+_FLAGGED_FRACTION = (0.01, 0.05)
+# The outline of a convex object changes by a few per cent from frame to frame.
+_MASK_JUMP = 0.1
+# The paper's target.
+_REPROJECTION_PX = 1.0
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
@@ -95,6 +99,17 @@ def calibration_section(dataset: PackedDataset) -> Section:
         blocks += _folded_picture(dataset, name, summary)
     findings = judge_calibration(dataset.flagged_values / _values(dataset), (found or {}).get("lamp_drift") or {})
     return Section("calibration", "Calibration", blocks, findings)
+
+
+def judge_calibration(flagged_fraction: float, drift: Mapping[str, Any]) -> list[Finding]:
+    """How many values are no measurement, and whether the lamps' drift is known."""
+    sentence = f"{flagged_fraction:.2%} of the values are no measurement (good up to {_FLAGGED_FRACTION[0]:.0%})"
+    advice = "see which bands, and lower the integration time if they are saturated"
+    findings = [judged("flagged", flagged_fraction, _FLAGGED_FRACTION, sentence, advice)]
+    if drift and not drift.get("measured"):
+        reason = drift.get("reason", "no reason is given")
+        findings.append(Finding("drift", "amber", f"The drift of the lamps was not measured: {reason}."))
+    return findings
 
 
 def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Table:
@@ -170,6 +185,19 @@ def masks_section(dataset: PackedDataset) -> Section:
     return Section("masks", "Masks", blocks, judge_masks(areas_px, [frame.capture for frame in dataset.frames]))
 
 
+def judge_masks(areas_px: Int[np.ndarray, "frames"], captures: Sequence[str]) -> list[Finding]:
+    """Frames whose mask is much larger or smaller than those of the frames before and after."""
+    neighbours = np.median([np.roll(areas_px, shift) for shift in (-2, -1, 1, 2)], axis=0)
+    jumps = np.abs(areas_px / np.maximum(neighbours, 1.0) - 1.0)
+    sentence = (
+        f"Masks differ from those of the frames beside them by up to {jumps.max():.1%} of their size (good up to "
+        f"{_MASK_JUMP:.0%})"
+    )
+    odd = ", ".join(captures[index] for index in np.argsort(-jumps)[:5] if jumps[index] > _MASK_JUMP)
+    advice = f"look at {odd}, and mend or exclude such frames"
+    return [judged("masks", float(jumps.max()), (_MASK_JUMP, np.inf), sentence, advice)]
+
+
 def poses_section(dataset: PackedDataset) -> Section:
     """Poses of the camera and their uncertainty."""
     found = read_json(dataset.root / "poses.json")
@@ -188,6 +216,21 @@ def poses_section(dataset: PackedDataset) -> Section:
         blocks.append(Figure([chart], caption))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
     return Section("poses", "Poses", blocks, judge_poses(found))
+
+
+def judge_poses(found: Mapping[str, Any]) -> list[Finding]:
+    """The reprojection error, the frames without a pose, and the warnings of ``poses.json``."""
+    error, frames = (found.get(key) or {} for key in ("reprojection_error_px", "frames"))
+    findings = []
+    if error.get("overall") is not None:
+        target_px = error.get("target") or _REPROJECTION_PX
+        sentence = f"The reprojection error is {error['overall']:.2f} px (good up to {target_px:g} px)"
+        advice = "look at the frames that stand out"
+        findings.append(judged("reprojection", error["overall"], (target_px, np.inf), sentence, advice))
+    if frames.get("total") and frames.get("used") != frames["total"]:
+        sentence = f"{frames['total'] - frames['used']} of {frames['total']} frames have no pose."
+        findings.append(Finding("left-out", "amber", sentence))
+    return findings + [Finding("poses", "amber", sentence) for sentence in found.get("warnings", ())]
 
 
 def _by_frame(values: Float[np.ndarray, "frames"], y_label: str, alt: str) -> Markup:

@@ -10,8 +10,8 @@ import numpy as np
 
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.judgements import judge_comparison, judge_traits
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _MM_PER_M = 1000.0
@@ -20,6 +20,8 @@ _SCORES = {"chosen": "at the chosen threshold", "knee": "at the knee of the F-sc
 _DISTANCES = {"cloud_to_reference": "cloud to reference", "reference_to_cloud": "reference to cloud"}
 _STATISTICS = {"mean_m": "mean", "median_m": "median", "rms_m": "RMS", "percentile_95_m": "95th percentile"}
 _WRONG_CONTENT = (AttributeError, KeyError, TypeError, ValueError)
+_F_SCORE_MISSING_PERCENT = (10.0, 30.0)
+_UNSEEN_FRACTION = 0.15
 
 
 def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Section:
@@ -45,6 +47,20 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Se
         alt = "The cloud and the reference, coloured by the distance to the other"
         blocks.append(Folded("Where the distances are", [Figure([embedded_file(picture, alt)], f"{alt}.")]))
     return Section("comparison", title, blocks, judge_comparison(comparison))
+
+
+def judge_comparison(comparison: Mapping[str, Any]) -> list[Finding]:
+    """The F-score at the chosen threshold."""
+    score = comparison["scores"]["chosen"]
+    missing_percent = 100.0 - float(score["f_score"])
+    sentence = (
+        f"The F-score at {1000.0 * float(score['threshold_m']):.1f} mm is {100.0 - missing_percent:.1f} % (good from "
+        f"{100.0 - _F_SCORE_MISSING_PERCENT[0]:g} %)"
+    )
+    lower = "precision" if score["precision"] < score["recall"] else "recall"
+    return [
+        judged("f-score", missing_percent, _F_SCORE_MISSING_PERCENT, sentence, f"{lower} is the lower of the two")
+    ]
 
 
 def comparison_key_figure(comparison: Mapping[str, Any]) -> dict[str, str]:
@@ -105,3 +121,13 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path) -> Section:
         raise InputError(f"{source}: holds no traits ({error}); make it again with `hsi-sc-nerf traits`.") from error
     blocks = [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
     return Section("traits", "Traits", blocks, findings)
+
+
+def judge_traits(traits: Mapping[str, Any]) -> list[Finding]:
+    """Whether the mesh encloses a volume, and how much of it was not seen."""
+    if not traits["watertight"]:
+        return [Finding("watertight", "red", "The mesh has holes, so its volume cannot be trusted; mesh it anew.")]
+    fraction = 1.0 - traits["seen_area_m2"] / traits["size"]["area_m2"]
+    sentence = f"The mesh is closed; {fraction:.1%} of its area was not seen (good up to {_UNSEEN_FRACTION:.0%})"
+    advice = "give the container's height (--data), and see which side was not seen"
+    return [judged("closed-area", fraction, (_UNSEEN_FRACTION, np.inf), sentence, advice)]

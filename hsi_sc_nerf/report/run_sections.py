@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.judgements import judge_training
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
@@ -33,6 +33,7 @@ Scalars = dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 _CHECKPOINT = re.compile(r"step-(\d+)\.ckpt")
 MOST_POINTS = 400
 """Longer curves are averaged to this many points."""
+_PSNR_RISE_DB = 0.5
 
 
 def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section:
@@ -78,6 +79,19 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     last_stage_from = ([0.0, 0.0, *marks.values()])[-2] if marks else 0.0
     findings = judge_training(psnr_db[steps >= last_stage_from])
     return Section("training", "Training", [Figure(charts, caption, titles, columns=2)], findings)
+
+
+def judge_training(psnr_db: Float[np.ndarray, "n"]) -> list[Finding]:
+    """Whether the PSNR of training rays in the last stage still rose at its end; nothing of a short log."""
+    if len(psnr_db) < 8:
+        return []
+    before, end = np.array_split(psnr_db[len(psnr_db) // 2 :], 2)
+    rise_db = float(np.mean(end) - np.mean(before))
+    sentence = (
+        f"The PSNR of training rays rose by {rise_db:.2f} dB in the last quarter of the last stage (converged up to "
+        f"{_PSNR_RISE_DB:g} dB)"
+    )
+    return [judged("convergence", rise_db, (_PSNR_RISE_DB, np.inf), sentence, "train longer")]
 
 
 def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:

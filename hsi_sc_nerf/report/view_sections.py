@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from string import ascii_uppercase
 
 import cv2
@@ -10,16 +10,18 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.plotting.figures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
+    PointSpectra,
     ViewScores,
     mean_and_sd,
     object_angles,
     spread_of_views,
 )
-from hsi_sc_nerf.report.judgements import judge_bands, judge_spectra, judge_views
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
 from hsi_sc_nerf.spectra.bands import to_8_bit
 
@@ -39,6 +41,11 @@ _METRICS = {
 }
 _MARK_RGB = (213, 94, 0)
 _MARKED_PX = 480
+# Half of the angle that tells two materials apart, and that angle.
+_SAM_RAD = (paper.CLASSIFICATION_ANGLE_RAD / 2.0, paper.CLASSIFICATION_ANGLE_RAD)
+# The paper prints 0.03 to 0.044 for real fruit.
+_RMSE = (0.05, 0.1)
+_SPECTRUM_ERROR = (0.05, 0.15)
 
 
 def metric_key_figures(views: Sequence[ViewScores]) -> dict[str, str]:
@@ -91,6 +98,17 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
         caption = f"{view.scores.name}: SAM {metrics['sam']:.4f} rad, RMSE {metrics['rmse']:.4f}."
         blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
     return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
+
+
+def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
+    """The spectral angle of the held-out views."""
+    angles = np.array([view.metrics["sam"] for view in views])
+    sentence = (
+        f"The mean spectral angle is {angles.mean():.3f} rad (good up to {_SAM_RAD[0]:g}; {_SAM_RAD[1]:g} is another "
+        f"material); it is largest in {views[int(angles.argmax())].name}, {angles.max():.3f} rad"
+    )
+    advice = "look at the maps, the mask and the pose of that view"
+    return [judged("spectral-angle", float(angles.mean()), _SAM_RAD, sentence, advice)]
 
 
 def white_of(views: Sequence[HeldOutView]) -> float:
@@ -171,6 +189,16 @@ def bands_section(
     return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
 
+def judge_bands(rmse: Float[np.ndarray, "bands"], wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Finding]:
+    """The band with the largest error."""
+    worst = int(np.nanargmax(rmse))
+    sentence = (
+        f"The RMSE of reflectance is {np.nanmean(rmse):.3f} and in no band above {rmse[worst]:.3f}, at "
+        f"{wavelengths_nm[worst]:.0f} nm (good up to {_RMSE[0]:g})"
+    )
+    return [judged("rmse", float(rmse[worst]), _RMSE, sentence, "train longer, or look at the maps of the error")]
+
+
 def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], white: float) -> Section:
     """Measured and rendered spectra around some points of one view, with how much they vary there.
 
@@ -197,6 +225,22 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
     marked = Figure([picture], f"Points in {view.scores.name}, as measured.")
     blocks = [marked, Figure(list(charts.values()), caption, list(charts), columns=2)]
     return Section("spectra", "Spectra", blocks, judge_spectra(points))
+
+
+def judge_spectra(points: Mapping[str, PointSpectra]) -> list[Finding]:
+    """How far rendered mean spectra are from the measured ones, by the points' letters."""
+    errors = {
+        letter: float(np.nanmean(np.abs(one.rendered - one.measured)) / np.nanmean(one.measured))
+        for letter, one in points.items()
+    }
+    if not errors:
+        return []
+    worst = max(errors, key=lambda letter: errors[letter])
+    sentence = (
+        f"Rendered spectra differ from the measured means by {np.mean(list(errors.values())):.1%} of reflectance, "
+        f"most at {worst}, {errors[worst]:.1%} (good up to {_SPECTRUM_ERROR[0]:.0%})"
+    )
+    return [judged("spectra", errors[worst], _SPECTRUM_ERROR, sentence, "compare its curve with the noise around it")]
 
 
 def _marked(view: HeldOutView, white: float) -> UInt8[np.ndarray, "h w 3"]:

@@ -18,11 +18,16 @@ import yaml
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
-from hsi_sc_nerf.simulate.effects import read_effects
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.effects import detector, image, light, motion
 from hsi_sc_nerf.simulate.effects.detector import SensorSettings
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 
 SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect for effect in (*motion.EFFECTS, *light.EFFECTS, *image.EFFECTS, *detector.EFFECTS)
+}
+"""All effects by name, in the order in which they act, whatever their order in the scene file."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,7 @@ class Scene:
     container: ContainerSettings = ContainerSettings()
     sensor: SensorSettings = field(default_factory=SensorSettings)
     effects: tuple[Any, ...] = ()
-    """Effects from `effects.EFFECTS`, in the order in which they act."""
+    """Effects from `EFFECTS`, in the order in which they act."""
     seed: int = between(0, 2**31 - 1, default=0)
 
 
@@ -274,3 +279,35 @@ def override(
         scene = replace(scene, effects=read_effects([yaml.safe_load(text) for text in effects], "--effects"))
     check_ranges(scene, scene.name, "")
     return scene
+
+
+def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
+    """Effects of a scene file's list, in the order in which they act.
+
+    Args:
+        values: names, or names with settings such as ``{"read_noise": {"electrons": 40}}``.
+        source: name of the file or option in error messages.
+
+    Raises:
+        InputError: an unknown or repeated effect; an unknown, missing, mistyped or out-of-range setting.
+
+    Example:
+        >>> read_effects(["photon_noise", {"lamp": {"fraction": 0.3}}], "scene.yaml")
+        (Lamp(fraction=0.3, azimuth_deg=-35.0, elevation_deg=30.0), PhotonNoise())
+    """
+    found: dict[str, Effect] = {}
+    settings: dict[str, Any]
+    for value in values:
+        if isinstance(value, str):
+            name, settings = value, {}
+        elif isinstance(value, dict) and len(value) == 1:
+            ((name, settings),) = value.items()
+        else:
+            raise InputError(f"{source}: effect {value!r} is neither a name nor `name: {{setting: value}}`.")
+        if name not in EFFECTS:
+            raise InputError(f"{source}: effect {name!r} is unknown; known are {', '.join(EFFECTS)}.")
+        if name in found:
+            raise InputError(f"{source}: effect {name} is named twice; name it once.")
+        found[name] = read_dataclass(EFFECTS[name], settings or {}, source, f"effects.{name}.")
+        check_ranges(found[name], source, f"effects.{name}.")
+    return tuple(found[name] for name in EFFECTS if name in found)

@@ -11,7 +11,7 @@ from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
-from hsi_sc_nerf.cli.traits import TraitsCommand
+from hsi_sc_nerf.cli.clouds import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
@@ -20,7 +20,7 @@ from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights
 from hsi_sc_nerf.simulate.scene import Fruit
-from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 25)
 STAND_M = 0.07

@@ -25,7 +25,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
-from hsi_sc_nerf.simulate.scores.surface import TrueSurface, relative_rms
+from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 31)
 GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)

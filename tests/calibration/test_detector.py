@@ -16,9 +16,8 @@ from hsi_sc_nerf.calibration.detector import (
     unlit_bands,
 )
 from hsi_sc_nerf.calibration.white_reference import find_coarse_roi
-from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
 NOISE = {"photon_noise": {}, "read_noise": {}}
 

@@ -21,9 +21,8 @@ from hsi_sc_nerf.calibration.lamp_drift import (
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel
 from hsi_sc_nerf.calibration.report import draw_lamp_drift
-from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
 NOISE = ("photon_noise", "read_noise", "dark_pattern")
 DRIFT = {"lamp_drift": {"percent": -7.0, "temperature_change_k": -100.0}}

@@ -18,10 +18,9 @@ from hsi_sc_nerf.calibration.noise import (
 )
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.simulate import frames
-from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, ReadoutContext
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
 LINES, SAMPLES, BANDS = 72, 60, 40
 COUNTS_PER_ELECTRON, READ_NOISE = 0.15, 4.0

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from plyfile import PlyData, PlyElement
 
-from hsi_sc_nerf.cli.compare import CompareCommand
+from hsi_sc_nerf.cli.clouds import CompareCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation import comparison
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Comparison, compare, read_reference, read_surface
@@ -16,7 +16,7 @@ from hsi_sc_nerf.evaluation.comparison_report import write_comparison
 from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
 from hsi_sc_nerf.geometry.camera import Similarity
-from hsi_sc_nerf.simulate.scores.surface import seen_points, true_reference
+from hsi_sc_nerf.simulate.true_surface import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 RADIUS_M, CAMERA_M = 0.04, 0.2

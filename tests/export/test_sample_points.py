@@ -9,7 +9,7 @@ import torch
 import yaml
 from plyfile import PlyData, PlyElement
 
-from hsi_sc_nerf.cli.sample import SampleCommand
+from hsi_sc_nerf.cli.trained_runs import SampleCommand
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from inspection_session import SIZE_PX, frame_picture, write_one
 
-from hsi_sc_nerf.cli.inspect import InspectCommand
+from hsi_sc_nerf.cli.sessions import InspectCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 

@@ -9,7 +9,7 @@ import spectral
 import torch
 from PIL import Image
 
-from hsi_sc_nerf.cli.render import RenderCommand
+from hsi_sc_nerf.cli.trained_runs import RenderCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.geometry.ray_projection import in_camera_frame

@@ -16,13 +16,12 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble, frames
 from hsi_sc_nerf.simulate.effect import effect_rng
 from hsi_sc_nerf.simulate.effects import detector as sensor
-from hsi_sc_nerf.simulate.effects import read_effects
 from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
 from hsi_sc_nerf.simulate.effects.image import OpticalBlur, distort, gaussian_kernel, undistort
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.materials import Measured, endmembers
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 

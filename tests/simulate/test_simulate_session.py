@@ -12,7 +12,7 @@ from seen_markers import detected_corners
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.instrument import read_metadata
 from hsi_sc_nerf.capture.session import open_session
-from hsi_sc_nerf.cli.simulate import SimulateCommand
+from hsi_sc_nerf.cli.sessions import SimulateCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.geometry.mesh import Mesh

@@ -301,3 +301,15 @@ def many_electrons(mean: Float[np.ndarray, "*n"], normal: Float[np.ndarray, "*n"
     number += mean - np.float32(1.0 / 6.0)
     np.rint(number, out=number)
     return np.maximum(number, 0.0, out=number)
+
+
+EFFECTS: tuple[type[Effect], ...] = (
+    SpectralSmile,
+    Saturation,
+    TarpExposure,
+    PhotonNoise,
+    DarkPattern,
+    ReadNoise,
+    BadPixels,
+)
+"""In the order in which they act."""

@@ -268,3 +268,15 @@ def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> 
         step_y = (xx * missing_y - xy * missing_x) / determinant
         found = found + np.stack([step_x, step_y], axis=-1)
     return None
+
+
+EFFECTS: tuple[type[Effect], ...] = (
+    TexturedBackground,
+    Drying,
+    DriftingLamps,
+    IlluminationFalloff,
+    LensDistortion,
+    OpticalBlur,
+    ImageRotation,
+)
+"""In the order in which they act."""

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
+from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, SurfaceLight, SurfaceLightEffect, ViewLightEffect
 from hsi_sc_nerf.simulate.render import Hits
 
@@ -182,3 +183,7 @@ def mean_fresnel(refractive_index: float) -> float:
 
 def _at_normal(refractive_index: float) -> float:
     return ((refractive_index - 1.0) / (refractive_index + 1.0)) ** 2
+
+
+EFFECTS: tuple[type[Effect], ...] = (ChamberShading, InterReflection, Lamp, Gloss)
+"""In the order in which they act."""

@@ -218,3 +218,16 @@ def _tilt(angle_deg: float, azimuth_deg: float) -> Float[np.ndarray, "3 3"]:
     about_y = np.array([[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]])
     to_azimuth = rotation_about_z(azimuth_deg)[:3, :3]
     return to_azimuth @ about_y @ to_azimuth.T
+
+
+EFFECTS: tuple[type[Effect], ...] = (
+    PartialTurn,
+    Clockwise,
+    AngleJitter,
+    AxisTilt,
+    Wobble,
+    RepeatedFrames,
+    MissingFrames,
+    OffCentre,
+)
+"""In the order in which they act."""

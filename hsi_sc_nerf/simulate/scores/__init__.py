@@ -1,1 +1,0 @@
-"""Errors of processing and analysis against the truth of simulated sessions."""
