@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import csv
 import dataclasses
 import inspect
 import io
@@ -24,9 +23,10 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from results_table import RESULTS, SOURCE_COLUMNS
+from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
 from hsi_sc_nerf.cli.main import Commands
+from hsi_sc_nerf.terminal import markdown_table
 
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
 
@@ -52,30 +52,27 @@ def results_table(name: str, folder: Path = RESULTS) -> str:
     path = folder / f"{name}.csv"
     if not path.is_file():
         raise PluginError(f"{path}: a page asks for this table, but there is no such file.")
-    with path.open(encoding="utf-8", newline="") as file:
-        columns, *rows = list(csv.reader(file))
+    columns, *rows = read_results(path)
     if tuple(columns[-len(SOURCE_COLUMNS) :]) != SOURCE_COLUMNS or not rows:
         raise PluginError(f"{path}: needs rows, and {', '.join(SOURCE_COLUMNS)} as its last columns.")
-    shown = [columns, ["---"] * len(columns), *rows]
-    lines = [f"| {' | '.join(cell.strip() for cell in row[: -len(SOURCE_COLUMNS)])} |" for row in shown]
+    shown = [[cell.strip() for cell in row[: -len(SOURCE_COLUMNS)]] for row in (columns, *rows)]
     sources = {tuple(row[-len(SOURCE_COLUMNS) :]) for row in rows}
     told = "; ".join(f"commit {commit}, seed {seed}, {machine}" for commit, seed, machine in sorted(sources))
-    return "\n".join([*lines, "", f"*`benchmarks/results/{name}.csv`: {told}.*"])
+    return "\n".join([markdown_table(shown[0], shown[1:]), "", f"*`benchmarks/results/{name}.csv`: {told}.*"])
 
 
 def readme_table(folder: Path = RESULTS) -> str:
     """The README's table: held-out views by ours and the published method in equal time; the paper's figures."""
-    with (folder / "beyond_the_paper.csv").open(encoding="utf-8", newline="") as file:
-        _, *rows = list(csv.reader(file))
+    _, *rows = read_results(folder / "beyond_the_paper.csv")
     titles = ["object", "method", "SAM, rad", "RMSE", "SSIM", "PSNR, dB", "F-score of what is seen at 2 mm, %"]
     methods = {
         "paper, its own fruit": "printed in the paper, real fruit",
         "paper": "published method",
         "ours": "ours",
     }
-    lines = [titles, ["---"] * len(titles)]
-    lines += [[row[0], methods[row[1]], *row[3:7], row[11]] for row in rows if row[1] in methods]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return markdown_table(
+        titles, [[row[0], methods[row[1]], *row[3:7], row[11]] for row in rows if row[1] in methods]
+    )
 
 
 def commands_page() -> str:
@@ -135,12 +132,12 @@ def settings_page() -> str:
     for prefix, settings in groups.items():
         dotted = f"{prefix}." if prefix else ""
         rows = [
-            f"| `--{dotted}{name.replace('_', '-')}` | `{_short(getattr(settings, name))}` | {text} |"
+            [f"`--{dotted}{name.replace('_', '-')}`", f"`{_short(getattr(settings, name))}`", text]
             for name, text in documented_fields(type(settings)).items()
         ]
         if rows:
             title = f"`--{prefix}`" if prefix else "The run"
-            parts += [f"## {title}", "\n".join(["| setting | default | meaning |", "| --- | --- | --- |", *rows])]
+            parts += [f"## {title}", markdown_table(["setting", "default", "meaning"], rows)]
     return "\n\n".join(parts) + "\n"
 
 

@@ -15,9 +15,11 @@ import matplotlib
 import networkx
 import tyro
 from rich.console import Console
-from rich.table import Table
+
+from hsi_sc_nerf.terminal import screen_table
 
 PACKAGE = "hsi_sc_nerf"
+FOLDERS = ("benchmarks", "tests")
 
 
 @dataclass(frozen=True)
@@ -31,21 +33,19 @@ class Structure:
 
     def main(self) -> None:
         """Print the table, draw the picture."""
-        lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in python_files(self.root)}
+        lines = {path: count_lines(path) for path in python_files(self.root / PACKAGE)}
         imports = module_imports(self.root)
         circles = [circle for circle in networkx.strongly_connected_components(imports) if len(circle) > 1]
-        tests = list((self.root / "tests").rglob("*.py"))
-        table = Table("what", "number")
-        table.add_row("files", str(len(lines)))
-        table.add_row("lines", f"{sum(lines.values())}")
-        table.add_row("lines of benchmarks", f"{count_lines(self.root / 'benchmarks')}")
-        table.add_row(
-            "lines of tests", f"{sum(len(path.read_text(encoding='utf-8').splitlines()) for path in tests)}"
-        )
-        table.add_row("largest folder, files", str(max(Counter(path.parent for path in lines).values())))
-        table.add_row("files in import circles", str(sum(map(len, circles))))
-        table.add_row("import circles", str(len(circles)))
-        Console().print(table)
+        figures = {
+            "files": len(lines),
+            "lines": sum(lines.values()),
+            **{f"lines of {name}": sum(map(count_lines, python_files(self.root / name))) for name in FOLDERS},
+            "largest folder, files": max(Counter(path.parent for path in lines).values()),
+            "files in import circles": sum(map(len, circles)),
+            "import circles": len(circles),
+        }
+        rows = [[what, str(number)] for what, number in figures.items()]
+        Console().print(screen_table(["what", "number"], rows))
         if self.picture is not None:
             sizes = Counter[str]()
             for path, count in lines.items():
@@ -53,19 +53,19 @@ class Structure:
             draw(folder_imports(imports), sizes, self.picture)
 
 
-def python_files(root: Path) -> list[Path]:
-    """The package's modules."""
-    return sorted((root / PACKAGE).rglob("*.py"))
+def python_files(folder: Path) -> list[Path]:
+    """All modules below a folder."""
+    return sorted(folder.rglob("*.py"))
 
 
-def count_lines(folder: Path) -> int:
-    """Lines of all Python files below a folder."""
-    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob("*.py"))
+def count_lines(path: Path) -> int:
+    """Lines of a file."""
+    return len(path.read_text(encoding="utf-8").splitlines())
 
 
 def module_imports(root: Path) -> networkx.DiGraph:
     """Edges from importing to imported modules, imports inside functions and for type checking included."""
-    modules = {".".join(path.relative_to(root).with_suffix("").parts): path for path in python_files(root)}
+    modules = {".".join(path.relative_to(root).with_suffix("").parts): path for path in python_files(root / PACKAGE)}
     graph = networkx.DiGraph()
     for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -134,7 +134,7 @@ def _spot_errors(surface: SpectralMesh, ideal: SpectralMesh) -> tuple[str, str, 
     errors = []
     for centre in centres:
         spot = RegionOfInterest("spot", tuple(centre.tolist()), ROI_RADIUS_M)
-        measured, true = (region_spectrum("spot", one, spot.of(one)).mean for one in (surface, ideal))
+        measured, true = (region_spectrum(one, spot.of(one)).mean for one in (surface, ideal))
         errors.append(relative_rms(measured, true))
     x, y, z = 1000.0 * centres[int(np.argmax(errors))]
     median, worst = 100.0 * np.median(errors), 100.0 * max(errors)

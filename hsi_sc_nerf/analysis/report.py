@@ -14,7 +14,6 @@ from jaxtyping import Float
 from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, Traits
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.spectra.bands import COMPOSITES
 from hsi_sc_nerf.terminal import markdown_table
 
 # Name, unit, and the unit's factor on metres, square metres or litres.
@@ -72,7 +71,6 @@ def trait_content(
             region.name: {
                 "area_m2": region.area_m2,
                 "indices": {name: _plain(value) for name, value in region.indices.items()},
-                "composites": {name: _plain(value) for name, value in region.composites.items()},
             }
             for region in traits.regions
         },
@@ -80,7 +78,7 @@ def trait_content(
 
 
 def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
-    """Sizes, classes, indices and composites in mm, cm² and mL, from the content of ``traits.json``.
+    """Sizes, classes and indices in mm, cm² and mL, from the content of ``traits.json``.
 
     Raises:
         AttributeError, KeyError, TypeError, ValueError: it is no such content.
@@ -101,16 +99,12 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
     if content["classes"]:
         tables += _class_tables(content["classes"], seen_m2)
-    for heading, note in (
-        ("Indices", "Mean ± standard deviation over the surface, weighted by area."),
-        ("Composites", "Mean ± standard deviation of the reflectance shown as red, green and blue."),
-    ):
-        regions = {name: region[heading.lower()] for name, region in content["regions"].items()}
-        names = list(regions[WHOLE])
-        if names:
-            header = ["region", *(f"{name}, {_nm(name)}" if name in COMPOSITES else name for name in names)]
-            rows = [[region, *(_mean_and_sd(values[name]) for name in names)] for region, values in regions.items()]
-            tables.append(TraitTable(heading, note, header, rows))
+    regions = {name: region["indices"] for name, region in content["regions"].items()}
+    names = list(regions[WHOLE])
+    if names:
+        rows = [[region, *(_mean_and_sd(values[name]) for name in names)] for region, values in regions.items()]
+        note = "Mean ± standard deviation over the surface, weighted by area."
+        tables.append(TraitTable("Indices", note, ["region", *names], rows))
     return tables
 
 
@@ -163,16 +157,11 @@ def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits
         writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
 
 
-def _nm(name: str) -> str:
-    return ", ".join(f"{wavelength:g}" for wavelength in COMPOSITES[name].wavelengths_nm) + " nm"
-
-
-def _plain(value: MeanAndSd) -> dict[str, Any]:
+def _plain(value: MeanAndSd) -> dict[str, float | None]:
     """Ready for JSON."""
-    numbers = {"mean": np.asarray(value.mean, float), "sd": np.asarray(value.sd, float)}
-    return {key: np.where(np.isfinite(array), array, np.array(None)).tolist() for key, array in numbers.items()}
+    return {key: float(one) if np.isfinite(one) else None for key, one in (("mean", value.mean), ("sd", value.sd))}
 
 
 def _mean_and_sd(value: Mapping[str, Any]) -> str:
-    pairs = zip(*(np.atleast_1d(np.array(value[key], float)) for key in ("mean", "sd")), strict=True)
-    return ", ".join(f"{mean:.3f} ± {sd:.3f}" for mean, sd in pairs)
+    mean, sd = (float("nan" if value[key] is None else value[key]) for key in ("mean", "sd"))
+    return f"{mean:.3f} ± {sd:.3f}"

@@ -1,4 +1,4 @@
-"""Traits of a spectral mesh: classes and their areas; indices, composites and spectra of regions."""
+"""Traits of a spectral mesh: classes and their areas; indices and spectra of regions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from hsi_sc_nerf.analysis.classes import (
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.bands import available_composites, composite
 from hsi_sc_nerf.spectra.indices import available_indices, index_values
 
 WHOLE = "whole surface"
@@ -105,14 +104,12 @@ class RegionTraits:
         area_m2: on the surface.
         spectrum: reflectance of each band.
         indices: spectral indices by name.
-        composites: reflectance shown as red, green and blue, by name.
     """
 
     name: str
     area_m2: float
     spectrum: MeanAndSd
     indices: Mapping[str, MeanAndSd]
-    composites: Mapping[str, MeanAndSd]
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ class Traits:
 def analyse(
     surface: SpectralMesh, regions: Sequence[RegionOfInterest] = (), classes: Classes | None = None
 ) -> Traits:
-    """Spectra, indices and composites of the whole seen surface, its classes and the regions of interest.
+    """Spectra and indices of the whole seen surface, its classes and the regions of interest.
 
     Raises:
         InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
@@ -148,12 +145,6 @@ def analyse(
 
     nm = surface.wavelengths_nm
     indices = {one.name: index_values(one, surface.spectra, nm) for one in available_indices(nm)}
-    composites = {
-        one.name: composite(surface.spectra, nm, one.wavelengths_nm, one.name) for one in available_composites(nm)
-    }
-
-    def over(maps: Mapping[str, np.ndarray], where: Bool[np.ndarray, "v"]) -> dict[str, MeanAndSd]:
-        return {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in maps.items()}
 
     return Traits(
         [
@@ -161,8 +152,7 @@ def analyse(
                 name,
                 float(surface.areas_m2[where].sum()),
                 region_spectrum(surface, where),
-                over(indices, where),
-                over(composites, where),
+                {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in indices.items()},
             )
             for name, where in chosen.items()
         ],

@@ -161,6 +161,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.closed_mesh import open_edges
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
         from hsi_sc_nerf.files import write_json
+        from hsi_sc_nerf.spectra.bands import available_composites
 
         views = pictures.SideViews(surface.mesh)
         drawn, extra = {}, {}
@@ -173,7 +174,7 @@ class TraitsCommand:
                 drawn[caption], extra[column] = picture, labels.astype("float32")
         drawn["Spectra of regions"] = "region_spectra.png"
         pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
-        if traits.regions[0].composites:
+        if available_composites(surface.wavelengths_nm):
             drawn["Composites"] = "composites.png"
             pictures.draw_composites(self.output_dir / "composites.png", surface, views)
         if traits.regions[0].indices:

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps, rc_context
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.geometry.mesh import ply_vertices
 from hsi_sc_nerf.plotting.figures import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, screen_table
 
@@ -132,15 +133,10 @@ def _write_distance_ply(
     path: Path, points_m: Float[np.ndarray, "n 3"], distances_m: Float[np.ndarray, "n"], limit_m: float
 ) -> None:
     """Points with their distance as colour and as ``scalar_distance_m``, a scalar field in CloudCompare."""
-    columns = [*((axis, "f4") for axis in "xyz"), ("scalar_distance_m", "f4")]
-    columns[3:3] = [(name, "u1") for name in ("red", "green", "blue")]
-    vertices = np.empty(len(points_m), columns)
-    for name, values in zip("xyz", points_m.T, strict=True):
-        vertices[name] = values
-    for name, values in zip(("red", "green", "blue"), _distance_colours(distances_m, limit_m).T, strict=True):
-        vertices[name] = values
-    vertices["scalar_distance_m"] = distances_m
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+    columns = dict(zip("xyz", points_m.T.astype(np.float32), strict=True))
+    columns |= dict(zip(("red", "green", "blue"), _distance_colours(distances_m, limit_m).T, strict=True))
+    columns["scalar_distance_m"] = distances_m.astype(np.float32)
+    PlyData([ply_vertices(columns)], byte_order="<").write(str(path))
 
 
 def _page(

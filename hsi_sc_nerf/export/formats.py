@@ -102,9 +102,7 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
     header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
-    text = "\n".join(comment_lines([*_COLOURS, *cloud.extra_names], cloud.run)).replace(
-        "scalar_WAVELENGTH", "WAVELENGTH"
-    )
+    text = "\n".join(comment_lines([*_COLOURS, *cloud.extra_names], cloud.run))
     header.vlrs.append(laspy.VLR("LASF_Spec", _LAS_TEXT_RECORD, "text area description", text.encode()))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:

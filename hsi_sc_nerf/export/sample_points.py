@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
-from plyfile import PlyData, PlyElement, PlyListProperty
+from plyfile import PlyData, PlyListProperty
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
@@ -25,7 +25,7 @@ from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, comment_lines, estimate_
 from hsi_sc_nerf.export.ply import band_property_names
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
-from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra.bands import to_8_bit
@@ -265,12 +265,8 @@ def write_sampled_ply(
         colours = np.where(known, to_8_bit(np.where(known, colours, 0.0)), np.uint8(_NO_SPECTRUM_GREY))
         columns |= zip(_COLOUR, colours.T, strict=True)
     kept = {name: vertices[name] for name in vertices.dtype.names if name not in columns}
-    rows = np.empty(len(vertices), [(name, values.dtype) for name, values in (kept | columns).items()])
-    for name, values in (kept | columns).items():
-        rows[name] = values
-    elements = [
-        PlyElement.describe(rows, "vertex") if element.name == "vertex" else element for element in content.elements
-    ]
+    vertex = ply_vertices(kept | columns)
+    elements = [vertex if element.name == "vertex" else element for element in content.elements]
     added = comment_lines([name for name in columns if name not in ("x", "y", "z")], run)
     comments = [*content.comments, *(line for line in added if line not in content.comments)]
     with atomic_write(path) as (temporary,):

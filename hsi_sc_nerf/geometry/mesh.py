@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
-from plyfile import PlyData, PlyListProperty, PlyParseError
+from jaxtyping import Float, Int, Shaped
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -53,6 +54,11 @@ class Mesh:
         forward, backward = np.sort(start * n + end), np.sort(end * n + start)
         return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
+    def facet_normals(self) -> Float[np.ndarray, "t 3"]:
+        """Outward unit normal of each triangle, 0 for one without an area."""
+        doubled = self._doubled_normals()
+        return doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-30)
+
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
         """Outward unit normal of each vertex: the area-weighted mean of its triangles', 0 for a vertex of none."""
         normals = self.area_weighted_normals()
@@ -66,6 +72,14 @@ class Mesh:
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return np.cross(b - a, c - a)
+
+
+def ply_vertices(columns: Mapping[str, Shaped[np.ndarray, "v"]]) -> PlyElement:
+    """The element ``vertex`` of a PLY file from its properties by name, in order; types are kept."""
+    rows = np.empty(len(next(iter(columns.values()))), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    return PlyElement.describe(rows, "vertex")
 
 
 def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:

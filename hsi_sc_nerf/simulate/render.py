@@ -161,9 +161,7 @@ class Renderer:
     @cached_property
     def facet_normals(self) -> Float[np.ndarray, "t 3"]:
         """Unit normal of each triangle, outwards."""
-        a, b, c = (self.vertices[corner] for corner in self.triangles.T)
-        doubled = np.cross(b - a, c - a)
-        return (doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+        return Mesh(self.vertices, self.triangles).facet_normals().astype(np.float32)
 
     def camera_hits(
         self,

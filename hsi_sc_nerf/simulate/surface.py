@@ -115,9 +115,7 @@ def split_at_creases(
     Returns:
         The triangles as indices of points, and the vertex of each point.
     """
-    a, b, c = (vertices[corner] for corner in triangles.T)
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = Mesh(vertices, triangles).facet_normals()
     # Corner 3 t + k is the start of edge k of triangle t. Sorting by edge pairs the two triangles of each edge.
     corner = np.arange(triangles.size)
     following = corner - corner % 3 + (corner + 1) % 3

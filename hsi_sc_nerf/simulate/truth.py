@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
 from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
@@ -203,10 +203,8 @@ def pixels_path(session_dir: Path, capture: str) -> Path:
 
 def write_mesh(path: Path, part: Part) -> None:
     """Write a part as binary PLY with one vertex property ``weight_NAME`` for each material."""
-    names = ["x", "y", "z", *(f"weight_{name}" for name in part.materials)]
-    vertices = np.zeros(len(part.mesh.vertices), [(name, "f8" if name in "xyz" else "f4") for name in names])
-    for name, column in zip(names, np.column_stack([part.mesh.vertices, part.weights]).T, strict=True):
-        vertices[name] = column
+    columns = dict(zip("xyz", part.mesh.vertices.T, strict=True))
+    columns |= {f"weight_{n}": w for n, w in zip(part.materials, part.weights.T.astype(np.float32), strict=True)}
     faces = np.zeros(len(part.mesh.triangles), [("vertex_indices", "i4", (3,))])
     faces["vertex_indices"] = part.mesh.triangles
-    PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(str(path))
+    PlyData([ply_vertices(columns), PlyElement.describe(faces, "face")]).write(str(path))

@@ -93,14 +93,13 @@ def test_what_was_not_seen_is_in_no_class_and_no_mean():
     assert traits.seen_m2 == pytest.approx(classes.areas_m2[0])
 
 
-def test_indices_and_composites_of_regions():
+def test_indices_of_regions():
     traits = analyse(two_halves(), [RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)])
     at = {nm: GREEN[np.abs(NM - nm).argmin()] for nm in (670.0, 800.0)}
     whole, spot = traits.regions
     ndvi = spot.indices["NDVI"]
     assert ndvi.mean == pytest.approx((at[800.0] - at[670.0]) / (at[800.0] + at[670.0]), rel=1e-5)
     assert ndvi.sd == pytest.approx(0.0, abs=1e-6)
-    assert spot.composites["CIR"].mean[:2] == pytest.approx([at[800.0], at[670.0]], rel=1e-5)
     assert whole.indices["NDVI"].sd > 0.05
     assert spot.area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import correlate1d
@@ -27,7 +28,7 @@ BOARDS, JOINT_WIDTH = 5, 0.008
 REFERENCE_NM = 700.0
 """Wavelength at which a change of colour temperature does not change the light."""
 Coefficients = tuple[float, float, float, float]
-NEWTON_STEPS = 20
+UNDISTORTION_STEPS = 500
 UNDISTORTED_TO = 1e-10
 """Residual of the undistortion as a fraction of the focal length, about 1e-7 pixel."""
 
@@ -233,41 +234,20 @@ def gaussian_kernel(sigma_px: float) -> Float[np.ndarray, "2*radius+1"]:
 
 def distort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Float[np.ndarray, "*n 2"]:
     """Distorted points of the image plane at distance 1, y down (OpenCV's model)."""
-    k1, k2, p1, p2 = coefficients
-    x, y = points[..., 0], points[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + (k1 + k2 * r2) * r2
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    in_space = np.append(points, np.ones((*points.shape[:-1], 1)), axis=-1).reshape(-1, 1, 3)
+    found, _ = cv2.projectPoints(in_space, np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients))
+    return found.reshape(points.shape)
 
 
 def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Float[np.ndarray, "*n 2"] | None:
-    """Inverse of `distort` by Newton's method; None if it does not converge or the model is not invertible there."""
-    k1, k2, p1, p2 = coefficients
-    found = points
-    for _ in range(NEWTON_STEPS):
-        missing_x, missing_y = np.moveaxis(points - distort(found, coefficients), -1, 0)
-        x, y = found[..., 0], found[..., 1]
-        r2 = x * x + y * y
-        radial, slope = 1.0 + (k1 + k2 * r2) * r2, 2.0 * k1 + 4.0 * k2 * r2
-        xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        xy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-        # The Jacobian is symmetric.
-        determinant = xx * yy - xy * xy
-        if not (determinant > 0.0).all() or not (xx > 0.0).all():
-            return None
-        if np.hypot(missing_x, missing_y).max(initial=0.0) < UNDISTORTED_TO:
-            return found
-        step_x = (yy * missing_x - xy * missing_y) / determinant
-        step_y = (xx * missing_y - xy * missing_x) / determinant
-        found = found + np.stack([step_x, step_y], axis=-1)
-    return None
+    """Inverse of `distort` (OpenCV); None if it does not converge, because the model is not invertible there."""
+    flat = np.ascontiguousarray(points, float).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, UNDISTORTION_STEPS, UNDISTORTED_TO)
+    found = cv2.undistortPointsIter(flat, np.eye(3), np.array(coefficients), None, None, criteria).reshape(
+        points.shape
+    )
+    missing = distort(found, coefficients) - points
+    return found if np.abs(missing).max(initial=0.0) < UNDISTORTED_TO else None
 
 
 EFFECTS: tuple[type[Effect], ...] = (
