@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Circle, Ellipse, Polygon, Rectangle
 
 from hsi_sc_nerf.plotting.figures import COLOURS, new_figure, save_figure
+from hsi_sc_nerf.simulate.assemble import marker_frames
 from hsi_sc_nerf.simulate.scene import Scene, load_scene
-from hsi_sc_nerf.simulate.target import marker_frames
 
 WALL_M, LAMP_HEIGHT_M = 0.24, 0.33
 SIZE = 8

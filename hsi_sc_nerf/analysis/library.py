@@ -7,15 +7,13 @@ file type.
 from __future__ import annotations
 
 import csv
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from spectral.io import envi
 
-from hsi_sc_nerf.capture.envi_header import check_layout, mended_fields, number_in, wavelengths_of
+from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.errors import InputError
 
 # Wavelengths of a table that are all below this are in micrometres.
@@ -117,32 +115,22 @@ def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
     """An ENVI library is an image of one band: each line a spectrum, each sample a wavelength."""
-    header, data = _envi_pair(path)
-    fields = mended_fields(header)
-    if "library" not in str(fields.get("file type", "")).lower():
-        raise InputError(f"{header}: its file type is no spectral library; give a library's header or correct it.")
+    header_path, data = _envi_pair(path)
+    header = read_header(header_path, library=True)
+    if header.wavelengths_nm is None:
+        raise InputError(f"{header_path}: lists no wavelengths; add them.")
+    lines, samples, _ = header.shape
     try:
-        shape = (int(fields["lines"]), int(fields["samples"]))
-        parameters = envi.gen_params(fields)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{header}: a field of this header cannot be read ({error}); correct it.") from error
-    dtype = np.dtype(parameters.dtype)
-    check_layout(header, {**fields, "file type": ""}, (*shape, 1), dtype, parameters.offset)
-    _, wavelengths_nm = wavelengths_of(header, fields, shape[1])
-    if wavelengths_nm is None:
-        raise InputError(f"{header}: lists no wavelengths; add them.")
-    scale, ignored = (number_in(header, fields, key) for key in ("reflectance scale factor", "data ignore value"))
-    try:
-        numbers = np.fromfile(data, dtype, math.prod(shape), offset=parameters.offset)
+        numbers = np.fromfile(data, header.dtype, lines * samples, offset=header.offset)
     except OSError as error:
         raise InputError(f"{data}: cannot be read ({error}); check the file.") from error
-    if numbers.size != math.prod(shape):
-        raise InputError(f"{data}: is smaller than its header {header.name} says; export the library again.")
-    spectra = numbers.reshape(shape).astype(float)
-    if ignored is not None:
-        spectra[np.isclose(spectra, ignored, rtol=1e-6, atol=0.0)] = np.nan
-    names = np.atleast_1d(fields.get("spectra names") or np.arange(1, shape[0] + 1).astype(str))
-    return names.tolist(), wavelengths_nm, spectra / (scale or 1.0)
+    if numbers.size != lines * samples:
+        raise InputError(f"{data}: is smaller than its header {header_path.name} says; export the library again.")
+    spectra = numbers.reshape(lines, samples).astype(float)
+    if header.ignore_value is not None:
+        spectra[np.isclose(spectra, header.ignore_value, rtol=1e-6, atol=0.0)] = np.nan
+    names = np.atleast_1d(header.fields.get("spectra names") or np.arange(1, lines + 1).astype(str))
+    return names.tolist(), header.wavelengths_nm, spectra / header.reflectance_scale
 
 
 def _envi_pair(path: Path) -> tuple[Path, Path]:

@@ -74,29 +74,39 @@ class EnviHeader:
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
 
-def read_header(path: Path) -> EnviHeader:
+def read_header(path: Path, library: bool = False) -> EnviHeader:
     """Read and check a header; the data file is not read.
+
+    Args:
+        path: the header.
+        library: whether it has to describe a spectral library, whose lines are spectra and whose samples are bands.
 
     Raises:
         InputError: there is no such file, it is no ENVI header, a field is missing or unreadable, a list does not
-            have one number a band, or the pixels would be read wrongly (complex numbers, frame offsets, compression,
-            a spectral library).
+            have one number a band, the pixels would be read wrongly (complex numbers, frame offsets, compression), or
+            it describes a library where an image is wanted, or the converse.
     """
-    fields = mended_fields(path)
+    fields = _mended_fields(path)
     try:
-        shape = (int(fields["lines"]), int(fields["samples"]), int(fields["bands"]))
+        shape = (int(fields["lines"]), int(fields["samples"]), 1 if library else int(fields["bands"]))
         offset = int(fields.get("header offset") or 0)
         dtype = np.dtype(envi.envi_to_dtype[fields["data type"]])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
-    check_layout(path, fields, shape, dtype, offset)
-    scale = number_in(path, fields, "reflectance scale factor")
+    _check_layout(path, fields, shape, dtype, offset)
+    is_library = "library" in str(fields.get("file type", "")).lower()
+    if is_library and not library:
+        raise InputError(f"{path}: describes a spectral library, not an image; give the cube's header.")
+    if library and not is_library:
+        raise InputError(f"{path}: its file type is no spectral library; give a library's header or correct it.")
+    bands = shape[1] if library else shape[2]
+    scale = _number(path, fields, "reflectance scale factor")
     if scale is not None and not scale > 0.0:
         raise InputError(f"{path}: reflectance scale factor {scale:g} is not positive; correct it.")
-    tint = number_in(path, fields, "tint")
-    nm_per_unit, wavelengths_nm = wavelengths_of(path, fields, shape[2])
-    fwhm = _numbers(path, fields, "fwhm", shape[2])
-    bad_band_list = _numbers(path, fields, "bbl", shape[2])
+    tint = _number(path, fields, "tint")
+    nm_per_unit, wavelengths_nm = _wavelengths(path, fields, bands)
+    fwhm = _numbers(path, fields, "fwhm", bands)
+    bad_band_list = _numbers(path, fields, "bbl", bands)
     return EnviHeader(
         header_path=path,
         shape=shape,
@@ -105,15 +115,15 @@ def read_header(path: Path) -> EnviHeader:
         offset=offset,
         wavelengths_nm=wavelengths_nm,
         fwhm_nm=None if fwhm is None else fwhm * nm_per_unit,
-        good_bands=np.ones(shape[2], bool) if bad_band_list is None else bad_band_list != 0.0,
+        good_bands=np.ones(bands, bool) if bad_band_list is None else bad_band_list != 0.0,
         reflectance_scale=1.0 if scale is None else scale,
-        ignore_value=number_in(path, fields, "data ignore value"),
+        ignore_value=_number(path, fields, "data ignore value"),
         integration_time_ms=tint if tint and tint > 0.0 else None,
         fields=fields,
     )
 
 
-def mended_fields(path: Path) -> dict[str, Any]:
+def _mended_fields(path: Path) -> dict[str, Any]:
     """The header's fields as in `EnviHeader.fields`; a missing ``byte order`` is filled in as little endian.
 
     Raises:
@@ -148,7 +158,7 @@ def mended_fields(path: Path) -> dict[str, Any]:
     return fields
 
 
-def check_layout(
+def _check_layout(
     path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int
 ) -> None:
     """Refuse headers whose pixels would be read wrongly."""
@@ -163,15 +173,13 @@ def check_layout(
         raise InputError(f"{path}: holds complex numbers, which are no spectral image; export real numbers.")
     if str(fields["byte order"]) not in ("0", "1"):
         raise InputError(f"{path}: byte order {fields['byte order']} is neither 0 (little) nor 1 (big); correct it.")
-    if "library" in str(fields.get("file type", "")).lower():
-        raise InputError(f"{path}: describes a spectral library, not an image; give the cube's header.")
     for key in ("major frame offsets", "minor frame offsets", "file compression"):
         values = np.atleast_1d(fields.get(key, "0"))
         if any(str(value).strip() not in ("", "0") for value in values):
             raise InputError(f"{path}: has {key}, which are not supported; export the cube without them.")
 
 
-def number_in(path: Path, fields: dict[str, Any], key: str) -> float | None:
+def _number(path: Path, fields: dict[str, Any], key: str) -> float | None:
     """A field's number; None where the field is missing or empty."""
     numbers = _numbers(path, {key: np.atleast_1d(fields.get(key, ""))[0]}, key, 1)
     return None if numbers is None else float(numbers[0])
@@ -193,7 +201,7 @@ def _numbers(path: Path, fields: dict[str, Any], key: str, count: int) -> Float[
     return numbers
 
 
-def wavelengths_of(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
+def _wavelengths(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
     """The factor from the header's unit to nm, and the band centres, or None where it lists none."""
     unit = re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", str(fields.get("wavelength units", "")).lower())
     unit = unit.strip().removesuffix("s").replace("metre", "meter")

@@ -17,8 +17,7 @@ from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.inspection.file_checks import check_files
-from hsi_sc_nerf.inspection.frame_checks import check_frames
+from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image

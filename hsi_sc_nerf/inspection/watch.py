@@ -9,8 +9,7 @@ import numpy as np
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
 from hsi_sc_nerf.capture.session_info import read_session_info
-from hsi_sc_nerf.inspection.file_checks import acquisition_day
-from hsi_sc_nerf.inspection.frame_checks import BLURRED, DARK_RED, SATURATED_RED
+from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
 from hsi_sc_nerf.inspection.look import Look, look_at, white_counts
 from hsi_sc_nerf.poses.marker_detection import detect_markers, find_dictionary
 

@@ -1,21 +1,52 @@
-"""From the description of a scene to what is rendered: the object, its support, and the camera of each frame."""
+"""From the description of a scene to what is rendered: the object, disc and container with markers, the cameras.
+
+Each marker on the container is a flat plaque in front of the curved wall, and each marker on the disc lies flat in
+z = 0, so the known corner positions are exact.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.simulate import own_mesh, plants, target
+from hsi_sc_nerf.simulate import own_mesh, plants
 from hsi_sc_nerf.simulate.effect import effect_rng, of_kind
 from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect
-from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, sphere
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, quads, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
-from hsi_sc_nerf.simulate.scene import CameraSettings, Cylinder, MaizeEar, Object, OwnMesh, Scene, Sphere
+from hsi_sc_nerf.simulate.scene import (
+    CameraSettings,
+    ContainerSettings,
+    Cylinder,
+    MaizeEar,
+    MarkerSettings,
+    Object,
+    OwnMesh,
+    Scene,
+    Sphere,
+    TurntableSettings,
+)
+
+PLAQUE_STANDOFF_M = 0.0005
+PLAQUE_THICKNESS_M = 0.0003
+DISC_THICKNESS_M = 0.006
+PRINT_HEIGHT_M = 0.0003
+"""Distance of the disc below the markers that are printed on it."""
+QUIET_ZONE_MODULES = 0.7
+"""Width of the white paper around a marker in modules; disc and container are bright as well."""
+
+# A marker's corners in its own plane (u right, v up), in OpenCV's order: upper left, then clockwise.
+UNIT_CORNERS = np.array([(-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)])
+
+MarkerLayout = dict[int, Float[np.ndarray, "4 3"]]
+MarkerFrame = tuple[np.ndarray, np.ndarray, np.ndarray]  # centre, unit u, unit v
 
 
 def intrinsics(camera: CameraSettings) -> PinholeIntrinsics:
@@ -80,15 +111,15 @@ def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
     Raises:
         InputError: the markers do not fit, or their dictionary does not exist.
     """
-    disc = cylinder(scene.turntable.disc_diameter_m, target.DISC_THICKNESS_M, spacing_m=spacing_m)
-    disc = disc.moved(np.array([0.0, 0.0, -target.DISC_THICKNESS_M - target.PRINT_HEIGHT_M]))
+    disc = cylinder(scene.turntable.disc_diameter_m, DISC_THICKNESS_M, spacing_m=spacing_m)
+    disc = disc.moved(np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M]))
     container = cylinder(scene.container.diameter_m, scene.container.height_m, spacing_m=spacing_m)
     parts = [_plain(disc, "disc"), _plain(container, "container_plastic")]
-    on_container, on_disc = target.marker_frames(scene.markers, scene.container, scene.turntable)
+    on_container, on_disc = marker_frames(scene.markers, scene.container, scene.turntable)
     for number, frame in (on_container | on_disc).items():
-        mesh, ink = target.marker_mesh(frame, number, scene.markers)
+        mesh, ink = marker_mesh(frame, number, scene.markers)
         parts.append(Part(mesh, ("paper", "marker_ink"), np.stack([~ink, ink], axis=-1).astype(float)))
-    parts += [_plain(target.plaque_back(frame, scene.markers), "paper") for frame in on_container.values()]
+    parts += [_plain(plaque_back(frame, scene.markers), "paper") for frame in on_container.values()]
     return parts
 
 
@@ -118,3 +149,109 @@ def build_renderer(
 
 def _plain(mesh: Mesh, material: str) -> Part:
     return Part(mesh, (material,), np.ones((len(mesh.vertices), 1)))
+
+
+def marker_frames(
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
+) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
+    """Centre, right and up vector of each marker on the container and on the disc, by marker number, object frame.
+
+    The markers of the container have the first numbers.
+
+    Raises:
+        InputError: the markers do not fit on the container or on the disc.
+    """
+    paper = markers.side_m * paper_side_in_markers(markers)
+    apothem = container.diameter_m / 2.0 + PLAQUE_STANDOFF_M
+    if paper > container.height_m or (
+        markers.on_container > 2 and paper > 2.0 * apothem * np.tan(np.pi / markers.on_container)
+    ):
+        raise InputError(
+            f"{markers.on_container} markers of {markers.side_m:g} m do not fit around the container; "
+            "make markers.side_m or markers.on_container smaller."
+        )
+    on_container: dict[int, MarkerFrame] = {}
+    for number in range(markers.on_container):
+        outwards, sideways = _directions(2.0 * np.pi * number / markers.on_container)
+        centre = apothem * outwards + np.array([0.0, 0.0, container.height_m / 2.0])
+        on_container[number] = (centre, sideways, np.array([0.0, 0.0, 1.0]))
+
+    # The smallest radius at which the inner edges touch neither a plaque's corner nor each other.
+    plaque_corner = np.hypot(apothem, paper / 2.0)
+    neighbours = paper / 2.0 / np.tan(np.pi / max(markers.on_disc, 3))
+    inner_edge = max(plaque_corner, neighbours) + 0.001
+    if markers.on_disc and np.hypot(inner_edge + paper, paper / 2.0) > turntable.disc_diameter_m / 2.0:
+        raise InputError(
+            f"{markers.on_disc} markers of {markers.side_m:g} m do not fit on the disc around the container; "
+            "make markers.side_m smaller or turntable.disc_diameter_m larger."
+        )
+    on_disc: dict[int, MarkerFrame] = {}
+    for number in range(markers.on_disc):
+        outwards, sideways = _directions(2.0 * np.pi * (number + 0.5) / markers.on_disc)
+        # Upright for a reader outside of the disc.
+        on_disc[markers.on_container + number] = ((inner_edge + paper / 2.0) * outwards, sideways, -outwards)
+    return on_container, on_disc
+
+
+def _directions(azimuth: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Unit vectors away from the axis and counter-clockwise around it, at an azimuth in radians."""
+    return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+
+
+def marker_layout(
+    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
+) -> MarkerLayout:
+    """The four corners of each marker's black square in OpenCV's order, metres, object frame."""
+    on_container, on_disc = marker_frames(markers, container, turntable)
+    return {
+        number: _to_object_frame(UNIT_CORNERS, frame, markers.side_m)
+        for number, frame in (on_container | on_disc).items()
+    }
+
+
+def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tuple[Mesh, np.ndarray]:
+    """A marker and its white paper as flat squares, one for each module; and which vertices are ink."""
+    dictionary = aruco_dictionary(markers)
+    modules = dictionary.markerSize + 2
+    image = cv2.aruco.generateImageMarker(dictionary, number, modules, borderBits=1)
+    quiet = paper_side_in_markers(markers) / 2.0
+    edges = np.concatenate([[-quiet], np.linspace(-0.5, 0.5, modules + 1), [quiet]])
+    ink = np.pad(image == 0, 1)
+    left, top = np.meshgrid(edges[:-1], -edges[:-1])
+    right, bottom = np.meshgrid(edges[1:], -edges[1:])
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    in_plane = np.stack([np.stack(corner, axis=-1) for corner in corners], axis=2).reshape(-1, 4, 2)
+    return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
+
+
+def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
+    """The back of a plaque, which makes the paper opaque."""
+    centre, u, v = frame
+    behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
+    corners = _to_object_frame(UNIT_CORNERS * paper_side_in_markers(markers), behind, markers.side_m)
+    return quads(corners[None])
+
+
+def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of the markers.
+
+    Raises:
+        InputError: OpenCV has no such dictionary, or it has too few markers.
+    """
+    name = markers.dictionary
+    if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+        raise InputError(f"markers.dictionary {name!r} is not an ArUco dictionary; use a name like DICT_5X5_50.")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    if len(dictionary.bytesList) < markers.on_container + markers.on_disc:
+        raise InputError(f"{name} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary.")
+    return dictionary
+
+
+def paper_side_in_markers(markers: MarkerSettings) -> float:
+    """Ratio of the side of a marker's paper to that of its black square."""
+    return 1.0 + 2.0 * QUIET_ZONE_MODULES / (aruco_dictionary(markers).markerSize + 2)
+
+
+def _to_object_frame(in_plane: Float[np.ndarray, "*n 2"], frame: MarkerFrame, side_m: float) -> np.ndarray:
+    centre, u, v = frame
+    return centre + side_m * (in_plane[..., :1] * u + in_plane[..., 1:] * v)

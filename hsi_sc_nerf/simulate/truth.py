@@ -14,12 +14,13 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
+from hsi_sc_nerf.simulate.assemble import MarkerLayout, marker_layout
 from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
-from hsi_sc_nerf.simulate.target import MarkerLayout, marker_layout
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,7 @@ class Truth:
 
     def mesh(self) -> Mesh:
         """The object's mesh, object frame, metres."""
-        read = PlyData.read(str(self.mesh_path))
-        vertices = np.stack([np.asarray(read["vertex"][axis], float) for axis in "xyz"], axis=-1)
-        return Mesh(vertices, np.stack(read["face"]["vertex_indices"]).astype(np.int32))
+        return Mesh(*read_surface(self.mesh_path))
 
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
         """Fraction of each material in each pixel, summing to 1."""

@@ -42,9 +42,9 @@ from hsi_sc_nerf.poses.session_pictures import (
 )
 from hsi_sc_nerf.processing.posed_frames import pose_frames
 from hsi_sc_nerf.processing.process import process_session
+from hsi_sc_nerf.simulate.assemble import marker_layout
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.target import marker_layout
 from hsi_sc_nerf.spectra.bands import to_8_bit
 
 DICTIONARY = "DICT_5X5_50"

@@ -8,9 +8,9 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble
+from hsi_sc_nerf.simulate.assemble import marker_layout
 from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.scene import EFFECTS, SHIPPED_SCENES, load_scene, override, parse_scene
-from hsi_sc_nerf.simulate.target import marker_layout
 
 GOOD = """
 object: {shape: apple, height_m: 0.07}

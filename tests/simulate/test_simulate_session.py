@@ -17,13 +17,13 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, turntable_camera_to_world
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import assemble, own_mesh, session
+from hsi_sc_nerf.simulate.assemble import marker_layout
 from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer, exact_weights
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
-from hsi_sc_nerf.simulate.target import marker_layout
 from hsi_sc_nerf.simulate.truth import load_truth
 
 SMALL = {"frames": 3, "size_px": 48, "bands": 12}
