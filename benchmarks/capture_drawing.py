@@ -15,7 +15,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Circle, Ellipse, Polygon, Rectangle
 
-from hsi_sc_nerf.plotting.figures import COLOURS, new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, new_figure, save_figure
 from hsi_sc_nerf.simulate.assemble import marker_frames
 from hsi_sc_nerf.simulate.scene import Scene, load_scene
 

@@ -31,7 +31,7 @@ from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 
 COLUMNS = (
     "case",

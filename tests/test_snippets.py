@@ -121,7 +121,7 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
         "geometry.mesh.Mesh",
         "models.losses.hsi_loss",
         "numerics.spectral_angle",
-        "spectra.indices.index_values",
+        "spectra.index_values",
         "surface.surface_depth.opacity_crossing_depth",
     ],
 )

@@ -16,9 +16,8 @@ from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.plotting.figures import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.spectra.bands import available_composites, composite
-from hsi_sc_nerf.spectra.indices import available_indices, index_values
+from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure, show_image
+from hsi_sc_nerf.spectra import available_composites, available_indices, composite, index_values
 
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420

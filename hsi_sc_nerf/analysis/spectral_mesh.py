@@ -15,7 +15,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
 from hsi_sc_nerf.export.ply import write_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.spectra.bands import nearest_bands, to_8_bit
+from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 NEIGHBOURS = 8
 _CHUNK_VERTICES = 1 << 13

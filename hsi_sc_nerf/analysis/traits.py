@@ -19,7 +19,7 @@ from hsi_sc_nerf.analysis.classes import (
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.indices import available_indices, index_values
+from hsi_sc_nerf.spectra import available_indices, index_values
 
 WHOLE = "whole surface"
 

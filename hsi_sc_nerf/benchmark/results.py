@@ -16,7 +16,7 @@ from rich.table import Table
 
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, screen_table
 
 _COLUMNS = {

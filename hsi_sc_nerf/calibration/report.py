@@ -24,8 +24,8 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.morphology import draw_outline
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
-from hsi_sc_nerf.plotting.figures import new_figure, save_figure
-from hsi_sc_nerf.spectra.bands import nearest_bands, to_8_bit
+from hsi_sc_nerf.plotting import new_figure, save_figure
+from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 REPORT_NAME = "calibration.json"
 PERCENTILE_STEP = 5.0

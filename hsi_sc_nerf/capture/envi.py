@@ -19,7 +19,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.spectra.bands import covered, nearest_bands
+from hsi_sc_nerf.spectra import covered, nearest_bands
 
 # Order of a cube's axes (lines, samples, bands) in a data file.
 _AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}

@@ -21,7 +21,7 @@ from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.settings_file import between, check_options
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.analysis.size import Size
+    from hsi_sc_nerf.analysis.closed_mesh import Size
     from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
     from hsi_sc_nerf.analysis.traits import Traits
 
@@ -109,9 +109,8 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
-        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
+        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh, size_of, size_spread
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.size import size_of, size_spread
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
@@ -161,7 +160,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.closed_mesh import open_edges
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
         from hsi_sc_nerf.files import write_json
-        from hsi_sc_nerf.spectra.bands import available_composites
+        from hsi_sc_nerf.spectra import available_composites
 
         views = pictures.SideViews(surface.mesh)
         drawn, extra = {}, {}

@@ -147,8 +147,7 @@ class RenderCommand:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
-        from hsi_sc_nerf.rendering.comparison import compare, write_report
-        from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
+        from hsi_sc_nerf.rendering.pictures import compare, find_false_colour, open_video, write_report
         from hsi_sc_nerf.rendering.views import (
             render_view,
             views_of_frames,
@@ -156,7 +155,7 @@ class RenderCommand:
             views_of_path,
             write_view,
         )
-        from hsi_sc_nerf.spectra.bands import to_8_bit
+        from hsi_sc_nerf.spectra import to_8_bit
         from hsi_sc_nerf.terminal import progress_bar
 
         run = open_run(self.load_config)

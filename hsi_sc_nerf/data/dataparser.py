@@ -24,7 +24,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, is_packed, open_packed
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
-from hsi_sc_nerf.spectra.bands import nearest_bands
+from hsi_sc_nerf.spectra import nearest_bands
 
 FRAME_INDEX = "frame_index"
 """Camera metadata: index of the session's frame that a ray belongs to."""

@@ -19,7 +19,7 @@ from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.geometry.mesh import ply_vertices
-from hsi_sc_nerf.plotting.figures import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, screen_table
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]

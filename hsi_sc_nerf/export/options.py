@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.formats import CloudFormat
-from hsi_sc_nerf.spectra.bands import require_bands
+from hsi_sc_nerf.spectra import require_bands
 
 Vector = tuple[float, float, float]
 _RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")

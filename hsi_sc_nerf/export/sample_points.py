@@ -28,7 +28,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, render_object, surface_depth
 from hsi_sc_nerf.terminal import progress_bar
 

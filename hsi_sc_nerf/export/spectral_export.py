@@ -26,7 +26,7 @@ from hsi_sc_nerf.export.cloud import (
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.models.trained_run import TrainedRun
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import STATISTICS, DepthRenders, render_depth_maps, view_statistics
 from hsi_sc_nerf.surface.regions import (
     EVERYWHERE,

@@ -20,7 +20,7 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
-from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure, save_figure, show_image
+from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.upright import rotation_from_corners
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Num, UInt8
 
 from hsi_sc_nerf.calibration.detector import dark_columns, saturation_counts
 from hsi_sc_nerf.capture.session import Capture, Session
-from hsi_sc_nerf.spectra.bands import nearest_bands, to_8_bit
+from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 PICTURE_NM = (640.0, 550.0, 470.0)
 """Red, green and blue of the pictures; markers' inks are dark in all of them."""

@@ -37,7 +37,7 @@ from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.plotting.figures import ANGLE_DRAWN_RAD, ERROR_DRAWN
+from hsi_sc_nerf.plotting import ANGLE_DRAWN_RAD, ERROR_DRAWN
 
 
 @dataclass

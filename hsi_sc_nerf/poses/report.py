@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.plotting.figures import save_figure
+from hsi_sc_nerf.plotting import save_figure
 from hsi_sc_nerf.poses.pose_checks import REPROJECTION_TARGET_PX, step_deviation_deg
 from hsi_sc_nerf.poses.result import TurntablePoses
 

@@ -20,7 +20,7 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 
 GRAY = "gray"
 """The mean over the range in which markers are printed to be seen; it is there always."""

@@ -27,7 +27,7 @@ from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
 from hsi_sc_nerf.processing.fingerprint import capture_files, fingerprint
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_width
-from hsi_sc_nerf.spectra.bands import bands_within, nearest_bands, to_8_bit
+from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.terminal import progress_bar
 
 MARKER_RANGE_NM = (450.0, 700.0)

@@ -54,7 +54,7 @@ from hsi_sc_nerf.processing.posed_frames import (
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.processing.session_checks import SessionChecks
-from hsi_sc_nerf.spectra.bands import nearest_bands
+from hsi_sc_nerf.spectra import nearest_bands
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.spectra.bands import nearest_bands
+from hsi_sc_nerf.spectra import nearest_bands
 from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
 
 CubeType = Literal["float32", "uint16"]

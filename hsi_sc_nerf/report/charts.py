@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from hsi_sc_nerf.plotting.figures import STYLE, new_figure
+from hsi_sc_nerf.plotting import STYLE, new_figure
 
 _SERIES = ("#0072b2", "#d55e00", "#00805f", "#b0568c", "#b07800", "#2f93cf", "#1c2126")
 _TEXT, _FAINT, _RULE = "#1c2126", "#5b6670", "#d9dee3"

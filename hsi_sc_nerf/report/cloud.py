@@ -13,9 +13,8 @@ from matplotlib import colormaps
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
-from hsi_sc_nerf.plotting.figures import INDEX_COLOURS
-from hsi_sc_nerf.spectra.bands import available_composites
-from hsi_sc_nerf.spectra.indices import available_indices, index_values
+from hsi_sc_nerf.plotting import INDEX_COLOURS
+from hsi_sc_nerf.spectra import available_composites, available_indices, index_values
 
 _INT16 = 32767
 _MISSING = 65535

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.findings import Finding, judged
-from hsi_sc_nerf.plotting.figures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
+from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
@@ -23,7 +23,7 @@ from hsi_sc_nerf.report.held_out_views import (
     spread_of_views,
 )
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 
 PICTURED_VIEWS = 4
 _ERROR_COLOURS = "viridis"

@@ -18,7 +18,7 @@ from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.frames import FramePaths
 from hsi_sc_nerf.simulate.truth import Truth
-from hsi_sc_nerf.spectra.bands import nearest_bands
+from hsi_sc_nerf.spectra import nearest_bands
 
 COVERED = 0.5
 """Fraction of a pixel that the object must exceed for the pixel to belong to it."""

@@ -20,7 +20,7 @@ from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
-from hsi_sc_nerf.spectra.bands import composite, to_8_bit
+from hsi_sc_nerf.spectra import composite, to_8_bit
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from viser import GuiMarkdownHandle, ViserServer
 
-from hsi_sc_nerf.plotting.figures import COLOURS, STYLE, new_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure
 
 _WIDTH_IN = 2.5  # 240 px of the viewer's panel
 _DPI = 3 * 96  # three dots a pixel, sharp on high-resolution screens

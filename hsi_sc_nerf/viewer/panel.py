@@ -27,9 +27,16 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.plotting.figures import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
-from hsi_sc_nerf.spectra.bands import COMPOSITES, available_composites, composite, nearest_bands
-from hsi_sc_nerf.spectra.indices import INDICES, available_indices, index_values
+from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
+from hsi_sc_nerf.spectra import (
+    COMPOSITES,
+    INDICES,
+    available_composites,
+    available_indices,
+    composite,
+    index_values,
+    nearest_bands,
+)
 from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 

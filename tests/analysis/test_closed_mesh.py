@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges, smoothed, solid_pieces, thinned
-from hsi_sc_nerf.analysis.size import feret_diameters, size_of, size_spread
+from hsi_sc_nerf.analysis.closed_mesh import (
+    MeshConfig,
+    closed_mesh,
+    feret_diameters,
+    open_edges,
+    size_of,
+    size_spread,
+    smoothed,
+    solid_pieces,
+    thinned,
+)
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder

@@ -25,7 +25,7 @@ from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.spectra.bands import nearest_bands
+from hsi_sc_nerf.spectra import nearest_bands
 
 MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
 WAVELENGTHS_NM = np.linspace(400.0, 1000.0, 7)

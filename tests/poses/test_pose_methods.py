@@ -16,7 +16,7 @@ from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.spectra.bands import bands_within, to_8_bit
+from hsi_sc_nerf.spectra import bands_within, to_8_bit
 
 SIZE_PX, FRAMES = 288, 24
 

@@ -45,7 +45,7 @@ from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.assemble import marker_layout
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.spectra.bands import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 
 DICTIONARY = "DICT_5X5_50"
 GRAY_NM = (450.0, 700.0)

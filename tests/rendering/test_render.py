@@ -15,10 +15,9 @@ from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
 from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.rendering.videos import find_false_colour, open_video
+from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import RenderedView, views_of_orbit, views_of_path, write_view
-from hsi_sc_nerf.spectra.bands import COMPOSITES
-from hsi_sc_nerf.spectra.indices import INDICES
+from hsi_sc_nerf.spectra import COMPOSITES, INDICES
 
 NM = factory.WAVELENGTHS_NM
 HELD_OUT = "ball_8"

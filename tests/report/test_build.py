@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from headless_browser import launch, needs_browser
 
+from hsi_sc_nerf.analysis.closed_mesh import Size
 from hsi_sc_nerf.analysis.report import trait_content
-from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply

@@ -15,8 +15,8 @@ from viser.transforms import SO3
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.plotting.figures import BLANK, coloured
-from hsi_sc_nerf.spectra.bands import COMPOSITES
+from hsi_sc_nerf.plotting import BLANK, coloured
+from hsi_sc_nerf.spectra import COMPOSITES
 from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.panel import SpectralPanel, attach_spectral_panel, pick
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels

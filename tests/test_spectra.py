@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra.bands import COMPOSITES, composite, covered, require_bands
-from hsi_sc_nerf.spectra.indices import INDICES, index_values
+from hsi_sc_nerf.spectra import COMPOSITES, INDICES, composite, covered, index_values, require_bands
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 WAVELENGTHS_NM = np.linspace(397.32, 1003.58, 204)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hsi_sc_nerf.cli.demo_report import draw_cloud, draw_spectra, draw_views
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.plotting.result_pictures import draw_cloud, draw_spectra, draw_views
 
 WAVELENGTHS = np.linspace(400.0, 1000.0, 7)
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -101,5 +101,5 @@ def test_matplotlibs_global_state_stays_as_it_was(tmp_path: Path) -> None:
     before = mpl.rcParams["font.size"], mpl.rcParams["axes.grid"]
     draw_views(tmp_path / "views.png", [plain(RED)], [plain(GREEN)], ["a"])
     assert (mpl.rcParams["font.size"], mpl.rcParams["axes.grid"]) == before
-    program = "import sys, hsi_sc_nerf.plotting.result_pictures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    program = "import sys, hsi_sc_nerf.cli.demo_report; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
