@@ -19,6 +19,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare, read_reference
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.settings_file import between, check_options
+from hsi_sc_nerf.terminal import screen_table
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.analysis.closed_mesh import Size
@@ -54,7 +55,7 @@ class CompareCommand:
             return track(items, doing, console=console, transient=True)
 
         # Slow to import.
-        from hsi_sc_nerf.evaluation.comparison_report import screen_tables, write_comparison
+        from hsi_sc_nerf.evaluation.comparison_report import comparison_tables, write_comparison
         from hsi_sc_nerf.simulate.true_surface import true_reference
 
         if self.reference.is_dir():
@@ -62,8 +63,8 @@ class CompareCommand:
         else:
             reference = read_reference(self.reference, self.config)
         comparison = compare(self.cloud, reference, self.config, shown)
-        write_comparison(self.output_dir, comparison, self.cloud.name, self.reference.name)
-        Console().print(*screen_tables(comparison))
+        figures = write_comparison(self.output_dir, comparison, self.cloud.name, self.reference.name)
+        Console().print(*(screen_table(*table) for table in comparison_tables(figures)))
         page = escape(str(self.output_dir / "comparison.md"))
         Console().print(f"Everything, and the pictures: {page}", soft_wrap=True)
 

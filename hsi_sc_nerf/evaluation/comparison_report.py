@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps, rc_context
 from plyfile import PlyData
-from rich.table import Table
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.evaluation.comparison import Comparison
@@ -20,10 +19,18 @@ from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics,
 from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.geometry.mesh import ply_vertices
 from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
-from hsi_sc_nerf.terminal import markdown_table, screen_table
+from hsi_sc_nerf.terminal import markdown_table
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
-_DISTANCE_TITLES = ["distance, mm", "mean", "median", "RMS", "95th percentile", "largest"]
+_STATISTICS = {
+    "mean_m": "mean",
+    "median_m": "median",
+    "rms_m": "RMS",
+    "percentile_95_m": "95th percentile",
+    "largest_m": "largest",
+}
+TextTable = tuple[list[str], list[list[str]]]
+"""Titles and rows."""
 _REACHED_PERCENT = (90.0, 95.0, 99.0)
 _DRAWN_POINTS = 60_000
 # Title, direction of y across and of x towards the viewer; z is up.
@@ -31,35 +38,26 @@ _SIDES = (("seen from +x", 1), ("seen from −x", -1))
 _PANEL_IN = 2.5
 
 
-def score_rows(comparison: Comparison) -> list[list[str]]:
-    """Precision, recall and F-score at the chosen threshold and at the knee."""
-    chosen_m = comparison.config.threshold_m
-    chosen = " (the paper's)" if chosen_m == paper.F_SCORE_THRESHOLD_M else " (chosen)"
-    rows = []
-    for threshold_m, label in ((chosen_m, chosen), (comparison.best_threshold_m, " (knee)")):
-        score = score_at(comparison.to_reference_m, comparison.to_cloud_m, threshold_m)
-        figures = (f"{percent:.2f}" for percent in (score.precision, score.recall, score.f_score))
-        rows.append([f"{1000 * threshold_m:.2f}{label}", *figures])
-    return rows
+def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]:
+    """Precision, recall and F-score at the chosen threshold and at the knee; statistics of the distances both ways.
 
+    Args:
+        figures: of `summary`, or the content of ``comparison.json``.
 
-def distance_rows(comparison: Comparison) -> list[list[str]]:
-    """Statistics of the distances in both directions."""
-    return [
-        [label, *(f"{1000 * value:.3f}" for value in distance_statistics(distances).values())]
-        for label, distances in (
-            ("cloud to reference", comparison.to_reference_m),
-            ("reference to cloud", comparison.to_cloud_m),
-        )
+    Raises:
+        KeyError, TypeError, ValueError: it is no such content.
+    """
+    scores = []
+    for name, score in figures["scores"].items():
+        threshold_m = float(score["threshold_m"])
+        label = "the paper's" if name == "chosen" and threshold_m == paper.F_SCORE_THRESHOLD_M else name
+        percent = (f"{float(score[key]):.2f}" for key in ("precision", "recall", "f_score"))
+        scores.append([f"{1000 * threshold_m:.2f} ({label})", *percent])
+    distances = [
+        [key.replace("_", " "), *(f"{1000 * float(figures[key][statistic]):.3f}" for statistic in _STATISTICS)]
+        for key in ("cloud_to_reference", "reference_to_cloud")
     ]
-
-
-def screen_tables(comparison: Comparison) -> list[Table]:
-    """The tables for a terminal."""
-    return [
-        screen_table(_SCORE_TITLES, score_rows(comparison)),
-        screen_table(_DISTANCE_TITLES, distance_rows(comparison)),
-    ]
+    return (_SCORE_TITLES, scores), (["distance, mm", *_STATISTICS.values()], distances)
 
 
 def summary(comparison: Comparison) -> dict[str, Any]:
@@ -104,8 +102,11 @@ def _alignment(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, reference_name: str) -> None:
+def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, reference_name: str) -> dict[str, Any]:
     """``comparison.md``, ``comparison.json``, ``curves.png``, ``distances.png`` and ``distances.ply``, all or none.
+
+    Returns:
+        The figures, as `summary` gives them.
 
     Raises:
         InputError: the operating system refused to write.
@@ -127,6 +128,7 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
         _draw_distances(pictures, surfaces, limit_m)
         _write_distance_ply(cloud, comparison.cloud.points_m, comparison.to_reference_m, limit_m)
         page.write_text(_page(comparison, figures, cloud_name, reference_name, limit_m), encoding="utf-8")
+    return figures
 
 
 def _write_distance_ply(
@@ -146,14 +148,15 @@ def _page(
         f"{percent:g} % at {1000 * figures['f_score_reaches'][f'{percent:g}_percent_m']:.2f} mm"
         for percent in _REACHED_PERCENT
     )
+    scores, distances = comparison_tables(figures)
     return f"""# {cloud_name} against {reference_name}
 
-{markdown_table(_SCORE_TITLES, score_rows(comparison))}
+{markdown_table(*scores)}
 
 The F-score reaches {reached}. It never falls as the threshold grows; the knee is where it stops rising steeply, seen
 from 0 to {1000 * comparison.config.largest_threshold_m:g} mm.
 
-{markdown_table(_DISTANCE_TITLES, distance_rows(comparison))}
+{markdown_table(*distances)}
 
 {_alignment_sentences(figures["alignment"])} {_distances_sentence(comparison)}{_seen_sentence(comparison)}
 

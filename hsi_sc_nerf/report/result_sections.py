@@ -10,15 +10,13 @@ import numpy as np
 
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.comparison_report import comparison_tables
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _MM_PER_M = 1000.0
 _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
-_SCORES = {"chosen": "at the chosen threshold", "knee": "at the knee of the F-score"}
-_DISTANCES = {"cloud_to_reference": "cloud to reference", "reference_to_cloud": "reference to cloud"}
-_STATISTICS = {"mean_m": "mean", "median_m": "median", "rms_m": "RMS", "percentile_95_m": "95th percentile"}
 _WRONG_CONTENT = (AttributeError, KeyError, TypeError, ValueError)
 _F_SCORE_MISSING_PERCENT = (10.0, 30.0)
 _UNSEEN_FRACTION = 0.15
@@ -76,7 +74,7 @@ def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
         Curve(name, thresholds_mm, np.array(found[key], float).reshape(len(thresholds_mm)))
         for key, name in _CURVES.items()
     ]
-    marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in _SCORES}
+    marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in ("chosen", "knee")}
     chart = line_chart(
         curves,
         x_label="distance threshold (mm)",
@@ -85,20 +83,12 @@ def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
         from_zero=True,
         marks={f"{key} {at:.2f} mm": at for key, at in marks_mm.items()},
     )
-    score_rows = [
-        (f"{name}, {marks_mm[key]:.2f} mm", *(f"{float(scores[key][measure]):.2f} %" for measure in _CURVES))
-        for key, name in _SCORES.items()
-    ]
-    distance_rows = [
-        (name, *(f"{_MM_PER_M * float(comparison[key][statistic]):.3f}" for statistic in _STATISTICS))
-        for key, name in _DISTANCES.items()
-        if key in comparison
-    ]
+    scored, distances = comparison_tables(comparison)
     caption = "Precision: fraction of the cloud within the threshold of the reference. Recall: the converse."
     return [
-        Table(caption, ("", *_CURVES.values()), score_rows),
+        Table(caption, *scored),
         Figure([chart], "Precision, recall and F-score over the distance threshold, per cent."),
-        Table("Distances, mm.", ("", *_STATISTICS.values()), distance_rows),
+        Table("Distances, mm.", *distances),
     ]
 
 
