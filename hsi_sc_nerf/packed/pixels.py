@@ -53,7 +53,7 @@ class PixelReader:
         frames, pixels = indices[:, 0], indices[:, 1] * samples + indices[:, 2]
         offsets = (self._starts[frames] + pixels * size).tolist()
         files = [self._files[frame].fileno() for frame in frames.tolist()]
-        # A disk serves many positions at once (benchmarks/pixel_fetch.py); not on macOS.
+        # A disk serves many positions at once; not on macOS.
         if hasattr(os, "posix_fadvise"):
             for file, offset in zip(files, offsets, strict=True):
                 os.posix_fadvise(file, offset, size, os.POSIX_FADV_WILLNEED)
