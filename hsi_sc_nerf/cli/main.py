@@ -11,10 +11,9 @@ from rich.markup import escape
 
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
-from hsi_sc_nerf.cli.demo import DemoCommand
-from hsi_sc_nerf.cli.run import RunCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, MarkersCommand, ProcessCommand, SimulateCommand
 from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand, SampleCommand
+from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.terminal import ignore_library_warnings
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hsi_sc_nerf.cli.demo import DemoCommand
+from hsi_sc_nerf.cli.workflows import DemoCommand
 from hsi_sc_nerf.errors import InputError
 
 

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from hsi_sc_nerf.cli.run import STEPS_NAME, RunCommand, Step
+from hsi_sc_nerf.cli.workflows import STEPS_NAME, RunCommand, Step
 from hsi_sc_nerf.errors import InputError
 
 ALL = ["process", "train", "evaluate", "export", "traits", "report"]
