@@ -24,7 +24,7 @@ from results_table import write_results
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
-from hsi_sc_nerf.benchmark.steps import nerfstudio_command, run_step
+from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
@@ -106,9 +106,9 @@ def noise_free_metrics(config: Path, noise_free: Path, held_out_views: int | Non
 
 def cloud_scores(config: Path, folder: Path, output_dir: Path) -> dict[str, float]:
     """F-scores (percent, 2 mm) of the exported cloud: against all of the surface, and what a camera can see of it."""
-    export = [*nerfstudio_command("exporter"), "pointcloud", "--load-config", str(config)]
-    options = ["--output-dir", str(output_dir), "--num-points", str(CLOUD_POINTS)]
-    run_step("export", [*export, *options], output_dir / "export.log")
+    export = ["ns-export", "pointcloud", "--load-config", config]
+    options = ["--output-dir", output_dir, "--num-points", CLOUD_POINTS]
+    run_step("export", typed_command([*export, *options]), output_dir / "export.log")
     scores = {}
     cloud = Surface(read_surface(output_dir / "point_cloud.ply")[0])
     for name, whole in (("whole", True), ("seen", False)):

@@ -80,21 +80,13 @@ def own_cost(name: str, started: float) -> StepCost:
     return StepCost(name, time.perf_counter() - started, peak_memory_mib())
 
 
-def nerfstudio_command(script: str) -> list[str]:
-    """Command that runs a script of nerfstudio (``train``, ``eval``, ``exporter``) with this Python."""
-    return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()"]
-
-
-def own_command() -> list[str]:
-    """Command that runs `hsi-sc-nerf` with this Python."""
-    return [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
-
-
-def typed_command(words: Sequence[str]) -> list[str]:
+def typed_command(words: Sequence[object]) -> list[str]:
     """Command that runs with this Python what a user would type, such as ``("ns-train", "hsi-sc-nerf", ...)``."""
-    scripts = {"ns-train": "train", "ns-eval": "eval", "ns-export": "exporter"}
-    program = own_command() if words[0] == "hsi-sc-nerf" else nerfstudio_command(scripts[words[0]])
-    return [*program, *words[1:]]
+    name, *rest = map(str, words)
+    if name == "hsi-sc-nerf":
+        return [sys.executable, "-m", "hsi_sc_nerf.cli.main", *rest]
+    script = {"ns-train": "train", "ns-eval": "eval", "ns-export": "exporter"}[name]
+    return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()", *rest]
 
 
 def _end_with_parent() -> None:

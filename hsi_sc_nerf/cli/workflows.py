@@ -19,7 +19,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.benchmark.configurations import split_words
-from hsi_sc_nerf.benchmark.steps import StepCost, nerfstudio_command, own_command, own_cost, run_step, typed_command
+from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.settings_file import between, check_options
@@ -253,33 +253,22 @@ class DemoCommand:
         for earlier in (runs, out / "renders"):
             shutil.rmtree(earlier, ignore_errors=True)
         config = runs / "demo" / "hsi-sc-nerf" / "demo" / "config.yml"
-        training = [word for key, value in DEMO_TRAINING.items() for word in (f"--{key}", *value.split())]
-        commands = {
-            "simulate": [*own_command(), "simulate", self.scene, str(session)],
-            "process": [*own_command(), "process", str(session), "--output-dir", str(data)],
-            "train": [
-                *nerfstudio_command("train"),
-                "hsi-sc-nerf",
-                *("--data", str(data), "--output-dir", str(runs)),
-                *("--experiment-name", "demo", "--timestamp", "demo"),
-                *("--max-num-iterations", str(self.iterations)),
-                *training,
-            ],
-            "evaluate": [
-                *nerfstudio_command("eval"),
-                *("--load-config", str(config), "--output-path", str(out / "eval.json")),
-                *("--render-output-path", str(out / "renders")),
-            ],
-            "export": [
-                *nerfstudio_command("exporter"),
-                *("pointcloud", "--load-config", str(config), "--output-dir", str(out)),
-                *("--num-points", str(self.points)),
-            ],
+        training: list[object] = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", runs]
+        training += ["--experiment-name", "demo", "--timestamp", "demo", "--max-num-iterations", self.iterations]
+        training += [word for key, value in DEMO_TRAINING.items() for word in (f"--{key}", value)]
+        evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
+        exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]
+        commands: dict[str, list[object]] = {
+            "simulate": ["hsi-sc-nerf", "simulate", self.scene, session],
+            "process": ["hsi-sc-nerf", "process", session, "--output-dir", data],
+            "train": training,
+            "evaluate": [*evaluating, "--render-output-path", out / "renders"],
+            "export": [*exporting, "--num-points", self.points],
         }
         costs: list[StepCost] = []
-        for number, (name, argv) in enumerate(commands.items(), start=1):
+        for number, (name, words) in enumerate(commands.items(), start=1):
             console.print(f"[bold]{number}/{len(commands) + 1} {name}")
-            costs.append(run_step(name, argv, logs / f"{name}.log"))
+            costs.append(run_step(name, typed_command(words), logs / f"{name}.log"))
         console.print(f"[bold]{len(costs) + 1}/{len(commands) + 1} compare")
         started = time.perf_counter()
         metrics, processing = score(out)
