@@ -28,9 +28,9 @@ BOARDS, JOINT_WIDTH = 5, 0.008
 REFERENCE_NM = 700.0
 """Wavelength at which a change of colour temperature does not change the light."""
 Coefficients = tuple[float, float, float, float]
-UNDISTORTION_STEPS = 500
+UNDISTORTION_STEPS, UNDISTORTION_GOAL = 500, 1e-13
 UNDISTORTED_TO = 1e-10
-"""Residual of the undistortion as a fraction of the focal length, about 1e-7 pixel."""
+"""Largest residual of an undistortion that converged, as a fraction of the focal length: about 1e-7 pixel."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def distort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Fl
 def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> Float[np.ndarray, "*n 2"] | None:
     """Inverse of `distort` (OpenCV); None if it does not converge, because the model is not invertible there."""
     flat = np.ascontiguousarray(points, float).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, UNDISTORTION_STEPS, UNDISTORTED_TO)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, UNDISTORTION_STEPS, UNDISTORTION_GOAL)
     found = cv2.undistortPointsIter(flat, np.eye(3), np.array(coefficients), None, None, criteria).reshape(
         points.shape
     )
