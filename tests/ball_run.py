@@ -9,15 +9,16 @@ from copy import deepcopy
 from pathlib import Path
 
 import capture_factory as factory
-import cv2
 import numpy as np
 import torch
 import yaml
 from nerfstudio.field_components.field_heads import FieldHeadNames
+from packed_frames import packed_frame
 
+from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame, write_transforms
+from hsi_sc_nerf.packed.dataset import PackedDataset, write_transforms
 
 ANGLES_DEG = np.arange(0.0, 360.0, 36.0)
 DENSITY = 400.0  # opaque within some hundredths of the scene's unit
@@ -29,29 +30,12 @@ def write_ball_dataset(root: Path) -> Path:
         pose = factory.true_pose(angle_deg)
         mask = factory.sphere_mask(pose)
         reflectance = np.where(mask[..., None], factory.PLANT, factory.BACKGROUND)
-        paths = {kind: root / kind / f"ball_{i}.png" for kind in ("images", "masks", "flags")}
-        pictures = {
-            "images": np.rint(255 * reflectance[..., [5, 3, 1]]),
-            "masks": 255 * mask,
-            "flags": np.zeros_like(mask),
-        }
-        for kind, path in paths.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), pictures[kind].astype(np.uint8))
-        cube_path = root / "cubes" / f"ball_{i}.hdr"
-        write_packed_cube(cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
-        frames.append(
-            PackedFrame(
-                capture=f"ball_{i}",
-                image_path=paths["images"],
-                mask_path=paths["masks"],
-                cube_path=cube_path,
-                flags_path=paths["flags"],
-                angle_deg=angle_deg,
-                reprojection_error_px=None,
-                camera_to_world=pose,
-            )
-        )
+        frame = packed_frame(root, f"ball_{i}", pose, angle_deg=angle_deg)
+        write_packed_cube(frame.cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
+        write_png(frame.image_path, np.rint(255 * reflectance[..., [5, 3, 1]]).astype(np.uint8))
+        write_png(frame.mask_path, 255 * mask.astype(np.uint8))
+        write_png(frame.flags_path, np.zeros_like(mask, np.uint8))
+        frames.append(frame)
     reach = np.full(3, factory.SPHERE_RADIUS_M)
     box = np.stack([factory.SPHERE_CENTRE_M - reach, factory.SPHERE_CENTRE_M + reach])
     write_transforms(

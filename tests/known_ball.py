@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from packed_frames import packed_frame
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader
 
 RADIUS = 0.5
@@ -111,10 +111,8 @@ def known_run(folder) -> SimpleNamespace:
         masks.append(np.isfinite(distance))
         points = origin + directions * np.where(masks[-1], distance, 0.0)[..., None]
         cube = np.where(masks[-1][..., None], true_spectra(points), 0.1)
-        path = folder / "cubes" / f"ball_{index:03d}.hdr"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_packed_cube(path, pack(cube), WAVELENGTHS_NM)
-        frames.append(packed_frame(folder, index, path))
+        frames.append(packed_frame(folder, f"ball_{index:03d}"))
+        write_packed_cube(frames[-1].cube_path, pack(cube), WAVELENGTHS_NM)
     sampler = SimpleNamespace(reader=PixelReader([frame.cube() for frame in frames]), masks=np.stack(masks))
     half_m = RADIUS / SCALE + 0.005
     box_m = CENTRE_M + np.array([[-half_m] * 3, [half_m] * 3])
@@ -128,18 +126,4 @@ def known_run(folder) -> SimpleNamespace:
         ),
         to_scene=lambda points_m: (points_m - CENTRE_M) * SCALE,
         to_metres=lambda points: points / SCALE + CENTRE_M,
-    )
-
-
-def packed_frame(folder, index, cube_path):
-    """A frame of the ball's dataset; only its cube is there."""
-    name = f"ball_{index:03d}.png"
-    paths = {f"{kind}_path": folder / f"{kind}s" / name for kind in ("image", "mask", "flags")}
-    return PackedFrame(
-        capture=f"ball_{index:03d}",
-        **paths,
-        cube_path=cube_path,
-        angle_deg=0.0,
-        reprojection_error_px=None,
-        camera_to_world=np.eye(4),
     )

@@ -143,8 +143,9 @@ def test_every_function_that_an_example_calls_exists() -> None:
     known |= {*vars(builtins), "Path"}
     found = 0
     for path, node in ((path, node) for path, module in modules.items() for node in ast.walk(module)):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
-            steps = doctest.DocTestParser().get_examples(ast.get_docstring(node) or "")
+        is_documented = isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module))
+        if is_documented and ">>>" in (docstring := ast.get_docstring(node, clean=False) or ""):
+            steps = doctest.DocTestParser().get_examples(docstring)
             example = list(ast.walk(ast.parse("".join(step.source for step in steps))))
             called = {
                 node.func.id for node in example if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)

@@ -210,11 +210,12 @@ def test_wavelengths_of_a_list_beside_session_json(tmp_path):
         ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
         ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
         ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+        (None, r"\.hdr: gives no wavelengths; .*'band_centres' in session\.json"),
     ],
 )
-def test_band_centres_that_cannot_be_used(tmp_path, content, message):
-    write_session(tmp_path, info={**INFO, "band_centres": "bands.csv"})
-    (tmp_path / "bands.csv").write_text(content)
+def test_without_band_centres_that_can_be_used(tmp_path, content, message):
+    write_session(tmp_path, info={**INFO, **({"band_centres": "bands.csv"} if content else {})})
+    (tmp_path / "bands.csv").write_text(content or "")
     for header in tmp_path.rglob("*.hdr"):
         without_wavelengths(header)
     with pytest.raises(InputError, match=message):
@@ -225,14 +226,6 @@ def test_the_instruments_own_list_of_band_centres():
     path = resources.files("hsi_sc_nerf.simulate") / "specim_iq_band_centres_nm.csv"
     centres_nm = read_band_centres(Path(str(path)))
     assert (len(centres_nm), centres_nm[0], centres_nm[-1]) == (204, 397.32, 1003.58)
-
-
-def test_no_wavelengths_anywhere(tmp_path):
-    write_session(tmp_path)
-    for header in tmp_path.rglob("*.hdr"):
-        without_wavelengths(header)
-    with pytest.raises(InputError, match=r"\.hdr: gives no wavelengths; .*'band_centres' in session\.json"):
-        open_session(tmp_path)
 
 
 def test_session_info_round_trip(tmp_path):

@@ -3,11 +3,13 @@
 import json
 import subprocess
 import sys
+from importlib import resources
 
 import cv2
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -17,6 +19,8 @@ from hsi_sc_nerf.simulate.truth import load_truth
 pytestmark = pytest.mark.slow
 
 ITERATIONS = 400
+# The shipped pear with fewer pixels and bands.
+SMALLER = {"size_px: 128": "size_px: 112", "bands: 204": "bands: 24"}
 
 
 def command(*words):
@@ -25,8 +29,15 @@ def command(*words):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    out = tmp_path_factory.mktemp("demo") / "out"
-    run = command("demo", "--output-dir", str(out), "--iterations", str(ITERATIONS), "--points", "20000")
+    folder = tmp_path_factory.mktemp("demo")
+    text = resources.files("hsi_sc_nerf.simulate").joinpath("scenes", "pear.yaml").read_text(encoding="utf-8")
+    for shipped, smaller in SMALLER.items():
+        assert shipped in text
+        text = text.replace(shipped, smaller)
+    (folder / "pear.yaml").write_text(text)
+    words = f"--scene {folder / 'pear.yaml'} --iterations {ITERATIONS} --points 20000".split()
+    out = folder / "out"
+    run = command("demo", "--output-dir", str(out), *words)
     logs = "\n".join(log.read_text()[-2000:] for log in (out / "logs").glob("*.log"))
     assert run.returncode == 0, run.stderr + logs
     return out
@@ -71,7 +82,7 @@ def test_both_stages_ran_and_the_first_left_its_checkpoint(demo):
 def test_cloud_is_metric_and_carries_every_band(demo):
     dataset = open_packed(demo / "data")
     cloud = read_spectral_ply(demo / "point_cloud.ply")
-    assert cloud.spectra.shape == (len(cloud.points), 204)
+    assert cloud.spectra.shape == (len(cloud.points), 24)
     np.testing.assert_allclose(cloud.wavelengths_nm, dataset.wavelengths_nm, atol=0.01)
     low, high = dataset.object_box_m
     assert ((cloud.points >= low - 1e-4) & (cloud.points <= high + 1e-4)).all()
@@ -99,10 +110,11 @@ def test_summary_and_pictures(demo):
         assert cv2.imread(str(demo / f"{name}.png")).std() > 5
 
 
-def test_processing_again_changes_nothing(demo):
+def test_processing_again_changes_nothing(demo, monkeypatch):
     before = (demo / "data" / "transforms.json").stat().st_mtime_ns
-    run = command("process", str(demo / "session"), "--output-dir", str(demo / "data"))
-    assert run.returncode == 0
+    words = ["process", str(demo / "session"), "--output-dir", str(demo / "data")]
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words])
+    main()
     assert (demo / "data" / "transforms.json").stat().st_mtime_ns == before
 
 
@@ -112,20 +124,3 @@ def test_bad_input_is_one_sentence_and_status_2(tmp_path):
     assert "nowhere" in run.stderr
     assert "Traceback" not in run.stderr
     assert not (tmp_path / "data").exists()
-
-
-def test_ns_train_on_bad_data_ends_in_one_sentence(tmp_path):
-    words = [
-        "hsi-sc-nerf",
-        "--data",
-        str(tmp_path / "nowhere"),
-        "--output-dir",
-        str(tmp_path),
-        "--vis",
-        "tensorboard",
-    ]
-    script = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
-    run = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True)
-    assert run.returncode != 0
-    assert "nowhere" in run.stderr.splitlines()[-1]
-    assert "Traceback" not in run.stderr

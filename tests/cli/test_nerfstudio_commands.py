@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 
 import ball_run
@@ -124,26 +123,34 @@ def test_renders_of_paths(call, ffmpeg, tmp_path, kind):
     assert len(list((tmp_path / "video").iterdir())) >= 2
 
 
-def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path):
-    script = """
-import sys, torch, tyro
-import torchmetrics.image.lpip as lpip
+@pytest.fixture
+def ns_train(tmp_path, monkeypatch):
+    """`ns-train` in this process, its results in the test's folder."""
+    from nerfstudio.scripts import train
+    from nerfstudio.utils import writer
 
-class NoDownload(torch.nn.Module):  # LPIPS would fetch a network
-    def __init__(self, **_):
-        super().__init__()
+    def called(words):
+        options = f" --output-dir {tmp_path} --vis tensorboard "
+        monkeypatch.setattr(sys, "argv", ["ns-train", *words.replace(" ", options, 1).split()])
+        train.entrypoint()
 
-lpip.LearnedPerceptualImagePatchSimilarity = NoDownload
-if __name__ == "__main__":
-    from nerfstudio.scripts.train import entrypoint
-    entrypoint()
-"""
-    (tmp_path / "train.py").write_text(script)
-    words = f"""nerfacto --data {tiny_dataset[0]} --output-dir {tmp_path} --timestamp run --vis tensorboard
-        --max-num-iterations 3 --machine.device-type cpu --pipeline.model.implementation torch
-        --pipeline.datamanager.train-num-rays-per-batch 64 --pipeline.model.log2-hashmap-size 10
-        hsi-sc-nerf-data""".split()
-    run = subprocess.run([sys.executable, str(tmp_path / "train.py"), *words], capture_output=True, text=True)
-    assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
+    return called
+
+
+def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path, ns_train, monkeypatch):
+    from torchmetrics.image import lpip
+
+    monkeypatch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", torch.nn.Identity)  # would fetch a network
+    ns_train(
+        f"""nerfacto --data {tiny_dataset[0]} --timestamp run --max-num-iterations 3 --machine.device-type cpu
+        --pipeline.model.implementation torch --pipeline.model.log2-hashmap-size 10
+        --pipeline.datamanager.train-num-rays-per-batch 64 hsi-sc-nerf-data"""
+    )
     (checkpoint,) = tmp_path.rglob("*.ckpt")
     assert torch.load(checkpoint, weights_only=False)["step"] == 2
+
+
+def test_training_on_bad_data_ends_in_one_sentence(tmp_path, ns_train):
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*nowhere[^\n]*\.$"):
+        ns_train(f"hsi-sc-nerf --data {tmp_path / 'nowhere'}")

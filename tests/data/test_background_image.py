@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from packed_frames import packed_frame
 
 from hsi_sc_nerf.data.background_image import (
     MAX_FRAMES,
@@ -19,7 +20,7 @@ from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack, unpack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, open_packed
+from hsi_sc_nerf.packed.dataset import Container, PackedDataset, open_packed
 
 LENS = PinholeIntrinsics(48, 40, 70.0, 70.0, 24.0, 20.0)
 FIRST_POSE = look_at([0.5, 0.0, 0.35], [0.0, 0.0, 0.05])
@@ -43,16 +44,8 @@ def turning_block(k, lens=LENS):
 def write_dataset(root, cubes, masks, lens=LENS, container=None):
     frames = []
     for k, (cube, mask) in enumerate(zip(cubes, masks, strict=True)):
-        frame = PackedFrame(
-            capture=f"f{k}",
-            image_path=root / f"{k}.png",
-            mask_path=root / f"mask{k}.png",
-            cube_path=root / f"{k}.hdr",
-            flags_path=root / f"flags{k}.png",
-            angle_deg=30.0 * k,
-            reprojection_error_px=None,
-            camera_to_world=turntable_camera_to_world(FIRST_POSE, 30.0 * k),
-        )
+        pose = turntable_camera_to_world(FIRST_POSE, 30.0 * k)
+        frame = packed_frame(root, f"f{k}", pose, angle_deg=30.0 * k)
         write_packed_cube(frame.cube_path, cube, np.linspace(400, 1000, cube.shape[-1]))
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
         frames.append(frame)

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from packed_frames import packed_frame
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.data.spectral_subspace import (
@@ -15,8 +15,8 @@ from hsi_sc_nerf.data.spectral_subspace import (
     sample_training_spectra,
 )
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.packed.cube import FLAGGED, ReflectanceUncertainty, pack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import PackedFrame
 
 BANDS = 60
 MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"
@@ -121,19 +121,9 @@ def test_spectra_of_a_packed_dataset_are_sampled(tmp_path):
         cube = rng.uniform(0.3, 0.4, (6, 5, 3)) + 0.5 * (mask[..., None] > 0)
         counts = pack(cube)
         counts[0, 0, 1] = FLAGGED
-        write_packed_cube(tmp_path / f"{i}.hdr", counts, np.arange(3.0) + 400.0)
-        cv2.imwrite(str(tmp_path / f"{i}.png"), mask)
-        paths = dict.fromkeys(("image_path", "mask_path", "flags_path"), tmp_path / f"{i}.png")
-        frames.append(
-            PackedFrame(
-                "",
-                **paths,
-                cube_path=tmp_path / f"{i}.hdr",
-                angle_deg=0.0,
-                reprojection_error_px=None,
-                camera_to_world=np.eye(4),
-            )
-        )
+        frames.append(packed_frame(tmp_path, str(i)))
+        write_packed_cube(frames[-1].cube_path, counts, np.arange(3.0) + 400.0)
+        write_png(frames[-1].mask_path, mask)
     spectra, valid = sample_training_spectra(frames, 400)
     assert spectra.shape == valid.shape == (400, 3)
     assert (spectra[:, 0] > 0.75).sum() == 200

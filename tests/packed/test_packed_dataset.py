@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from packed_frames import packed_frame
 from spectral import get_rgb
 from spectral.io import envi as spy
 
@@ -24,7 +25,7 @@ from hsi_sc_nerf.packed.cube import (
     unpack,
     write_packed_cube,
 )
-from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, is_packed, open_packed, write_transforms
+from hsi_sc_nerf.packed.dataset import Container, PackedDataset, is_packed, open_packed, write_transforms
 
 WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
 
@@ -34,22 +35,13 @@ def dataset(tmp_path) -> PackedDataset:
     rng = np.random.default_rng(0)
     frames = []
     for name in ("a", "b"):
-        write_packed_cube(tmp_path / "cubes" / f"{name}.hdr", pack(rng.random((4, 5, 3))), WAVELENGTHS_NM)
-        write_png(tmp_path / "images" / f"{name}.png", rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
-        write_png(tmp_path / "masks" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * 255)
-        write_png(tmp_path / "flags" / f"{name}.png", np.eye(4, 5, dtype=np.uint8) * PixelFlag.SATURATED)
-        frames.append(
-            PackedFrame(
-                capture=name,
-                image_path=tmp_path / "images" / f"{name}.png",
-                mask_path=tmp_path / "masks" / f"{name}.png",
-                cube_path=tmp_path / "cubes" / f"{name}.hdr",
-                flags_path=tmp_path / "flags" / f"{name}.png",
-                angle_deg=12.5,
-                reprojection_error_px=0.25,
-                camera_to_world=look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.1]),
-            )
-        )
+        pose = look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.1])
+        frame = packed_frame(tmp_path, name, pose, angle_deg=12.5, reprojection_error_px=0.25)
+        write_packed_cube(frame.cube_path, pack(rng.random((4, 5, 3))), WAVELENGTHS_NM)
+        write_png(frame.image_path, rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
+        write_png(frame.mask_path, np.eye(4, 5, dtype=np.uint8) * 255)
+        write_png(frame.flags_path, np.eye(4, 5, dtype=np.uint8) * PixelFlag.SATURATED)
+        frames.append(frame)
     return PackedDataset(
         root=tmp_path,
         intrinsics=PinholeIntrinsics(5, 4, 10.0, 11.0, 2.5, 2.0),

@@ -1,6 +1,7 @@
 """Effects of the sensor: each against its closed form, any two against their definitions, and none unless named."""
 
 import dataclasses
+import functools
 import itertools
 
 import cv2
@@ -34,6 +35,12 @@ def scene(name="sphere", size_px=24, bands=6, frames=2, **effects):
     """A shipped scene with effects, by name and strengths."""
     changed = override(load_scene(name), size_px=size_px, bands=bands, frames=frames)
     return dataclasses.replace(changed, effects=read_effects([{k: v} for k, v in effects.items()], "test"))
+
+
+@functools.cache
+def quiet(size_px, bands):
+    """The scene without effects, simulated once for all tests."""
+    return Simulation(scene(size_px=size_px, bands=bands))
 
 
 def tarp(cube):
@@ -122,32 +129,26 @@ def test_calibration_of_a_noisy_white_sphere_is_unbiased(tmp_path):
 # Detector
 
 
-def test_dark_pattern_is_the_same_in_all_exposures_and_truth_knows_it(tmp_path):
-    with_pattern = scene(size_px=64, bands=40, dark_pattern={"spread": 8.0})
-    simulation, quiet = Simulation(with_pattern), Simulation(scene(size_px=64, bands=40))
+def test_dark_pattern_is_the_same_in_all_exposures():
+    simulation, even = Simulation(scene(size_px=64, bands=40, dark_pattern={"spread": 8.0})), quiet(64, 40)
     pattern = simulation.detector_maps["dark_pattern"]["dark_offset"]
     degrees = pattern.size - 1
     assert pattern.var(ddof=1) == pytest.approx(64.0, rel=ALL_BUT_A_MILLIONTH * np.sqrt(2.0 / degrees))
     assert pattern.mean() == pytest.approx(0.0, abs=ALL_BUT_A_MILLIONTH * 8.0 / np.sqrt(pattern.size))
-    for capture, without in ((simulation.white(), quiet.white()), (simulation.frame(1), quiet.frame(1))):
+    for capture, without in ((simulation.white(), even.white()), (simulation.frame(1), even.frame(1))):
         np.testing.assert_array_equal(capture.dark, np.broadcast_to(np.rint(DARK + pattern), capture.dark.shape))
         # Each rounded on its own: a count apart at most.
         added = capture.counts.astype(float) - without.counts - pattern
         assert np.abs(added).max() <= 1.0 + 1e-3
-    simulate_session(with_pattern, tmp_path / "s", False)
-    np.testing.assert_array_equal(load_truth(tmp_path / "s").detector_maps()["dark_offset"], pattern)
 
 
-def test_bad_pixels_are_where_truth_says_and_nothing_else_changes(tmp_path):
-    with_bad = scene(size_px=40, bands=30, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.02})
-    simulate_session(with_bad, tmp_path / "s", False)
-    maps = load_truth(tmp_path / "s").detector_maps()
+def test_bad_pixels_are_where_the_maps_say_and_nothing_else_changes():
+    simulation = Simulation(scene(size_px=40, bands=30, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.02}))
+    even, maps = quiet(40, 30), simulation.detector_maps["bad_pixels"]
     dead, hot = maps["dead"], maps["hot"]
     assert dead.shape == (40, 30)
     assert (dead.sum(), hot.sum(), (dead & hot).sum()) == (12, 24, 0)
-    quiet = Simulation(scene(size_px=40, bands=30))
-    simulation = Simulation(with_bad)
-    for capture, without in ((simulation.white(), quiet.white()), (simulation.frame(0), quiet.frame(0))):
+    for capture, without in ((simulation.white(), even.white()), (simulation.frame(0), even.frame(0))):
         for cube, reference in ((capture.counts, without.counts), (capture.dark, without.dark)):
             assert (cube[:, dead] == DARK).all()
             assert (cube[:, hot] == LARGEST).all()
@@ -159,7 +160,7 @@ def test_saturation_clips_exactly_where_truth_says(tmp_path):
     changed = scene(size_px=40, bands=12, saturation={"exposure_factor": 1.6})
     simulate_session(changed, tmp_path / "s", False)
     truth = load_truth(tmp_path / "s")
-    simulation, quiet = Simulation(changed), Simulation(dataclasses.replace(changed, effects=()))
+    simulation, even = Simulation(changed), quiet(40, 12)
     signal = 1.6 * sensor.white_signal(changed.sensor, truth.wavelengths_nm)
     clipped = []
     for capture in truth.captures:
@@ -171,13 +172,13 @@ def test_saturation_clips_exactly_where_truth_says(tmp_path):
         assert '<key field="integration_time" unit="ms">16.0</key>' in metadata
     assert 0.05 < np.mean(clipped) < 0.9
     # The tarp is taken with the same integration time, so where neither stops the ratio is the one without.
-    white, white_quiet = tarp(simulation.white().counts)[0], tarp(quiet.white().counts)[0]
+    white, white_quiet = tarp(simulation.white().counts)[0], tarp(even.white().counts)[0]
     assert (white == LARGEST).any()
-    frame, frame_quiet = simulation.frame(0).counts, quiet.frame(0).counts
+    frame, frame_quiet = simulation.frame(0).counts, even.frame(0).counts
     fits = (frame < LARGEST) & (white < LARGEST)
     ratio, ratio_quiet = (frame - DARK) / (white - DARK), (frame_quiet - DARK) / (white_quiet - DARK)
     assert np.abs(ratio - ratio_quiet)[fits].max() < 1.0 / (white_quiet.min() - DARK)
-    np.testing.assert_array_equal(simulation.frame(0).dark, quiet.frame(0).dark)
+    np.testing.assert_array_equal(simulation.frame(0).dark, even.frame(0).dark)
 
 
 def test_a_sharp_edge_of_a_spectrum_shifts_by_the_smiles_parabola():
@@ -202,7 +203,7 @@ def test_a_sharp_edge_of_a_spectrum_shifts_by_the_smiles_parabola():
 
 
 def test_tarp_of_its_own_integration_time():
-    usual, changed = Simulation(scene()), Simulation(scene(tarp_exposure={"exposure_factor": 0.4}))
+    usual, changed = quiet(24, 6), Simulation(scene(tarp_exposure={"exposure_factor": 0.4}))
     assert usual.white().integration_time_ms == usual.frame(0).integration_time_ms == paper.INTEGRATION_TIME_MS
     white, frame = changed.white(), changed.frame(1)
     assert white.integration_time_ms == pytest.approx(0.4 * paper.INTEGRATION_TIME_MS)
@@ -277,24 +278,27 @@ def test_a_lens_that_folds_the_image_is_refused():
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 def test_a_rotated_image_is_the_upright_one_turned(quarter_turns):
     rotated = Simulation(scene(size_px=40, image_rotation={"quarter_turns": quarter_turns}))
-    frame, upright = rotated.frame(1), Simulation(scene(size_px=40)).frame(1)
+    frame, upright = rotated.frame(1), quiet(40, 6).frame(1)
     np.testing.assert_array_equal(frame.counts, np.rot90(upright.counts, quarter_turns))
     assert (frame.counts != upright.counts).any()
     np.testing.assert_array_equal(frame.material_weights, upright.material_weights)
     np.testing.assert_array_equal(frame.dark, upright.dark)
 
 
-def test_rotation_leaves_the_detector_where_it_is(tmp_path):
-    turned = scene(size_px=32, image_rotation={}, dark_pattern={"spread": 30.0}, bad_pixels={"hot_fraction": 0.02})
-    session_dir = simulate_session(turned, tmp_path / "s", False)
-    truth = load_truth(session_dir)
+def test_rotation_leaves_the_detector_where_it_is_and_truth_knows_its_maps(tmp_path):
+    bad_pixels = {"dead_fraction": 0.05, "hot_fraction": 0.02}
+    turned = scene(size_px=32, image_rotation={}, dark_pattern={"spread": 30.0}, bad_pixels=bad_pixels)
+    truth = load_truth(simulate_session(turned, tmp_path / "s", False))
     assert truth.effects["image_rotation"] == {"quarter_turns": 1}
-    maps, frame = truth.detector_maps(), Simulation(turned).frame(0)
+    simulation = Simulation(turned)
+    maps, frame = truth.detector_maps(), simulation.frame(0)
+    for effect in ("dark_pattern", "bad_pixels"):
+        for name, expected in simulation.detector_maps[effect].items():
+            np.testing.assert_array_equal(maps[name], expected)
+    good = ~maps["hot"] & ~maps["dead"]
     assert (frame.counts[:, maps["hot"]] == LARGEST).all()
-    np.testing.assert_array_equal(
-        frame.dark.mean(axis=0)[~maps["hot"] & ~maps["dead"]],
-        np.rint(DARK + maps["dark_offset"])[~maps["hot"] & ~maps["dead"]],
-    )
+    assert (frame.counts[:, maps["dead"]] == DARK).all()
+    np.testing.assert_array_equal(frame.dark.mean(axis=0)[good], np.rint(DARK + maps["dark_offset"])[good])
     light = truth.light(truth.captures[0]).radiance()
     np.testing.assert_allclose(light, np.rot90(truth.reflectance(truth.captures[0])), atol=1e-6)
 

@@ -5,14 +5,7 @@ import pytest
 
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import plants
-from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
-
-
-def sphere(radius_m: float, rings: int = 200, segments: int = 200) -> Mesh:
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, rings)
-    profile = radius_m * np.stack([np.cos(latitude), np.sin(latitude)], axis=-1)
-    profile[[0, -1], 0] = 0.0
-    return revolve(profile, segments)
+from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, quads, revolve, sphere
 
 
 def test_cylinder_has_the_area_and_volume_of_its_polygonal_prism():
@@ -24,8 +17,29 @@ def test_cylinder_has_the_area_and_volume_of_its_polygonal_prism():
     np.testing.assert_allclose(mesh.area_m2(), 2 * base + n * 2 * r * np.sin(np.pi / n) * h, rtol=1e-12)
 
 
+@pytest.mark.parametrize("diameter_m", [0.01, 0.07, 0.3])
+def test_sphere_has_its_closed_forms(diameter_m):
+    mesh = sphere(diameter_m)
+    radius_m = diameter_m / 2
+    assert mesh.is_watertight()
+    assert mesh.area_m2() == pytest.approx(np.pi * diameter_m**2, rel=2e-4)
+    assert mesh.volume_m3() == pytest.approx(np.pi / 6 * diameter_m**3, rel=2e-4)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - [0, 0, radius_m], axis=1), radius_m, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("diameter_m", "height_m"), [(0.01, 0.01), (0.06, 0.08), (0.02, 0.4)])
+def test_cylinder_has_its_closed_forms(diameter_m, height_m):
+    mesh = cylinder(diameter_m, height_m, SEGMENTS, VERTEX_SPACING_M)
+    assert mesh.is_watertight()
+    assert mesh.area_m2() == pytest.approx(np.pi * diameter_m * (diameter_m / 2 + height_m), rel=2e-4)
+    assert mesh.volume_m3() == pytest.approx(np.pi / 4 * diameter_m**2 * height_m, rel=2e-4)
+    radius = np.hypot(*mesh.vertices[:, :2].T)
+    on_side = (mesh.vertices[:, 2] > 1e-9) & (mesh.vertices[:, 2] < height_m - 1e-9)
+    np.testing.assert_allclose(radius[on_side], diameter_m / 2, rtol=1e-12)
+
+
 def test_a_hole_and_a_flipped_triangle_are_not_watertight():
-    mesh = sphere(0.03, 12, 12)
+    mesh = revolve(np.array([[0.0, 0.0], [0.03, 0.01], [0.02, 0.03], [0.0, 0.04]]), 12)
     assert not Mesh(mesh.vertices, mesh.triangles[1:]).is_watertight()
     flipped = mesh.triangles.copy()
     flipped[5] = flipped[5, ::-1]

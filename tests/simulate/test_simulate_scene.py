@@ -10,7 +10,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.assemble import marker_layout
 from hsi_sc_nerf.simulate.light import render
-from hsi_sc_nerf.simulate.scene import EFFECTS, SHIPPED_SCENES, load_scene, override, parse_scene
+from hsi_sc_nerf.simulate.materials import MATERIALS, Measured, Plain, PlantTissue, endmembers
+from hsi_sc_nerf.simulate.scene import EFFECTS, SHIPPED_SCENES, OwnMesh, load_scene, override, parse_scene
 
 GOOD = """
 object: {shape: apple, height_m: 0.07}
@@ -18,6 +19,17 @@ camera: {elevation_deg: 20, distance_m: 0.5, aim_height_m: 0.05}
 turntable: {disc_diameter_m: 0.205}
 markers: {side_m: 0.036}
 """
+BALL = "{shape: sphere, height_m: 0.07, material: matte_white}"
+MESH = "{shape: mesh, mesh_file: a.ply, materials: [matte_grey]}"
+
+
+def of(thing):
+    """The scene with another object."""
+    return GOOD.replace("{shape: apple, height_m: 0.07}", thing)
+
+
+def parse(text, folder=Path()):
+    return parse_scene(text, source="scene.yaml", name="scene", folder=folder)
 
 
 @pytest.mark.parametrize("name", SHIPPED_SCENES)
@@ -51,6 +63,30 @@ def test_a_scene_file_fills_in_defaults_and_takes_its_name_from_the_file(tmp_pat
     assert scene.effects == ()
 
 
+def test_a_scene_defines_its_own_materials_in_three_ways(tmp_path):
+    (tmp_path / "leaf.csv").write_text("wavelength_nm, reflectance\n390, 0.1\n700, 0.5\n1010, 0.3\n")
+    text = of(BALL) + "materials:\n  disc: {plain: {level: 0.2}}\n  paper: {csv: leaf.csv}\n"
+    scene = parse(text.replace("matte_white", "skin") + "  skin: {plant: {plateau: 0.6, water: 1}}\n", tmp_path)
+    assert scene.materials == {
+        "disc": Plain(0.2),
+        "paper": Measured((390.0, 700.0, 1010.0), (0.1, 0.5, 0.3)),
+        "skin": PlantTissue(0.6, water=1.0),
+    }
+    spectra = endmembers(["disc", "paper", "chamber"], np.array([545.0, 700.0, 855.0]), scene.materials)
+    np.testing.assert_allclose(spectra[0], 0.2)
+    np.testing.assert_allclose(spectra[1], [0.3, 0.5, 0.4])
+    np.testing.assert_array_equal(spectra[2], endmembers(["chamber"], np.array([545.0, 700.0, 855.0]))[0])
+    assert "skin" not in MATERIALS
+
+
+def test_paths_are_relative_to_the_scene_file(tmp_path):
+    (tmp_path / "mine.yaml").write_text(of(MESH.replace("a.ply", "parts/a.ply")))
+    thing = load_scene(tmp_path / "mine.yaml").object
+    assert isinstance(thing, OwnMesh)
+    assert thing.mesh_file == tmp_path / "parts" / "a.ply"
+    assert thing.height_m is None
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -69,15 +105,50 @@ def test_a_scene_file_fills_in_defaults_and_takes_its_name_from_the_file(tmp_pat
         (GOOD + "name: ../elsewhere\n", "name is '../elsewhere', but"),
         ("object: [", "not valid YAML"),
         ("", "the file must hold"),
+        (of(BALL.replace("matte_white", "skim")), "material 'skim' is not defined"),
+        (of(BALL.replace("matte_white", "3")), "object.material is 3, but must be a text"),
+        (of(BALL.replace("sphere", "[sphere]")), "object.shape is ['sphere'], but must be one of"),
+        (of("5"), "object must hold `key: value` lines"),
+        (of(MESH.replace("matte_grey", "")), "object.materials is [], but must name one or more"),
+        (of(MESH.replace("matte_grey", "disc, disc")), "but must name one or more, each once"),
+        (of(MESH.replace("matte_grey", "1")), "object.materials[0] is 1, but must be a text"),
+        (of(MESH.replace("}", ", height_m: 9}")), "object.height_m is 9, but must lie between"),
+        (of(MESH.replace("a.ply", "4")), "object.mesh_file is 4, but must be a path"),
+        (GOOD + "materials: 3\n", "materials must hold `name: definition` lines"),
+        (GOOD + "materials: {disc: {level: 0.2}}\n", "disc is {'level': 0.2}, but must be one of `plant"),
+        (GOOD + "materials: {disc: {plain: {level: 20}}}\n", "level is 20, but must lie between 0 and 1"),
+        (GOOD + "materials: {disc: {plain: {}}}\n", "materials.disc.plain.level is missing"),
+        (GOOD + "materials: {disc: {plant: {plateau: 0.5, green: 1}}}\n", "plant.green is not a known key"),
+        (GOOD + "materials: {disc: {csv: 4}}\n", "materials.disc.csv is 4, but must be the path of a CSV file"),
+        (GOOD + "materials: {dics: {plain: {level: 0.2}}}\n", "nothing is made of the material 'dics'"),
+        (GOOD + "materials: {disc: {csv: none.csv}}\n", "none.csv: cannot be read"),
     ],
 )
 def test_bad_scene_files_get_one_sentence(text, sentence):
     with pytest.raises(InputError) as caught:
-        parse_scene(text, source="scene.yaml", name="scene")
+        parse(text)
     message = str(caught.value)
-    assert message.startswith("scene.yaml: ")
+    assert message.startswith(("scene.yaml: ", "none.csv: "))
     assert sentence in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("", "not a table of numbers with the columns wavelength_nm and reflectance|must cover"),
+        ("nm,r\n390,0.1\n1010,0.2\n", "not a table of numbers with the columns"),
+        ("wavelength_nm,reflectance\n390,0.1\n1010,high\n", "not a table of numbers"),
+        ("wavelength_nm,reflectance\n400,0.1\n1010,0.2\n", "must cover 397.32 to 1003.58 nm"),
+        ("wavelength_nm,reflectance\n1010,0.1\n390,0.2\n", "wavelengths must increase"),
+        ("wavelength_nm,reflectance\n390,10\n1010,20\n", "divide by 100"),
+        ("wavelength_nm,reflectance\n390,nan\n1010,0.2\n", "must lie between 0 and 1"),
+    ],
+)
+def test_bad_spectra_get_one_sentence(tmp_path, content, sentence):
+    (tmp_path / "leaf.csv").write_text(content)
+    with pytest.raises(InputError, match=rf"leaf\.csv: .*({sentence})"):
+        parse(GOOD + "materials: {disc: {csv: leaf.csv}}\n", tmp_path)
 
 
 @pytest.mark.parametrize("wrong", [{"frames": 0}, {"size_px": 1}, {"bands": 0}, {"seed": -1}])
@@ -96,7 +167,7 @@ def test_overrides_are_checked_as_well(wrong):
     ],
 )
 def test_markers_that_cannot_be_made_are_refused(old, new, sentence):
-    scene = parse_scene(GOOD.replace(old, new), source="scene.yaml", name="scene")
+    scene = parse(GOOD.replace(old, new))
     with pytest.raises(InputError, match=sentence):
         marker_layout(scene.markers, scene.container, scene.turntable)
 
