@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.processing.hull_silhouettes import hull_silhouettes
 
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
@@ -32,25 +30,21 @@ _MOST_NAMES = 8
 def check_masks(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
+    silhouettes: Bool[np.ndarray, "frames h w"],
     brightness: Float[np.ndarray, "frames h w"],
     regions: Bool[np.ndarray, "frames h w"] | None = None,
-    min_z_m: float | None = None,
 ) -> list[Finding]:
     """What speaks against the masks; nothing for good ones.
 
     Args:
         masks: true on the object.
         names: of the frames.
-        camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera; lens distortion is neglected.
+        silhouettes: of the masks' visual hull (`VotedHull`).
         brightness: mean reflectance.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
-        min_z_m: height of the container's lid; None if unknown.
 
     Example:
-        >>> refuse_red(check_masks(masks, names, poses, intrinsics, brightness), accepted=["masks-border"])
+        >>> refuse_red(check_masks(masks, names, hull.silhouettes, brightness), accepted=["masks-border"])
     """
     empty = np.logical_not(masks.any(axis=(1, 2)))
     found = []
@@ -71,7 +65,7 @@ def check_masks(
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),
         *_still(masks[~empty], brightness),
-        *_hull(masks, names, camera_to_worlds, intrinsics, min_z_m),
+        *_hull(masks, names, silhouettes),
     ]
 
 
@@ -136,13 +130,10 @@ def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "fram
 def _hull(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    min_z_m: float | None,
+    silhouettes: Bool[np.ndarray, "frames h w"],
 ) -> list[Finding]:
     """Masks that contradict the visual hull, which is found by vote."""
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
-    silhouettes = hull_silhouettes(masks, camera_to_worlds, intrinsics, min_z_m)
     union = (masks | silhouettes).sum(axis=(1, 2))
     contradiction = 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
     typical = float(np.median(contradiction[filled]))
