@@ -24,6 +24,8 @@ STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
+STANDING_FRACTION = 0.5
+"""Fraction of the middle of the lid that what stands on it hides."""
 _MOST_NAMES = 8
 
 
@@ -33,6 +35,7 @@ def check_masks(
     silhouettes: Bool[np.ndarray, "frames h w"],
     brightness: Float[np.ndarray, "frames h w"],
     regions: Bool[np.ndarray, "frames h w"] | None = None,
+    lid_middles: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> list[Finding]:
     """What speaks against the masks; nothing for good ones.
 
@@ -42,6 +45,7 @@ def check_masks(
         silhouettes: of the masks' visual hull (`VotedHull`).
         brightness: mean reflectance.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
+        lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
 
     Example:
         >>> refuse_red(check_masks(masks, names, hull.silhouettes, brightness), accepted=["masks-border"])
@@ -64,7 +68,7 @@ def check_masks(
     return [
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),
-        *_still(masks[~empty], brightness),
+        *_still(masks[~empty], brightness, None if lid_middles is None else lid_middles[~empty]),
         *_hull(masks, names, silhouettes),
     ]
 
@@ -102,8 +106,17 @@ def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"]
     return found
 
 
-def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "frames h w"]) -> list[Finding]:
-    """Masks that are the same in all frames and show the same at their edge: of what does not turn."""
+def _still(
+    masks: Bool[np.ndarray, "n h w"],
+    brightness: Float[np.ndarray, "frames h w"],
+    lid_middles: Bool[np.ndarray, "n h w"] | None,
+) -> list[Finding]:
+    """Masks that are the same in all frames and show the same at their edge: of what does not turn.
+
+    A body of revolution looks like that as well. It stands on the lid and hides its middle; a wall is behind the lid.
+    """
+    if lid_middles is not None and (masks & lid_middles).sum() > STANDING_FRACTION * lid_middles.sum():
+        return []
     common, all_of_them = masks.all(axis=0), masks.any(axis=0)
     overlap = common.sum() / all_of_them.sum()
     if len(masks) < 3 or overlap < STILL_OVERLAP:

@@ -42,7 +42,7 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
+from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
     container_under,
@@ -267,7 +267,7 @@ def _write_masks(
     Raises:
         InputError: a finding is red and not accepted.
     """
-    regions = None
+    regions = lid_middles = None
     if container is not None:
         distortion = np.array(poses.distortion, dtype=float)
         regions = np.stack(
@@ -276,13 +276,14 @@ def _write_masks(
                 for frame in frames
             ]
         )
+        lid_middles = np.stack([lid_middle(poses.intrinsics, frame.camera_to_world, container) for frame in frames])
     masks = foreground_masks([cache.bins for cache in caches], config, None if regions is None else list(regions))
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
     brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
     hull = voted_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
-    findings = check_masks(masks, names, hull.silhouettes, brightness, regions)
+    findings = check_masks(masks, names, hull.silhouettes, brightness, regions, lid_middles)
     if all(finding.level != "red" for finding in findings):
         masks = hull.trim(masks)
     for frame, mask in zip(frames, masks, strict=True):

@@ -9,7 +9,7 @@ from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import above_lid
+from hsi_sc_nerf.processing.masks import above_lid, lid_middle
 from hsi_sc_nerf.processing.voted_hull import voted_hull
 
 INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
@@ -43,9 +43,9 @@ def findings(masks, brightness=None, regions=None) -> dict[str, str]:
     return {finding.name: finding.level for finding in checked(masks, brightness, regions)}
 
 
-def checked(masks, brightness, regions=None):
+def checked(masks, brightness, regions=None, lid_middles=None):
     silhouettes = voted_hull(masks, POSES, INTRINSICS).silhouettes
-    return check_masks(masks, NAMES, silhouettes, brightness, regions)
+    return check_masks(masks, NAMES, silhouettes, brightness, regions, lid_middles)
 
 
 def test_good_masks_have_no_finding():
@@ -83,6 +83,16 @@ def test_masks_that_stand_still_show_the_wall():
     assert "masks-static" not in findings(still, seen(still))
     turning = good_masks()
     assert "masks-static" not in findings(turning, seen(turning, change=0.0))
+
+
+def test_a_body_of_revolution_stands_on_the_lid_and_a_wall_is_behind_it():
+    middles = np.stack([lid_middle(INTRINSICS, pose, CONTAINER) for pose in POSES])
+    on_the_lid = -SPHERE_CENTRE_M + [0.0, 0.0, CONTAINER.height_m + SPHERE_RADIUS_M]
+    body = np.broadcast_to(ball(POSES[0], offset_m=on_the_lid), (FRAMES, 64, 64))
+    of_wall = body & (np.arange(64) < np.nonzero(middles[0])[0].min())[:, None]
+    for masks, names in ((body, set()), (of_wall, {"masks-static"})):
+        found = checked(masks, seen(masks, change=0.0), lid_middles=middles)
+        assert {finding.name for finding in found} & {"masks-static"} == names
 
 
 def test_masks_that_contradict_each_other():
