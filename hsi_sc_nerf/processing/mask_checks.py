@@ -134,7 +134,7 @@ def _still(
             "red",
             "The masks and what they show at their edge stand still while the table turns, so they are "
             "probably the wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body "
-            "of revolution.",
+            "of revolution on no known container.",
             {"overlap": float(overlap), "still_fraction": still},
         )
     ]
