@@ -1,6 +1,7 @@
 """Foreground masks of simulated sessions with hard backgrounds and objects, against the truth, as a table.
 
     uv run python benchmarks/mask_cases.py
+    uv run python benchmarks/mask_cases.py --size-px 96 --scenes pear maize
 
 A mask is wrong where its intersection over union (IoU) with the true object pixels is below 0.95; then the session
 must be refused.
@@ -98,6 +99,7 @@ SCENES: dict[str, Scene] = {
     "apple in uneven light": _scene("apple", *SHADE),
     "maize": _scene("maize", *NOISE),
     "pear, textured wall": _scene("pear", *WALL),
+    "pear in uneven light, textured wall": _scene("pear", "textured_background", *SHADE),
     "apple in uneven light, textured wall": _scene("apple", "textured_background", *SHADE),
     "maize, textured wall": _scene("maize", *WALL),
     "pear, patterned wall": _on(PatternedWall(), _scene("pear", *NOISE)),
@@ -114,7 +116,7 @@ SCENES: dict[str, Scene] = {
 }
 MIXED = "pear, two frames of another pear"
 SWAPPED = (5, 12)
-COLUMNS = ["session", "IoU, lowest", "IoU, median", "refused because of"]
+COLUMNS = ["session", "size, px", "IoU, lowest", "IoU, median", "refused because of"]
 
 
 @dataclass(frozen=True)
@@ -123,25 +125,29 @@ class MaskCases:
 
     scenes: tuple[str, ...] = (*SCENES, MIXED)
     """Sessions to measure; rows of the others are kept."""
+    size_px: int = 128
+    """Width and height of the frames, pixels."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure, print the table, write it."""
-        rows = []
+        """Measure, print and write row by row."""
         with tempfile.TemporaryDirectory(prefix="mask-cases-") as folder:
             for number, name in enumerate(track(self.scenes, "masks")):
-                session = Path(folder) / f"session_{number}"
-                simulate_session(SCENES["pear" if name == MIXED else name], session, progress=False)
+                session, data = Path(folder) / f"session_{number}", Path(folder) / f"data_{number}"
+                scene = override(SCENES["pear" if name == MIXED else name], size_px=self.size_px)
+                simulate_session(scene, session, progress=False)
                 if name == MIXED:
-                    _swap_frames(session, Path(folder) / "other")
-                rows.append([name, *_cells(session, Path(folder) / f"data_{number}", name == MIXED)])
-        write_results("mask_cases", COLUMNS, rows, keys=1, folder=self.results)
+                    _swap_frames(session, Path(folder) / "other", self.size_px)
+                row = [name, str(self.size_px), *_cells(session, data, name == MIXED)]
+                write_results("mask_cases", COLUMNS, [row], keys=2, folder=self.results)
+                shutil.rmtree(session)
+                shutil.rmtree(data, ignore_errors=True)
 
 
-def _swap_frames(session: Path, other: Path) -> None:
+def _swap_frames(session: Path, other: Path, size_px: int) -> None:
     """Replace two captures by those of another pear at the same angles."""
-    simulate_session(override(SCENES["pear"], seed=2), other, progress=False)
+    simulate_session(override(SCENES["pear"], seed=2, size_px=size_px), other, progress=False)
     for number in SWAPPED:
         name = f"pear_{number:03d}"
         shutil.rmtree(session / name)

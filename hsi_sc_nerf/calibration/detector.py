@@ -31,6 +31,8 @@ BELOW_TOP = 10
 """Readings pile up at the largest count if it has more of them than this many counts below it together."""
 MIN_TOP_PAIRS = 20
 """Fewest readings, and fewest pairs of neighbours, that can be a pile at the largest count."""
+SAME_PATTERN = 1.5
+"""Variance of the frames' dark patterns, relative to that of noise, up to which they are the same."""
 BRIGHT = 0.5
 """Fraction of the largest count above which readings are bright."""
 
@@ -155,6 +157,32 @@ def dark_columns(
         return np.zeros((1, bands))
     columns = dark.mean(axis=0, dtype=np.float64)
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
+
+
+def pooled_darks(
+    darks: Sequence[Float[np.ndarray, "columns bands"]], readings: int, read_noise: Float[np.ndarray, "bands"]
+) -> list[Float[np.ndarray, "columns bands"]]:
+    """The frames' dark counts with the pattern of the columns that all frames share, and each frame's own level.
+
+    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame. The frames' darks are
+    kept as they are if their patterns differ by more than noise.
+
+    Args:
+        darks: `dark_columns` of each frame.
+        readings: lines of each dark cube.
+        read_noise: standard deviation of one reading.
+    """
+    if len(darks) < 2 or len({dark.shape for dark in darks}) > 1 or len(darks[0]) < 2:
+        return list(darks)
+    stacked = np.stack(darks)
+    level = stacked.mean(axis=1, keepdims=True)
+    pattern = (stacked - level).mean(axis=0)
+    free = (1.0 - 1.0 / stacked.shape[0]) * (1.0 - 1.0 / stacked.shape[1])
+    expected = free * read_noise**2 / readings
+    variance = np.median(np.square(stacked - level - pattern).mean(axis=0), axis=0)
+    if np.median(variance / np.maximum(expected, 1e-12)) > SAME_PATTERN:
+        return list(darks)
+    return list(level + pattern)
 
 
 def no_data(counts: Num[np.ndarray, "*shape"], ignore_value: float | None) -> Bool[np.ndarray, "*shape"] | None:

@@ -3,7 +3,8 @@
 Some lines of each frame are read, and the pixels that follow one common course over the frames are static
 (`static_pixels`). The common grey level is a robust mean over them, in which their scatter averages out. The change
 of each band comes from the sum of their spectra, each divided by its own deviation from the grey level, in which a
-scatter that is common to all bands cancels. A low-order polynomial over 1 / wavelength removes the bands' noise.
+scatter that is common to all bands cancels. A smooth curve over 1 / wavelength, which all frames share, removes the
+bands' noise (`drift_curves`).
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ from jaxtyping import Bool, Float, Int, Num
 from scipy import stats
 
 from hsi_sc_nerf.calibration.detector import no_data
+from hsi_sc_nerf.calibration.drift_curves import common_courses, smoothing_basis
 from hsi_sc_nerf.calibration.noise import NoiseModel
 from hsi_sc_nerf.calibration.static_pixels import MIN_FRACTION, Courses, grey_deviation, static_pixels
 
 CorrectDrift = Literal["auto", "always", "never"]
 ReadLines = Callable[[int], Num[np.ndarray, "survey samples bands"]]
 
-SURVEY_FRACTION, SURVEY_PIXELS = 0.06, 8192
-"""Fraction of each frame's lines that is surveyed, and fewest pixels: a scatter of 5 % averages to 0.1 %."""
+SURVEY_FRACTION, SURVEY_PIXELS = 0.06, 16384
+"""Fraction of each frame's lines that is surveyed, and fewest pixels: over half of them a scatter of 5 % averages to
+0.06 %."""
 MIN_LINES = 8
 """Fewest lines of a survey."""
 BINS = 12
@@ -32,10 +35,8 @@ BINS = 12
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a band in the curve's fit."""
 DEGREE, MIN_BANDS = 5, 3
-"""Largest degree of the curve over 1 / wavelength, and fewest bands: a change of output and of colour temperature is
-linear in it, but lamps may lose more in the blue alone."""
-RANK_MARGIN = 1.5
-"""Singular values of the drift count from this many times the largest of pure noise."""
+"""Largest degree of the polynomial over 1 / wavelength that tells whether there is a drift, and fewest bands: a
+change of output and of colour temperature is linear in it, but lamps may lose more in the blue alone."""
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
@@ -120,20 +121,16 @@ def measure_lamp_drift(
     lit = (total > MIN_SIGNAL * np.sqrt(variance)).all(axis=0)
     if lit.sum() < MIN_BANDS:
         return NotMeasurable("what stands still in the image is too dark")
-    basis = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
     measured = np.full(total.shape, np.nan)
     measured[:, lit] = total[:, lit] / total[0, lit]
-    coefficients, covariance = fit_over_wavelength(
-        np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0), basis[lit]
-    )
-    # The first term is constant over the bands, as the grey level's error is.
-    covariance[0, 0] += grey_error**2
-    smooth, variance = common_courses(coefficients, covariance, basis)
-    factor = np.exp(smooth - smooth[0])
+    log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)
+    curve, variance_of_curve = _common_curves(log_light, variance, grey_error, wavelengths_nm, lit)
+    factor = np.exp(curve - curve[0])
     # The first frame's error is part of all the others.
-    standard_error = SHARED_ERROR * factor * np.sqrt(variance + variance[0])
+    standard_error = SHARED_ERROR * factor * np.sqrt(variance_of_curve + variance_of_curve[0])
     standard_error[0] = 0.0
-    p_value = drift_p_value(coefficients, covariance)
+    polynomials = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
+    p_value = drift_p_value(*_fit_with_grey_error(log_light, variance, polynomials[lit], grey_error))
     return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
 
 
@@ -191,28 +188,6 @@ def fit_over_wavelength(
     return coefficients, covariance * max(1.0, scatter)
 
 
-def common_courses(
-    coefficients: Float[np.ndarray, "frames terms"],
-    covariance: Float[np.ndarray, "terms terms"],
-    basis: Float[np.ndarray, "bands terms"],
-) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The curves of all frames as few courses over the session, each with one spectrum; and their variance.
-
-    Lamps drift with one course or two, so that the frames tell the spectrum of the drift together. The courses are
-    the singular vectors of the coefficients, in units of their errors, that exceed noise, at least the first. The
-    variance is to first order that of a truncated singular value decomposition.
-    """
-    root = np.linalg.cholesky(covariance)
-    left, singular, right = np.linalg.svd(np.linalg.solve(root, coefficients.T).T, full_matrices=False)
-    of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
-    rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
-    curves = ((left[:, :rank] * singular[:rank]) @ right[:rank]) @ root.T @ basis.T
-    of_band = basis @ root
-    leverage = np.square(left[:, :rank]).sum(axis=1)[:, None]
-    within = np.square(of_band @ right[:rank].T).sum(axis=1)
-    return curves, leverage * np.square(of_band).sum(axis=1) + (1.0 - leverage) * within
-
-
 def drift_p_value(
     coefficients: Float[np.ndarray, "frames terms"],
     covariance: Float[np.ndarray, "terms terms"],
@@ -227,6 +202,33 @@ def drift_p_value(
     expected = covariance + floor**2 / terms * np.eye(terms)
     distance = np.einsum("fi,ij,fj->", coefficients, np.linalg.inv(expected), coefficients)
     return float(stats.chi2.sf(distance, (frames - 1) * terms))
+
+
+def _common_curves(
+    log_light: Float[np.ndarray, "frames lit"],
+    variance: Float[np.ndarray, "lit"],
+    grey_error: float,
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    lit: Bool[np.ndarray, "bands"],
+) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
+    """The frames' deviations from their mean as smooth curves over all bands, and the curves' variance."""
+    precision = np.zeros(len(wavelengths_nm))
+    precision[lit] = 1.0 / variance
+    basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)
+    fitted = _fit_with_grey_error(log_light, variance, basis[lit], grey_error)
+    return common_courses(*fitted, basis, roughness)
+
+
+def _fit_with_grey_error(
+    log_light: Float[np.ndarray, "frames lit"],
+    variance: Float[np.ndarray, "lit"],
+    basis: Float[np.ndarray, "lit terms"],
+    grey_error: float,
+) -> tuple[Float[np.ndarray, "frames terms"], Float[np.ndarray, "terms terms"]]:
+    """`fit_over_wavelength`, with the grey level's error, which all bands share, in the covariance."""
+    coefficients, covariance = fit_over_wavelength(log_light, variance, basis)
+    constant = np.linalg.lstsq(basis, np.ones(len(basis)), rcond=None)[0]
+    return coefficients, covariance + grey_error**2 * np.outer(constant, constant)
 
 
 def _bins(wavelengths_nm: Float[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands bins"]:

@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.detector import Defects, Readings, dark_columns, fill_no_data, find_defects, no_data
+from hsi_sc_nerf.calibration.detector import (
+    Defects,
+    Readings,
+    dark_columns,
+    fill_no_data,
+    find_defects,
+    no_data,
+    pooled_darks,
+)
 from hsi_sc_nerf.calibration.flat_field import flat_field
 from hsi_sc_nerf.calibration.lamp_drift import (
     CorrectDrift,
@@ -199,6 +207,9 @@ def _drift(
 ) -> LampDriftEstimate | NotMeasurable:
     """The lamps' drift, from counts at the first frame's integration time."""
     captures = session.frames
+    lines = {0 if capture.dark is None else capture.dark.shape[0] for capture in captures}
+    if len(lines) == 1 and 0 not in lines:
+        darks = pooled_darks(darks, *lines, noise.read_noise)
     survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-MIN_PIXELS, MIN_FRACTION, MIN_SCATTERING_FRACTION = 64, 0.05, 0.1
+MIN_PIXELS, MIN_FRACTION, MIN_SCATTERING_FRACTION = 64, 0.05, 0.15
 """Fewest static pixels, and their least fraction of all, without and with scatter: it leaves more room for chance."""
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a pixel's bin, so that its logarithm is normal."""

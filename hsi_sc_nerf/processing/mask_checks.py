@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.processing.hull_silhouettes import hull_silhouettes
 
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
@@ -26,31 +24,31 @@ STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
+STANDING_FRACTION = 0.5
+"""Fraction of the middle of the lid that what stands on it hides."""
 _MOST_NAMES = 8
 
 
 def check_masks(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
+    silhouettes: Bool[np.ndarray, "frames h w"],
     brightness: Float[np.ndarray, "frames h w"],
     regions: Bool[np.ndarray, "frames h w"] | None = None,
-    min_z_m: float | None = None,
+    lid_middles: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> list[Finding]:
     """What speaks against the masks; nothing for good ones.
 
     Args:
         masks: true on the object.
         names: of the frames.
-        camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera; lens distortion is neglected.
+        silhouettes: of the masks' visual hull (`VotedHull`).
         brightness: mean reflectance.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
-        min_z_m: height of the container's lid; None if unknown.
+        lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
 
     Example:
-        >>> refuse_red(check_masks(masks, names, poses, intrinsics, brightness), accepted=["masks-border"])
+        >>> refuse_red(check_masks(masks, names, hull.silhouettes, brightness), accepted=["masks-border"])
     """
     empty = np.logical_not(masks.any(axis=(1, 2)))
     found = []
@@ -70,8 +68,8 @@ def check_masks(
     return [
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),
-        *_still(masks[~empty], brightness),
-        *_hull(masks, names, camera_to_worlds, intrinsics, min_z_m),
+        *_still(masks[~empty], brightness, None if lid_middles is None else lid_middles[~empty]),
+        *_hull(masks, names, silhouettes),
     ]
 
 
@@ -108,8 +106,17 @@ def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"]
     return found
 
 
-def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "frames h w"]) -> list[Finding]:
-    """Masks that are the same in all frames and show the same at their edge: of what does not turn."""
+def _still(
+    masks: Bool[np.ndarray, "n h w"],
+    brightness: Float[np.ndarray, "frames h w"],
+    lid_middles: Bool[np.ndarray, "n h w"] | None,
+) -> list[Finding]:
+    """Masks that are the same in all frames and show the same at their edge: of what does not turn.
+
+    A body of revolution looks like that as well. It stands on the lid and hides its middle; a wall is behind the lid.
+    """
+    if lid_middles is not None and (masks & lid_middles).sum() > STANDING_FRACTION * lid_middles.sum():
+        return []
     common, all_of_them = masks.all(axis=0), masks.any(axis=0)
     overlap = common.sum() / all_of_them.sum()
     if len(masks) < 3 or overlap < STILL_OVERLAP:
@@ -127,7 +134,7 @@ def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "fram
             "red",
             "The masks and what they show at their edge stand still while the table turns, so they are "
             "probably the wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body "
-            "of revolution.",
+            "of revolution on no known container.",
             {"overlap": float(overlap), "still_fraction": still},
         )
     ]
@@ -136,13 +143,10 @@ def _still(masks: Bool[np.ndarray, "n h w"], brightness: Float[np.ndarray, "fram
 def _hull(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    min_z_m: float | None,
+    silhouettes: Bool[np.ndarray, "frames h w"],
 ) -> list[Finding]:
     """Masks that contradict the visual hull, which is found by vote."""
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
-    silhouettes = hull_silhouettes(masks, camera_to_worlds, intrinsics, min_z_m)
     union = (masks | silhouettes).sum(axis=(1, 2))
     contradiction = 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
     typical = float(np.median(contradiction[filled]))

@@ -1,8 +1,8 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
 Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
-excluded by geometry. Dark parts next to the object are compared by score relative to brightness, for the score falls
-with the light.
+excluded by geometry. The edge, where the score falls with the light and pixels are mixed, is decided locally
+(`mask_edges`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays, project
 from hsi_sc_nerf.morphology import (
     dilate,
     draw_outline,
@@ -28,17 +28,16 @@ from hsi_sc_nerf.morphology import (
 )
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
+from hsi_sc_nerf.processing.mask_edges import at_half_coverage, shaded_parts
 
 MIN_CONTRAST = 0.005
 """Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
 MIN_SEPARATION = 6.0
 """Smallest such difference as a multiple of the background's scatter; noise alone has 3 to 5."""
+LID_MIDDLE = 0.3
+"""Radius of the middle of the container's lid, of the lid's."""
 CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
-# Fractions of the object's median brightness. Before a darker background noise and pixels that are partly background
-# have a high relative score; so does noise in darker pixels.
-_MIN_BACKGROUND_BRIGHTNESS = 0.9
-_MIN_BRIGHTNESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,9 @@ class MaskConfig:
     spectrum) from which a pixel is the object's. Otsu's threshold over all frames if not given."""
     weak_fraction: float = 0.5
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
-    shaded_fraction: float | None = 0.4
+    shaded_fraction: float | None = 0.5
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
-    than this fraction of the object's; None for none. Not applied before a dark background."""
+    than this fraction of the object's; None for none. Not applied next to what is darker still."""
     overhang: float = 1.2
     """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
 
@@ -85,11 +84,12 @@ def foreground_masks(
     for index, score in enumerate(scores):
         region = np.ones(score.shape, bool) if regions is None else regions[index]
         mask = foreground_mask(score, threshold, region=region, weak_fraction=weak_fraction)
+        brightness = bins[index].mean(axis=0, dtype=np.float32)
+        may_grow = region & (score > lowest)
         if config.shaded_fraction is not None:
-            brightness = bins[index].mean(axis=0, dtype=np.float32)
-            shaded = shaded_parts(mask, score, brightness, region=region, fraction=config.shaded_fraction)
-            mask = fill_holes(mask | (shaded & (score > lowest)))
-        masks.append(mask)
+            shaded = shaded_parts(mask, score, brightness, region=may_grow, fraction=config.shaded_fraction)
+            mask = fill_holes(mask | shaded)
+        masks.append(at_half_coverage(mask, score, brightness, may_grow))
     return np.stack(masks)
 
 
@@ -145,42 +145,6 @@ def foreground_mask(
     return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
 
 
-def shaded_parts(
-    body: Bool[np.ndarray, "h w"],
-    score: Float[np.ndarray, "h w"],
-    brightness: Float[np.ndarray, "h w"],
-    *,
-    region: Bool[np.ndarray, "h w"] | None = None,
-    fraction: float = 0.4,
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels next to ``body`` that belong to it but get less light than most of it.
-
-    Illumination scales score and brightness alike, so their ratio is the material's. The ratio of a mixed pixel falls
-    faster than its fraction of object: 0.4 of the object's ratio takes about 60 % object before a white background.
-
-    Args:
-        body: the object's mask so far.
-        score: of one frame.
-        brightness: of one frame.
-        region: pixels that may be the object's; all if not given.
-        fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
-
-    Returns:
-        The pixels to add. None where the background is darker than the body.
-    """
-    empty = np.zeros_like(body)
-    if not body.any() or body.all():
-        return empty
-    typical = float(np.median(brightness[body]))
-    if np.median(brightness[~body]) < _MIN_BACKGROUND_BRIGHTNESS * typical:
-        return empty
-    relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
-    shaded = (relative > fraction * np.median(relative[body])) & (brightness < typical) & ~body
-    if region is not None:
-        shaded &= region
-    return touching(shaded, dilate(body, 3), min_area_px=1)
-
-
 def above_lid(
     intrinsics: PinholeIntrinsics,
     distortion: Float[np.ndarray, "4"],
@@ -207,6 +171,24 @@ def above_lid(
     above, above_end = _cylinder_interval(origin, directions, overhang * radius, height, np.inf)
     solid, solid_end = _cylinder_interval(origin, directions, radius, 0.0, height)
     return (above < above_end) & ~((solid < solid_end) & (solid <= above))
+
+
+def lid_middle(
+    intrinsics: PinholeIntrinsics, camera_to_world: Float[np.ndarray, "4 4"], container: Container
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that see the middle of the empty lid, `LID_MIDDLE` of its radius; lens distortion is neglected.
+
+    What stands on the axis hides them, and no wall is seen there.
+    """
+    ticks = np.linspace(-1.0, 1.0, 41) * LID_MIDDLE * container.diameter_m / 2.0
+    x, y = (coordinate.ravel() for coordinate in np.meshgrid(ticks, ticks))
+    points = np.stack([x, y, np.full_like(x, container.height_m)], axis=-1)[np.hypot(x, y) <= ticks[-1]]
+    pixels, depth = project(points, camera_to_world, intrinsics)
+    inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
+    column, row = pixels[inside].astype(int).T
+    seen = np.zeros((intrinsics.h, intrinsics.w), bool)
+    seen[row, column] = True
+    return seen
 
 
 def mask_picture(

@@ -22,10 +22,9 @@ from hsi_sc_nerf.calibration.report import (
     write_calibration,
 )
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
-from hsi_sc_nerf.capture.session import Session, in_short, open_session
+from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session, suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
@@ -41,9 +40,8 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
-from hsi_sc_nerf.processing.hull_silhouettes import trim_to_hull
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, mask_picture
+from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
     PoseFunction,
     container_under,
@@ -54,6 +52,7 @@ from hsi_sc_nerf.processing.posed_frames import (
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.processing.session_checks import SessionChecks
+from hsi_sc_nerf.processing.voted_hull import VotedHull, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
 
 
@@ -134,10 +133,12 @@ def process_session(
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    inspection = _checked(session, config, console)
+    inspection = _inspect(session, config, console)
     session = inspection.session
+    # Damaged captures are refused as the session is opened, unless the user leaves them out.
+    checks = SessionChecks(inspection, ("damaged", *config.accept), output_dir)
     _remove_transforms(output_dir)
-    checks = SessionChecks(inspection, config.accept, output_dir)
+    checks.write()
 
     calibration = _calibrate(session, config, output_dir, console)
     checks.add(check_calibration(session, calibration))
@@ -168,8 +169,8 @@ def process_session(
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
-    masks = _write_masks(caches, frames, poses, container, config.masks, output_dir, console, checks)
-    object_box_m, scene_box_m = _boxes(session, frames, masks, poses, container, console)
+    masks, hull = _write_masks(caches, frames, poses, container, config.masks, output_dir, console, checks)
+    object_box_m, scene_box_m = _boxes(session, hull, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
         typical = calibration.uncertainty.standard_deviation(object_spectrum(frames, masks))
@@ -202,24 +203,14 @@ def process_session(
     return output_dir
 
 
-def _checked(session: Session, config: ProcessConfig, console: Console) -> Inspection:
-    """The checks of `inspect_session`, with the session upright.
-
-    Raises:
-        InputError: a finding is red and not accepted.
-    """
-    if session.damaged:
-        console.print(f"Left out: {in_short(session.damaged)}.", highlight=False)
+def _inspect(session: Session, config: ProcessConfig, console: Console) -> Inspection:
+    """The findings of `inspect_session`, with the session upright; print a ``session.json`` where one is missing."""
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
         inspection = inspect_session(session, config.poses, scale_known, config.calibration.white_source)
-    findings = [finding for finding in inspection.findings if finding.name != "damaged"]
-    for finding in findings:
-        if finding.level == "amber" or finding.name in config.accept:
-            console.print(f"Warning ({finding.name}): {finding.sentence}", highlight=False)
-        if finding.name == "scale" and finding.level == "red" and not session.info_path.is_file():
-            console.print(suggestion(session, inspection.session_json), highlight=False)
-    refuse_red(findings, config.accept)
+    no_scale = any(finding.name == "scale" and finding.level == "red" for finding in inspection.findings)
+    if no_scale and not session.info_path.is_file():
+        console.print(suggestion(session, inspection.session_json), highlight=False)
     return inspection
 
 
@@ -269,13 +260,13 @@ def _write_masks(
     output_dir: Path,
     console: Console,
     checks: SessionChecks,
-) -> Bool[np.ndarray, "frames h w"]:
-    """Find, write, draw and check the foreground masks of the posed frames.
+) -> tuple[Bool[np.ndarray, "frames h w"], VotedHull]:
+    """Find, write, draw and check the foreground masks of the posed frames; the masks and their visual hull.
 
     Raises:
         InputError: a finding is red and not accepted.
     """
-    regions = None
+    regions = lid_middles = None
     if container is not None:
         distortion = np.array(poses.distortion, dtype=float)
         regions = np.stack(
@@ -284,35 +275,34 @@ def _write_masks(
                 for frame in frames
             ]
         )
+        lid_middles = np.stack([lid_middle(poses.intrinsics, frame.camera_to_world, container) for frame in frames])
     masks = foreground_masks([cache.bins for cache in caches], config, None if regions is None else list(regions))
     camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
     brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
-    findings = check_masks(masks, names, camera_to_worlds, poses.intrinsics, brightness, regions, lid_z_m)
+    hull = voted_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
+    findings = check_masks(masks, names, hull.silhouettes, brightness, regions, lid_middles)
     if all(finding.level != "red" for finding in findings):
-        masks = trim_to_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
+        masks = hull.trim(masks)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
     images = [frame.pseudo_rgb() for frame in frames]
     mask_picture(output_dir / "report" / "masks.png", images, list(masks), names)
     console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
     checks.add(findings)
-    return masks
+    return masks, hull
 
 
 def _boxes(
     session: Session,
-    frames: Sequence[PackedFrame],
-    masks: Bool[np.ndarray, "frames h w"],
+    hull: VotedHull,
     poses: TurntablePoses,
     container: Container | None,
     console: Console,
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
     """The boxes of the object and of everything that turns; print what they rest on."""
-    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
-    min_z_m = None if container is None else container.height_m
-    object_box_m = object_box(masks, camera_to_worlds, poses.intrinsics, min_z_m=min_z_m)
+    object_box_m = object_box(hull, None if container is None else container.height_m)
     size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
     console.print(f"Object: inside a box of {size_mm} mm.")
     diameter_m = session.info.container_diameter_m if poses.metric else None

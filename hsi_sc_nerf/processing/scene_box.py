@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import Container
-from hsi_sc_nerf.processing.hull_silhouettes import hull_voxels
+from hsi_sc_nerf.processing.voted_hull import VotedHull
 
 OBJECT_MARGIN_M = 0.003
 """The object's box is widened by this: masks and poses are uncertain by a pixel or two."""
@@ -21,18 +20,11 @@ DISC_OVER_CONTAINER = 2.3
 container of 90 mm."""
 
 
-def object_box(
-    masks: Bool[np.ndarray, "frames h w"],
-    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
-    intrinsics: PinholeIntrinsics,
-    min_z_m: float | None = None,
-) -> Float[np.ndarray, "2 3"]:
-    """Minimum and maximum of the masks' visual hull, object frame, metres.
+def object_box(hull: VotedHull, min_z_m: float | None = None) -> Float[np.ndarray, "2 3"]:
+    """Minimum and maximum of the core of the masks' visual hull, object frame, metres.
 
     Args:
-        masks: true on the object.
-        camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera; lens distortion is neglected.
+        hull: of the masks.
         min_z_m: height of the container's lid, below which the box does not reach; None if unknown.
 
     Raises:
@@ -41,15 +33,14 @@ def object_box(
     Example:
         >>> dataset = open_packed("apple_01-data")
         >>> masks = np.stack([frame.mask() for frame in dataset.frames])
-        >>> low_m, high_m = object_box(masks, dataset.camera_to_worlds, dataset.intrinsics)
+        >>> low_m, high_m = object_box(voted_hull(masks, dataset.camera_to_worlds, dataset.intrinsics))
     """
-    hull, step, _ = hull_voxels(masks, camera_to_worlds, intrinsics, min_z_m)
-    if len(hull) == 0:
+    if len(hull.core) == 0:
         raise InputError(
             "the foreground masks and the poses do not fit each other, so that no object is left in space; look "
             "at report/masks.png and report/poses.png."
         )
-    low, high = hull.min(axis=0) - step / 2.0, hull.max(axis=0) + step / 2.0
+    low, high = hull.core.min(axis=0) - hull.sides_m / 2.0, hull.core.max(axis=0) + hull.sides_m / 2.0
     box = np.stack([low - OBJECT_MARGIN_M, high + OBJECT_MARGIN_M])
     if min_z_m is not None:
         box[0, 2] = max(box[0, 2], min_z_m)

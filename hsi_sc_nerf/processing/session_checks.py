@@ -24,6 +24,9 @@ class SessionChecks:
         accepted: names of checks whose red findings the user accepts.
         output_dir: the dataset.
 
+    Raises:
+        InputError: a finding of the inspection is red and not accepted; nothing is written then.
+
     Example:
         >>> checks = SessionChecks(inspect_session(session), ["masks-static"], Path("apple_01-data"))
         >>> checks.add(check_calibration(session, calibration))
@@ -34,7 +37,8 @@ class SessionChecks:
         self._findings = list(inspection.findings)
         self._accepted = accepted
         self._path = output_dir / CHECKS_PATH
-        self._write()
+        self._warn(inspection.findings)
+        refuse_red(inspection.findings, accepted)
 
     def add(self, findings: Sequence[Finding]) -> None:
         """Warn of what is amber or accepted, keep all, and stop at what is red.
@@ -42,13 +46,23 @@ class SessionChecks:
         Raises:
             InputError: a finding is red and not accepted, or the file cannot be written.
         """
-        for finding in findings:
-            if finding.level == "amber" or (finding.level == "red" and finding.name in self._accepted):
-                _log.warning("Warning (%s): %s", finding.name, finding.sentence)
+        self._warn(findings)
         self._findings += findings
-        self._write()
+        self.write()
         refuse_red(findings, self._accepted)
 
-    def _write(self) -> None:
+    def _warn(self, findings: Sequence[Finding]) -> None:
+        for finding in findings:
+            if finding.level == "amber":
+                _log.warning("Warning (%s): %s", finding.name, finding.sentence)
+            elif finding.level == "red" and finding.name in self._accepted:
+                _log.warning("Accepted (%s): %s", finding.name, finding.sentence)
+
+    def write(self) -> None:
+        """Write all findings so far.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
         self._path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self._path, {**self._report, "findings": [finding.as_json() for finding in self._findings]})

@@ -11,7 +11,6 @@ from scipy import stats
 from hsi_sc_nerf.calibration.lamp_drift import (
     LampDriftEstimate,
     NotMeasurable,
-    common_courses,
     correction,
     drift_p_value,
     fit_over_wavelength,
@@ -87,7 +86,7 @@ def test_session_without_drift_stays_as_it_is(effects):
     drift, _, _ = simulated(*effects)
     assert isinstance(drift, LampDriftEstimate)
     assert not drift.significant
-    assert np.abs(drift.factor - 1.0).max() < 0.006
+    assert np.abs(drift.factor - 1.0).max() < 0.004
     assert correction(drift, "auto") is None
 
 
@@ -295,22 +294,6 @@ def test_basis_and_fit():
     np.testing.assert_allclose(np.var(change, axis=0), 2.0 * np.diag(covariance), rtol=0.2)
 
 
-def test_frames_tell_the_spectrum_of_the_drift_together():
-    """The variance is right, and far smaller than that of each frame by itself."""
-    rng, frames = np.random.default_rng(6), 20
-    basis = smooth_basis(WAVELENGTHS_NM, np.ones(BANDS, bool), 3)
-    covariance = np.diag([1.0, 2.0, 4.0, 8.0]) * 1e-6
-    true = np.outer(np.linspace(-1.0, 1.0, frames), [0.05, -0.02, 0.01, 0.005])
-    scores, squares = [], []
-    for _ in range(200):
-        noisy = true + np.sqrt(np.diag(covariance)) * rng.standard_normal(true.shape)
-        curves, variance = common_courses(noisy, covariance, basis)
-        scores.append(np.square(curves - true @ basis.T) / variance)
-        squares.append(np.square(curves - true @ basis.T) / np.square((noisy - true) @ basis.T).mean())
-    assert np.mean(scores) == pytest.approx(1.0, rel=0.1)
-    assert np.mean(squares) < 0.4
-
-
 def test_scatter_beyond_the_noise_makes_the_errors_larger():
     variance, basis = np.full(BANDS, 1e-6), smooth_basis(WAVELENGTHS_NM, np.ones(BANDS, bool), 2)
     scatter = 3e-3 * np.random.default_rng(7).standard_normal((20, BANDS))
@@ -320,7 +303,7 @@ def test_scatter_beyond_the_noise_makes_the_errors_larger():
 
 @pytest.mark.parametrize(
     ("lines", "samples", "count"),
-    [(512, 512, 31), (512, 64, 128), (1000, 512, 60), (128, 128, 64), (10, 512, 10), (2, 9, 2), (1, 1, 1)],
+    [(512, 512, 32), (512, 64, 256), (1000, 512, 60), (128, 128, 128), (10, 512, 10), (2, 9, 2), (1, 1, 1)],
 )
 def test_survey_lines(lines, samples, count):
     chosen = survey_lines(lines, samples)

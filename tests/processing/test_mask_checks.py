@@ -9,7 +9,8 @@ from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import above_lid
+from hsi_sc_nerf.processing.masks import above_lid, lid_middle
+from hsi_sc_nerf.processing.voted_hull import voted_hull
 
 INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
@@ -39,8 +40,12 @@ def seen(masks, change=0.05) -> np.ndarray:
 
 def findings(masks, brightness=None, regions=None) -> dict[str, str]:
     brightness = seen(masks) if brightness is None else brightness
-    found = check_masks(masks, NAMES, POSES, INTRINSICS, brightness, regions, None)
-    return {finding.name: finding.level for finding in found}
+    return {finding.name: finding.level for finding in checked(masks, brightness, regions)}
+
+
+def checked(masks, brightness, regions=None, lid_middles=None):
+    silhouettes = voted_hull(masks, POSES, INTRINSICS).silhouettes
+    return check_masks(masks, NAMES, silhouettes, brightness, regions, lid_middles)
 
 
 def test_good_masks_have_no_finding():
@@ -53,7 +58,7 @@ def test_good_masks_have_no_finding():
 def test_empty_masks_are_named(number, level):
     masks = good_masks()
     masks[:number] = False
-    (finding,) = [f for f in check_masks(masks, NAMES, POSES, INTRINSICS, seen(masks)) if f.name == "masks-empty"]
+    (finding,) = [f for f in checked(masks, seen(masks)) if f.name == "masks-empty"]
     assert (finding.level, finding.values["frames"]) == (level, NAMES[:number])
 
 
@@ -80,6 +85,16 @@ def test_masks_that_stand_still_show_the_wall():
     assert "masks-static" not in findings(turning, seen(turning, change=0.0))
 
 
+def test_a_body_of_revolution_stands_on_the_lid_and_a_wall_is_behind_it():
+    middles = np.stack([lid_middle(INTRINSICS, pose, CONTAINER) for pose in POSES])
+    on_the_lid = -SPHERE_CENTRE_M + [0.0, 0.0, CONTAINER.height_m + SPHERE_RADIUS_M]
+    body = np.broadcast_to(ball(POSES[0], offset_m=on_the_lid), (FRAMES, 64, 64))
+    of_wall = body & (np.arange(64) < np.nonzero(middles[0])[0].min())[:, None]
+    for masks, names in ((body, set()), (of_wall, {"masks-static"})):
+        found = checked(masks, seen(masks, change=0.0), lid_middles=middles)
+        assert {finding.name for finding in found} & {"masks-static"} == names
+
+
 def test_masks_that_contradict_each_other():
     masks = good_masks()
     patch = np.zeros((64, 64), bool)
@@ -91,6 +106,6 @@ def test_masks_that_contradict_each_other():
 def test_a_frame_of_another_object_is_named(other):
     masks = good_masks()
     masks[5] = ball(POSES[5], **other)
-    (finding,) = check_masks(masks, NAMES, POSES, INTRINSICS, seen(masks))
+    (finding,) = checked(masks, seen(masks))
     assert (finding.name, finding.level, list(finding.values["frames"])) == ("frames-hull", "red", ["ball_5"])
     assert "--exclude ball_5" in finding.sentence

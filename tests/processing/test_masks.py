@@ -9,10 +9,9 @@ from capture_factory import (
     sphere_mask,
     true_pose,
 )
-from scipy import ndimage
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, project
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
 from hsi_sc_nerf.processing.masks import (
@@ -20,9 +19,9 @@ from hsi_sc_nerf.processing.masks import (
     above_lid,
     foreground_mask,
     foreground_masks,
+    lid_middle,
     mask_picture,
     select_threshold,
-    shaded_parts,
 )
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -59,42 +58,6 @@ def test_mask_is_one_whole_region_with_its_stem():
     region[40:] = False
     assert not foreground_mask(score, 0.2, region=region)[40:].any()
     assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
-
-
-def shaded_ball(background: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bins of a red ball whose lower half gets ever less light, on a gray background; where it is and its light."""
-    y, x = np.mgrid[:60, :60]
-    ball = np.hypot(x - 30, y - 30) < 20
-    light = np.where(y > 30, np.clip(1.0 - (y - 30) / 22.0, 0.0, 1.0), 1.0)
-    spectrum = np.linspace(0.1, 0.7, 24)[:, None, None]
-    wall = np.full((24, 1, 1), background)
-    bins = np.where(ball, spectrum * light, wall * np.where(y > 50, 0.1, 1.0))
-    return bins.astype(np.float32), ball, light
-
-
-def test_shaded_parts_are_told_by_spread_relative_to_brightness():
-    bins, ball, light = shaded_ball(background=0.9)
-    score, bright = bins.std(axis=0), bins.mean(axis=0)
-    body = foreground_mask(score, 0.1)
-    assert (ball & ~body).sum() > 60  # what the score alone misses
-    shaded = shaded_parts(body, score, bright)
-    rim = ball & ~ndimage.binary_erosion(ball)
-    assert not (ball & (light > 0.15) & ~body & ~shaded & ~rim).any()
-    assert (shaded & ~ball).sum() <= 4
-    assert not shaded_parts(body, score, bright, fraction=1.5).any()
-    upper = np.zeros_like(ball)
-    upper[:40] = True
-    assert not shaded_parts(body, score, bright, region=upper)[40:].any()
-
-
-def test_shaded_parts_are_not_looked_for_before_a_dark_background():
-    bins, _, _ = shaded_ball(background=0.1)
-    bins += np.random.default_rng(0).normal(0.0, 0.02, bins.shape).astype(np.float32)
-    score, bright = bins.std(axis=0), bins.mean(axis=0)
-    body = foreground_mask(score, 0.1)
-    assert not shaded_parts(body, score, bright).any()
-    assert not shaded_parts(np.zeros_like(body), score, bright).any()
-    assert not shaded_parts(np.ones_like(body), score, bright).any()
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 77.0])
@@ -140,6 +103,17 @@ def test_above_lid_undoes_lens_distortion():
     disagree = (bent[row, column] != straight)[central].mean()
     assert disagree < 0.02
     assert (bent != straight)[central].mean() > 2 * disagree
+
+
+def test_the_middle_of_the_lid_is_in_the_middle_of_what_may_be_the_objects():
+    pose = true_pose(0.0)
+    middle = lid_middle(INTRINSICS, pose, CONTAINER)
+    (centre,), _ = project(np.array([[0.0, 0.0, CONTAINER.height_m]]), pose, INTRINSICS)
+    row, column = np.nonzero(middle)
+    assert np.hypot(column.mean() + 0.5 - centre[0], row.mean() + 0.5 - centre[1]) < 0.5
+    radius_px = INTRINSICS.fl_x * 0.3 * CONTAINER.diameter_m / 2 / np.linalg.norm(pose[:3, 3] - [0, 0, 0.07])
+    assert np.ptp(column) + 1 == pytest.approx(2 * radius_px, abs=1.5)
+    assert (middle & above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER)).sum() == middle.sum()
 
 
 def test_mask_picture_draws_each_outline(tmp_path):

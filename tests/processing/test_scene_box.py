@@ -18,6 +18,7 @@ from hsi_sc_nerf.processing.scene_box import (
     object_box,
     scene_box,
 )
+from hsi_sc_nerf.processing.voted_hull import voted_hull
 
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
 OUTWARDS = np.array([[-1.0], [1.0]])
@@ -32,13 +33,13 @@ def test_object_box_of_a_sphere():
     poses = turn(24)
     intrinsics = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
     masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics) - OBJECT_MARGIN_M * OUTWARDS
+    box = object_box(voted_hull(masks, poses, intrinsics)) - OBJECT_MARGIN_M * OUTWARDS
     truth = np.stack([SPHERE_CENTRE_M - SPHERE_RADIUS_M, SPHERE_CENTRE_M + SPHERE_RADIUS_M])
     outside = np.stack([truth[0] - box[0], box[1] - truth[1]])
     assert outside.min() > -0.001
     # From one height the hull keeps a cone above and below the sphere; around it, it is exact.
     assert outside[:, :2].max() < 0.005
-    assert object_box(masks, poses, intrinsics, min_z_m=0.08)[0, 2] == 0.08
+    assert object_box(voted_hull(masks, poses, intrinsics), min_z_m=0.08)[0, 2] == 0.08
 
 
 @pytest.mark.parametrize("count", [4, 6, 8])
@@ -48,7 +49,7 @@ def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
     poses = np.stack([turntable_camera_to_world(start, angle) for angle in np.arange(count) * 360.0 / count])
     intrinsics = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0)
     masks = np.stack([sphere_mask(pose, intrinsics) for pose in poses])
-    box = object_box(masks, poses, intrinsics)
+    box = object_box(voted_hull(masks, poses, intrinsics))
     assert np.abs(box[:, :2]).max() < SPHERE_RADIUS_M + OBJECT_MARGIN_M + 0.02
 
 
@@ -56,9 +57,9 @@ def test_box_of_few_frames_holds_nothing_that_few_of_them_see(count):
 def test_one_wrong_mask_does_not_cut_the_object():
     poses = turn(24)
     masks = np.stack([sphere_mask(pose) for pose in poses])
-    box = object_box(masks, poses, INTRINSICS)
+    box = object_box(voted_hull(masks, poses, INTRINSICS))
     masks[5] = False
-    assert np.abs(object_box(masks, poses, INTRINSICS) - box).max() < 0.01
+    assert np.abs(object_box(voted_hull(masks, poses, INTRINSICS)) - box).max() < 0.01
 
 
 def test_box_keeps_a_part_thinner_than_a_voxel():
@@ -69,14 +70,14 @@ def test_box_keeps_a_part_thinner_than_a_voxel():
     for mask, pose in zip(masks, poses, strict=True):
         x, y = project(stem, pose, intrinsics)[0].astype(int).T
         mask[y, x] = True
-    assert 0.17 <= object_box(masks, poses, intrinsics)[1, 2] - OBJECT_MARGIN_M < 0.18
+    assert 0.17 <= object_box(voted_hull(masks, poses, intrinsics))[1, 2] - OBJECT_MARGIN_M < 0.18
 
 
 def test_masks_that_do_not_fit_the_poses():
     poses = turn(6)
     masks = np.zeros((6, 48, 48), bool)
     with pytest.raises(InputError, match="do not fit each other"):
-        object_box(masks, poses, INTRINSICS)
+        object_box(voted_hull(masks, poses, INTRINSICS))
 
 
 OBJECT = np.array([[-0.02, -0.02, 0.07], [0.02, 0.02, 0.2]])

@@ -6,7 +6,7 @@ import numpy as np
 from capture_factory import sphere_mask, true_pose
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.processing.hull_silhouettes import hull_silhouettes, trim_to_hull
+from hsi_sc_nerf.processing.voted_hull import voted_hull
 
 INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
 POSES = np.stack([true_pose(angle) for angle in np.arange(12) * 30.0])
@@ -22,7 +22,7 @@ def overlap(a, b):
 
 def test_silhouettes_of_a_sphere_are_its_masks():
     masks = good_masks()
-    assert overlap(hull_silhouettes(masks, POSES, INTRINSICS), masks).min() > 0.92
+    assert overlap(voted_hull(masks, POSES, INTRINSICS).silhouettes, masks).min() > 0.92
 
 
 def test_what_other_frames_contradict_is_trimmed_and_nothing_else():
@@ -31,7 +31,7 @@ def test_what_other_frames_contradict_is_trimmed_and_nothing_else():
     y, x = np.nonzero(masks[3])
     spoilt[3, y.max() - 1 : y.max() + 9, x.min() : x.max()] = True
     assert (spoilt[3] & ~masks[3]).sum() > 50
-    trimmed = trim_to_hull(spoilt, POSES, INTRINSICS)
+    trimmed = voted_hull(spoilt, POSES, INTRINSICS).trim(spoilt)
     np.testing.assert_array_equal(np.delete(trimmed, 3, axis=0), np.delete(masks, 3, axis=0))
     assert (trimmed[3] >= masks[3]).all()
     assert (trimmed[3] & ~masks[3]).sum() < 0.4 * (spoilt[3] & ~masks[3]).sum()

@@ -1,0 +1,114 @@
+"""Curves of the lamps' drift over wavelength: smooth, and shared by all frames.
+
+Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
+spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
+counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue.
+
+P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
+Statistics 13, 1985.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import linalg
+
+MAX_TERMS = 24
+"""Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
+RANK_MARGIN = 1.5
+"""Singular values of the drift count from this many times the largest of pure noise."""
+LOG_STRENGTHS = np.linspace(-12.0, 12.0, 97)
+"""Tried logarithms of the penalised terms' variance, relative to the noise in the term of median roughness."""
+
+
+def common_courses(
+    coefficients: Float[np.ndarray, "frames terms"],
+    covariance: Float[np.ndarray, "terms terms"],
+    basis: Float[np.ndarray, "bands terms"],
+    roughness: Float[np.ndarray, "terms"] | None = None,
+) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
+    """The curves of all frames as few courses over the session, each with one smooth spectrum; and their variance.
+
+    The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
+    the first. The variance is to first order that of a truncated singular value decomposition, with the posterior
+    variance of the spectra.
+
+    Args:
+        coefficients: of each frame, its deviation from the mean frame.
+        covariance: of one frame's coefficients; terms with a roughness have an error of their own.
+        basis: terms over the bands.
+        roughness: of each term, 0 for those that are not penalised; all 0 if not given.
+    """
+    roughness = np.zeros(len(covariance)) if roughness is None else roughness
+    root = np.linalg.cholesky(covariance)
+    left, singular, right = np.linalg.svd(np.linalg.solve(root, coefficients.T).T, full_matrices=False)
+    of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
+    rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
+    left, spectra = left[:, :rank], singular[:rank, None] * right[:rank]
+    kept = np.stack([_kept_fraction(spectrum, roughness) for spectrum in spectra])
+    of_band = basis @ root
+    curves = left @ (kept * spectra) @ of_band.T
+    leverage = np.square(left).sum(axis=1)[:, None]
+    of_spectra = np.square(left) @ kept @ np.square(of_band).T
+    of_amplitudes = np.square(of_band @ (kept * right[:rank]).T).sum(axis=1)
+    return curves, of_spectra + (1.0 - leverage) * of_amplitudes
+
+
+def smoothing_basis(
+    positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"]
+) -> tuple[Float[np.ndarray, "bands terms"], Float[np.ndarray, "terms"]]:
+    """The smoothest functions that the data can tell apart, orthonormal under ``precision`` (Demmler-Reinsch basis).
+
+    Args:
+        positions: of the bands, all different.
+        precision: 1 / variance of each band, 0 in bands without a measurement, which are interpolated.
+
+    Returns:
+        At most `MAX_TERMS` functions, and the roughness of each, the integral of its squared second derivative.
+        The first two, constant and linear, have none.
+    """
+    order = np.argsort(positions)
+    scaled = (positions[order] - positions.min()) / np.ptp(positions)
+    penalty = _roughness_of_splines(scaled)
+    weight = np.diag(precision[order])
+    penalty *= np.trace(weight) / max(float(np.trace(penalty)), 1e-300)
+    told, functions = linalg.eigh(weight, weight + penalty)
+    terms = min(MAX_TERMS, np.count_nonzero(precision))
+    told, functions = told[::-1][:terms], functions[:, ::-1][:, :terms]
+    roughness = np.maximum(1.0 / told - 1.0, 0.0)
+    roughness[:2] = 0.0
+    basis = np.empty_like(functions)
+    basis[order] = functions / np.sqrt(told)
+    return basis, roughness
+
+
+def _roughness_of_splines(positions: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands bands"]:
+    """Matrix of the integral of the squared second derivative of the natural cubic spline through values."""
+    step = np.diff(positions)
+    inner = np.arange(len(positions) - 2)
+    second = np.zeros((len(positions), len(inner)))
+    second[inner, inner] = 1.0 / step[:-1]
+    second[inner + 1, inner] = -1.0 / step[:-1] - 1.0 / step[1:]
+    second[inner + 2, inner] = 1.0 / step[1:]
+    gram = np.diag((step[:-1] + step[1:]) / 3.0) + np.diag(step[1:-1] / 6.0, 1) + np.diag(step[1:-1] / 6.0, -1)
+    return second @ np.linalg.solve(gram, second.T)
+
+
+def _kept_fraction(
+    spectrum: Float[np.ndarray, "terms"], roughness: Float[np.ndarray, "terms"]
+) -> Float[np.ndarray, "terms"]:
+    """Fraction of each coefficient that is signal and not noise of variance 1.
+
+    The coefficients of penalised terms are taken to be normal with a variance that falls with their roughness. Its
+    scale is the most likely one.
+    """
+    penalised = roughness > 0.0
+    if not penalised.any():
+        return np.ones_like(spectrum)
+    relative = roughness[penalised] / np.median(roughness[penalised])
+    total = 1.0 + np.exp(LOG_STRENGTHS)[:, None] / relative
+    unlikeliness = (np.log(total) + spectrum[penalised] ** 2 / total).sum(axis=1)
+    kept = np.ones_like(spectrum)
+    kept[penalised] = 1.0 - 1.0 / total[int(np.argmin(unlikeliness))]
+    return kept

@@ -1,0 +1,87 @@
+"""Curves of drift over wavelength, against drawn drifts and closed forms of splines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.calibration.drift_curves import MAX_TERMS, common_courses, smoothing_basis
+from hsi_sc_nerf.calibration.lamp_drift import SHARED_ERROR, fit_over_wavelength, smooth_basis
+
+BANDS, FRAMES = 24, 20
+WAVELENGTHS_NM = np.linspace(400.0, 1000.0, BANDS)
+MANY_NM = np.linspace(400.0, 1000.0, 120)
+
+
+def test_frames_tell_the_spectrum_of_the_drift_together():
+    """The variance is right, and far smaller than that of each frame by itself."""
+    rng, frames = np.random.default_rng(6), 20
+    basis = smooth_basis(WAVELENGTHS_NM, np.ones(BANDS, bool), 3)
+    covariance = np.diag([1.0, 2.0, 4.0, 8.0]) * 1e-6
+    true = np.outer(np.linspace(-1.0, 1.0, frames), [0.05, -0.02, 0.01, 0.005])
+    scores, squares = [], []
+    for _ in range(200):
+        noisy = true + np.sqrt(np.diag(covariance)) * rng.standard_normal(true.shape)
+        curves, variance = common_courses(noisy, covariance, basis)
+        scores.append(np.square(curves - true @ basis.T) / variance)
+        squares.append(np.square(curves - true @ basis.T) / np.square((noisy - true) @ basis.T).mean())
+    assert np.mean(scores) == pytest.approx(1.0, rel=0.1)
+    assert np.mean(squares) < 0.4
+
+
+def fitted(log_light, variance, wavelengths_nm):
+    basis, roughness = smoothing_basis(1.0 / wavelengths_nm, 1.0 / variance)
+    return common_courses(*fit_over_wavelength(log_light, variance, basis), basis, roughness)
+
+
+def test_a_drift_of_the_blue_alone_stays_in_the_blue():
+    """A kink that no polynomial follows, under noise that is largest in the blue."""
+    rng = np.random.default_rng(3)
+    spectrum = -0.05 - 0.05 * np.clip((530.0 - MANY_NM) / 130.0, 0.0, None)
+    true = np.outer(np.linspace(-0.5, 0.5, FRAMES), spectrum)
+    deviation = 1e-4 + 0.012 * np.exp((400.0 - MANY_NM) / 40.0)
+    scores, errors = [], []
+    for _ in range(60):
+        noisy = true + deviation * rng.standard_normal(true.shape)
+        curves, variance = fitted(noisy, deviation**2, MANY_NM)
+        error = curves - (true - true.mean(axis=0))
+        scores.append(error**2 / variance)
+        errors.append(np.abs(error).max())
+        assert np.abs(error[:, MANY_NM > 600.0]).max() < 5e-4
+    assert np.median(errors) < 0.07 * deviation.max()
+    # The spline is a little smoother than the kink, which the stated errors hold.
+    assert 0.3 < np.mean(scores) < SHARED_ERROR**2
+
+
+def test_a_drift_of_temperature_has_no_roughness():
+    """By Wien's law it is linear in 1 / wavelength: noise is all that is lost."""
+    rng = np.random.default_rng(5)
+    true = np.outer(np.linspace(-1.0, 1.0, FRAMES), 0.02 * (700.0 / MANY_NM - 1.0) - 0.03)
+    errors = {}
+    for name, variance in (("spline", np.full(120, 1e-6)), ("quiet", np.full(120, 1e-14))):
+        noisy = true + np.sqrt(variance) * rng.standard_normal(true.shape)
+        errors[name] = np.abs(fitted(noisy, variance, MANY_NM)[0] - true).max()
+    assert errors["quiet"] < 1e-6
+    assert errors["spline"] < 1e-3
+
+
+def test_basis_is_orthonormal_ordered_and_starts_with_straight_lines():
+    rng = np.random.default_rng(1)
+    positions, precision = rng.permutation(1.0 / MANY_NM), rng.uniform(1.0, 50.0, 120)
+    precision[:10] = 0.0
+    basis, roughness = smoothing_basis(positions, precision)
+    assert basis.shape == (120, MAX_TERMS)
+    np.testing.assert_allclose(basis.T * precision @ basis, np.eye(MAX_TERMS), atol=1e-6)
+    assert (np.diff(roughness) >= 0.0).all()
+    line = np.stack([np.ones(120), (positions - positions.mean()) / np.ptp(positions)], axis=1)
+    inside = np.linalg.lstsq(basis[:, :2], line, rcond=None)[0]
+    np.testing.assert_allclose(basis[:, :2] @ inside, line, atol=1e-6)
+
+
+@pytest.mark.parametrize("bands", [3, 5])
+def test_few_bands_have_as_many_terms(bands):
+    wavelengths_nm = np.linspace(400.0, 1000.0, bands)
+    true = np.outer(np.linspace(-1.0, 1.0, FRAMES), np.linspace(0.02, 0.05, bands))
+    curves, variance = fitted(true, np.full(bands, 1e-10), wavelengths_nm)
+    np.testing.assert_allclose(curves, true, atol=1e-4)
+    assert np.isfinite(variance).all()
