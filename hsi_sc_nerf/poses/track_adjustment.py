@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
-from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.residuals import (
     MarkerResiduals,
@@ -23,6 +22,7 @@ from hsi_sc_nerf.poses.residuals import (
     loop_closure_deg,
 )
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
+from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
