@@ -32,7 +32,7 @@ from path_traced_scene import (
     camera_pose,
     stop_angles_deg,
 )
-from pose_hard_cases import Case, grey_images, pose_errors, scene_of
+from pose_hard_cases import Case, grey_images, known_info, pose_errors, scene_of
 from results_table import RESULTS, write_results
 from rich.progress import track
 
@@ -67,7 +67,7 @@ GOAL = (0.3, 1.5, 0.5)
 """Degrees, millimetres, percent of the size."""
 PICTURE_NM = np.array([[470.0, 560.0, 640.0]])
 """Wavelengths of the path-traced picture."""
-SPOTS, FIELD_OF_VIEW_DEG, RAYS = 500, 17.0, 20
+SPOTS, FIELD_OF_VIEW_DEG, RAYS, RAYS_FOR_MARKERS = 500, 17.0, 20, 9
 LIGHT = ("textured_background", "photon_noise", "lamp", "gloss")
 SIMULATED = {
     "pear": Case(("textured_background",), frames=FRAMES),
@@ -111,15 +111,7 @@ def simulated(case: Case, size_px: int, markers: bool) -> Session:
     if not markers:
         case = replace(case, changes={"markers": {"on_container": 0, "on_disc": 0}})
     simulation = Simulation(scene_of(case, size_px))
-    scene = simulation.scene
-    info = SessionInfo(
-        marker_dictionary=scene.markers.dictionary,
-        marker_side_m=scene.markers.side_m,
-        nominal_step_deg=simulation.plan.nominal_step_deg,
-        direction=simulation.plan.direction,
-        container_diameter_m=scene.container.diameter_m,
-        container_height_m=scene.container.height_m,
-    )
+    info = known_info(simulation)
     return Session(grey_images(simulation), simulation.intrinsics.fl_x, simulation.camera_to_world, info)
 
 
@@ -128,7 +120,7 @@ def path_traced(size_px: int, markers: bool) -> Session:
     scene = PathTracedScene(
         PICTURE_NM,
         size_px,
-        RAYS,
+        RAYS_FOR_MARKERS if markers else RAYS,
         spots=SPOTS,
         markers=markers,
         field_of_view_deg=FIELD_OF_VIEW_DEG,
