@@ -4,7 +4,8 @@
     uv run python benchmarks/poses_without_markers.py FOLDER --objects "quince, path-traced"
 
 The objects are those of our simulator and the path-traced fruit of benchmarks/path_traced_scene.py. Each is rendered
-without markers, and once with markers for comparison. FOLDER keeps the pictures, which are used again.
+without markers, and once with markers for comparison. FOLDER keeps the pictures and what COLMAP found in them, which are used
+again: take an empty one after a change of either.
 
 Errors are the largest over the used frames. The origin's height is not compared where no marker shows the disc.
 Where nothing gives the scale, lengths are compared in units of the camera's distance. The size is that of the object:
@@ -14,6 +15,7 @@ the camera's distance over its focal length.
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -44,7 +46,7 @@ from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
+from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
 
@@ -149,7 +151,7 @@ class PosesWithoutMarkers:
     """Measure poses without markers."""
 
     folder: tyro.conf.Positional[Path]
-    """Keeps the pictures."""
+    """Keeps the pictures and what COLMAP found."""
     objects: tuple[str, ...] = (*SIMULATED, PATH_TRACED)
     """Which objects."""
     size: int = 384
@@ -160,15 +162,22 @@ class PosesWithoutMarkers:
     def main(self) -> None:
         """Measure, print the table, write it."""
         for name in self.objects:
-            rows = []
             session = self._session(name, markers=False)
-            free = structure_from_motion(session.images, session.names)
-            from_features = partial(poses_from_features, free=free)
+            from_features = partial(poses_from_features, free=self._free_poses(name, session))
             for known, (info, camera) in what_is_known(session).items():
-                rows.append((name, known, *_cells(session, info, camera, from_features)))
+                self._write(name, known, _cells(session, info, camera, from_features))
             session = self._session(name, markers=True)
-            rows.append((name, "markers", *_cells(session, session.info, None, None)))
-            write_results("poses_without_markers", COLUMNS, rows, keys=2, folder=self.results)
+            self._write(name, "markers", _cells(session, session.info, None, None))
+
+    def _write(self, name: str, known: str, cells: tuple[str, ...]) -> None:
+        write_results("poses_without_markers", COLUMNS, [(name, known, *cells)], keys=2, folder=self.results)
+
+    def _free_poses(self, name: str, session: Session) -> FreePoses:
+        """What COLMAP finds in the session, found unless the folder has it."""
+        path = self.folder / f"{name.replace(', ', '_')}_{self.size}_colmap.pickle"
+        if not path.is_file():
+            path.write_bytes(pickle.dumps(structure_from_motion(session.images, session.names)))
+        return pickle.loads(path.read_bytes())
 
     def _session(self, name: str, markers: bool) -> Session:
         """The session, rendered unless the folder has its pictures."""
