@@ -4,8 +4,8 @@
     uv run python benchmarks/poses_without_markers.py FOLDER --objects "quince, path-traced"
 
 The objects are those of our simulator and the path-traced fruit of benchmarks/path_traced_scene.py. Each is rendered
-without markers, and once with markers for comparison. FOLDER keeps the pictures and what COLMAP found in them, which are used
-again: take an empty one after a change of either.
+without markers, and once with markers for comparison. FOLDER keeps the pictures and what COLMAP found in them, which
+are used again: take an empty one after a change of either.
 
 Errors are the largest over the used frames. The origin's height is not compared where no marker shows the disc.
 Where nothing gives the scale, lengths are compared in units of the camera's distance. The size is that of the object:
