@@ -39,18 +39,21 @@ def pose_uncertainty(adjusted: Adjusted, covariance: Float[np.ndarray, "p p"], m
     turn[np.arange(len(turn)), :, layout.angle] += turntable.camera_rotation[:, 2]
     turn = turn[..., :-1]
     variance = np.einsum("fip,pq,fiq->f", turn, covariance, turn)
-    # The camera over the disc: its distance from the axis and its height. And the size of what turns.
+    # The camera over the disc: its distance from the axis, its height, and its way along the circle from the first
+    # frame's. And the size of what turns.
     height, size = _landmark_gradients(adjusted)
     place = np.stack([np.zeros(len(covariance)), -height])
     if 4 in layout.camera:
         place[0, layout.camera[4]] = turntable.distance
+    angles = np.append(covariance.diagonal(), 0.0)[layout.angle]
+    along = turntable.distance**2 * float(angles.max())
     return Uncertainty(
         focal=float(sigmas[0]),
         distance=distance,
         size=float(np.sqrt(size @ covariance @ size)),
         angle_deg=adjusted.angle_sigmas_deg(covariance),
         rotation_deg=float(np.rad2deg(np.sqrt(variance.max()))),
-        position_m=metres * float(np.sqrt(np.trace(place @ covariance @ place.T))),
+        position_m=metres * float(np.sqrt(np.trace(place @ covariance @ place.T) + along)),
     )
 
 
