@@ -1,10 +1,9 @@
-"""Largest errors of poses in hard cases: from markers, and from features on sessions without markers.
+"""Largest errors of poses from markers in hard cases.
 
     uv run python benchmarks/pose_hard_cases.py
-    uv run python benchmarks/pose_hard_cases.py --method colmap
 
 Each case is a simulated session with one thing that makes it hard; errors are those against its true poses, over the
-used frames, beside the standard deviations that are stated. Poses from features are told the camera's distance.
+used frames. benchmarks/poses_without_markers.py measures poses from features.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -25,7 +23,6 @@ from results_table import RESULTS, write_results
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -42,18 +39,6 @@ COLUMNS = (
     "reprojection, px",
     "time, s",
     "model; warnings",
-)
-FEATURE_COLUMNS = (
-    "session",
-    "rotation, deg",
-    "stated, deg",
-    "position, mm",
-    "stated, mm",
-    "focal, %",
-    "stated focal, %",
-    "size, %",
-    "stated size, %",
-    "findings",
 )
 WORKERS = 2
 Images = list[UInt8[np.ndarray, "h w"]]
@@ -77,8 +62,6 @@ class Case:
     """A wobbling table has no axis but a mean one, and the truth's is another: compare after a rigid alignment."""
     any_height: bool = False
     """Without markers on the disc the origin's height is arbitrary."""
-    knows_camera: bool = False
-    """Give the camera of an earlier session."""
 
 
 def blur_some(images: Images) -> Images:
@@ -135,21 +118,6 @@ CASES = {
     "wobble of 1 degree": Case(("{wobble: {amplitude_deg: 1}}",), frames=36, any_axis=True),
 }
 
-WALL = ("textured_background",)
-NO_MARKERS: dict[str, dict[str, float]] = {"markers": {"on_container": 0, "on_disc": 0}}
-LIGHT = (*WALL, "photon_noise", "lamp", "gloss")
-FEATURE_CASES = {
-    "pear": Case(WALL, frames=36, changes=NO_MARKERS, any_height=True),
-    "pear, gloss": Case(LIGHT, frames=36, changes=NO_MARKERS, any_height=True),
-    "pear, gloss, earlier camera": Case(LIGHT, frames=36, changes=NO_MARKERS, any_height=True, knows_camera=True),
-    "pear, gloss, two markers": Case(LIGHT, frames=36, changes={"markers": {"on_container": 0, "on_disc": 2}}),
-    "pear, gloss, 200 degrees": Case(
-        (*LIGHT, "{partial_turn: {span_deg: 200}}"), frames=36, changes=NO_MARKERS, any_height=True
-    ),
-    "apple, gloss": Case(LIGHT, "apple", 36, changes=NO_MARKERS, any_height=True),
-    "maize ear": Case(WALL, "maize", 36, changes=NO_MARKERS, any_height=True),
-}
-
 
 @dataclass(frozen=True)
 class Posed:
@@ -203,9 +171,7 @@ def grey_images(simulation: Simulation) -> Images:
         return list(pool.map(lambda i: to_8_bit((signal(simulation.frame(i)) / white).mean(axis=-1)), frames))
 
 
-def pose(
-    case: Case, size_px: int, frames: int | None = None, method: Literal["markers", "colmap"] = "markers"
-) -> Posed:
+def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
     """Simulate a case and pose it.
 
     Raises:
@@ -216,11 +182,9 @@ def pose(
     images = grey_images(simulation)
     if case.alter is not None:
         images = case.alter(images)
-    info, camera = known_info(simulation, method), None
-    if case.knows_camera:
-        camera = KnownCamera(simulation.intrinsics, (0.0, 0.0, 0.0, 0.0), simulation.camera_to_world[0])
+    info = known_info(simulation)
     started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, info, method, camera=camera, progress=False)
+    poses = find_poses(images, simulation.captures, info, "markers", progress=False)
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
@@ -261,11 +225,9 @@ def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"])
     return moved
 
 
-def known_info(simulation: Simulation, method: Literal["markers", "colmap"]) -> SessionInfo:
-    """What a laboratory would note of a session: of one with features alone, the camera's distance at least."""
+def known_info(simulation: Simulation) -> SessionInfo:
+    """What a laboratory would note of a session."""
     scene = simulation.scene
-    if method == "colmap" and scene.markers.on_disc == 0:
-        return SessionInfo(camera_distance_m=float(np.linalg.norm(simulation.camera_to_world[0, :2, 3])))
     return SessionInfo(
         marker_dictionary=scene.markers.dictionary,
         marker_side_m=scene.markers.side_m,
@@ -280,30 +242,24 @@ def known_info(simulation: Simulation, method: Literal["markers", "colmap"]) -> 
 class PoseHardCases:
     """Measure poses in hard cases."""
 
-    method: Literal["markers", "colmap"] = "markers"
-    """From markers, or from features."""
     size: int = 512
     """Width and height of the images, pixels; some cases take a fraction of it."""
     cases: tuple[str, ...] = ()
-    """Which cases of the method; all if not given."""
+    """Which cases; all if not given."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print the table, write it."""
-        markers = self.method == "markers"
-        known, cells = (CASES, _cells) if markers else (FEATURE_CASES, _feature_cells)
         rows = []
-        for name in self.cases or known:
+        for name in self.cases or CASES:
             try:
-                measured = cells(pose(known[name], self.size, method=self.method))
+                measured = _cells(pose(CASES[name], self.size))
             except InputError as error:
-                refused = f"refused: {error}"
-                measured = ("0", "", "", "", "", "", refused) if markers else (*("",) * 8, refused)
+                measured = ("0", "", "", "", "", "", f"refused: {error}")
             rows.append((name, *measured))
             print(" | ".join(rows[-1]), flush=True)
-        table, columns = ("pose_hard_cases", COLUMNS) if markers else ("poses_by_object", FEATURE_COLUMNS)
-        write_results(table, columns, rows, keys=1, folder=self.results)
+        write_results("pose_hard_cases", COLUMNS, rows, keys=1, folder=self.results)
 
 
 def _cells(posed: Posed) -> tuple[str, ...]:
@@ -316,28 +272,6 @@ def _cells(posed: Posed) -> tuple[str, ...]:
         f"{poses.overall_error_px:.3f}",
         f"{posed.seconds:.0f}",
         "; ".join([poses.model, *(f.sentence for f in check_poses(poses, posed.info) if f.level != "green")]),
-    )
-
-
-def _feature_cells(posed: Posed) -> tuple[str, ...]:
-    poses, truth = posed.poses, posed.simulation
-    distance = np.linalg.norm(poses.camera_to_world[poses.used][0, :2, 3])
-    true_distance = np.linalg.norm(truth.camera_to_world[0, :2, 3])
-    size_percent = 100.0 * (distance / true_distance * truth.intrinsics.fl_x / poses.intrinsics.fl_x - 1.0)
-    stated, scale = poses.uncertainty, poses.scale
-    assert stated is not None
-    assert scale is not None
-    levels = [f"{f.name} {f.level}" for f in check_poses(poses, posed.info) if f.level != "green"]
-    return (
-        f"{posed.rotation_deg.max():.3f}",
-        f"{stated.rotation_deg:.3f}",
-        f"{posed.position_mm.max():.2f}",
-        f"{1e3 * stated.position_m:.2f}",
-        f"{posed.focal_percent:+.2f}",
-        f"{100.0 * stated.focal:.2f}",
-        f"{size_percent:+.2f}",
-        f"{100.0 * scale.uncertainty:.2f}",
-        "; ".join(levels),
     )
 
 

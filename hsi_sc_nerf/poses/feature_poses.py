@@ -21,9 +21,10 @@ from hsi_sc_nerf.poses.object_frame import disc_height, lie_on_disc, scale_of
 from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
-from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
+from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
+    adjust_either_way,
     adjust_together,
     adjust_tracks,
     halves_differ,
@@ -53,6 +54,7 @@ def poses_from_features(
     *,
     camera: KnownCamera | None = None,
     hold_angles: bool = False,
+    free: FreePoses | None = None,
 ) -> TurntablePoses:
     """Poses from features: free poses by COLMAP, a turntable fitted to them, and its bundle adjustment.
 
@@ -64,6 +66,7 @@ def poses_from_features(
         info: what gives the scale, the markers' dictionary, and the angles.
         camera: of an earlier session, whose focal length and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.
+        free: what ``structure_from_motion`` finds, where it is known already.
 
     Raises:
         InputError: too little texture, poses that do not turn about one axis, unknown angles that should be held, or
@@ -76,14 +79,14 @@ def poses_from_features(
     if hold_angles and angles_deg is None:
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
     grays = SessionPictures.of(images).named(GRAY)
-    free = structure_from_motion(grays, names)
+    free = structure_from_motion(grays, names) if free is None else free
     start, contradicts = turntable_from_poses(free.world_to_camera, free.points_3d, free.focal_px, free.centre_px)
     if contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
         raise InputError(
             f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
-    found = adjust_tracks(start, free.tracks)
+    found = adjust_either_way(start, free.tracks)
     found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
     known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(

@@ -12,7 +12,6 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
-from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
@@ -24,6 +23,7 @@ from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
+from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
 _SIDE_WITHOUT_SCALE_M = 0.03

@@ -71,7 +71,7 @@ class Uncertainty:
     rotation_deg: float
     """Of the least certain frame's rotation in the object frame."""
     position_m: float
-    """Of the camera's position in the object frame."""
+    """Of the least certain frame's camera position in the object frame."""
 
 
 @dataclass(frozen=True)

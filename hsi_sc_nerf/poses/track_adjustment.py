@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
-from hsi_sc_nerf.poses.hidden_errors import with_hidden_errors
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.residuals import (
     MarkerResiduals,
@@ -23,6 +22,8 @@ from hsi_sc_nerf.poses.residuals import (
     loop_closure_deg,
 )
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
+from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
+from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
@@ -67,6 +68,12 @@ class AdjustedTracks:
     def residual_px(self) -> Float[np.ndarray, "m 2"]:
         """Reprojection errors of the used rows."""
         return self.turntable.reproject(self.tracks) - self.tracks.pixels
+
+    @property
+    def misfit_px(self) -> float:
+        """Mean distance of the given rows from their projections; at most 1 px each, as which outliers count."""
+        distances = np.linalg.norm(self.residual_px, axis=-1)
+        return float((np.minimum(distances, 1.0).sum() + self.outliers.sum()) / len(self.outliers))
 
     @property
     def overall_error_px(self) -> float:
@@ -115,6 +122,23 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | No
         fits[np.flatnonzero(good)[outlier]] = False
         good = _enough(tracks, fits)
     return AdjustedTracks(turntable, kept, ~good)
+
+
+def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
+    """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
+
+    Raises:
+        InputError: too few tracks fit either.
+    """
+    found, refused = [], None
+    for way in (start, reversed_in_depth(start)):
+        try:
+            found.append(adjust_tracks(way, tracks))
+        except InputError as error:
+            refused = refused or error
+    if refused is not None and not found:
+        raise refused
+    return min(found, key=lambda adjusted: adjusted.misfit_px)
 
 
 def adjust_together(

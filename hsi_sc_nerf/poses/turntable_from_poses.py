@@ -10,6 +10,8 @@ the axis, so q is known well even where a frame's rotation and position are wron
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
@@ -101,6 +103,33 @@ def turntable_from_poses(
         points_3d=(points_3d - origin) @ to_turntable.T / distance,
     )
     return turntable, contradicts
+
+
+def reversed_in_depth(turntable: Turntable) -> Turntable:
+    """The turntable whose points, axis and turn are mirrored in depth: a camera far away sees the same of it.
+
+    A long lens hardly tells a turn one way, seen from above, from a turn the other way, seen from below. Structure
+    from motion with a wrong focal length may find the wrong one of the two.
+
+    Args:
+        turntable: without markers and motions.
+    """
+    middle = np.array([0.0, 0.0, np.median(turntable.points_3d[:, 2])])
+    in_camera = turntable.camera_rotation @ (middle - [turntable.distance, 0.0, 0.0])
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    sight = in_camera / np.linalg.norm(in_camera)
+    rotation = (np.eye(3) - 2.0 * np.outer(sight, sight)) @ turntable.camera_rotation @ mirror
+    camera = -rotation.T @ in_camera
+    turn = rotation_about_z(float(np.rad2deg(np.arctan2(camera[1], camera[0]))))[:3, :3]
+    away = replace(
+        turntable,
+        camera_rotation=rotation @ turn,
+        distance=float(np.hypot(camera[0], camera[1])),
+        angles_rad=-turntable.angles_rad,
+        # The origin is at the camera's height.
+        points_3d=(turntable.points_3d - middle) @ mirror @ turn - [0.0, 0.0, camera[2]],
+    )
+    return away.resized(turntable.distance / away.distance)
 
 
 def _agreeing(rotations):

@@ -43,6 +43,7 @@ from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.pipelines.base_pipeline import Pipeline
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle
 
@@ -81,6 +82,8 @@ class BrowserControl(ViewerControl):
     """nerfstudio's access to the viewer, which also reports every browser that opens it.
 
     The training cameras are hidden when their scene is made: their pictures would cover the object and catch clicks.
+    A render for a browser that is closed or reloaded is stopped: nerfstudio would finish it, a minute at full size on
+    two cores, while all other browsers wait for the model and stay black.
 
     Args:
         opened: called with the browser, whose initial camera is inside the object.
@@ -91,7 +94,18 @@ class BrowserControl(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
-        viewer.viser_server.on_client_connect(self._opened)
+        renderers: dict[int, RenderStateMachine] = {}
+
+        def opened(client: ClientHandle) -> None:
+            renderers[client.client_id] = viewer.render_statemachines[client.client_id]
+            self._opened(client)
+
+        def closed(client: ClientHandle) -> None:
+            # nerfstudio has told the thread to end, but not its render.
+            renderers.pop(client.client_id).interrupt_render_flag = True
+
+        viewer.viser_server.on_client_connect(opened)
+        viewer.viser_server.on_client_disconnect(closed)
         show_scene = viewer.init_scene
 
         def show_scene_without_cameras(*args: Any, **options: Any) -> None:

@@ -9,8 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.track_adjustment import adjust_tracks, halves_differ, with_lost_frames
+from hsi_sc_nerf.poses.track_adjustment import (
+    adjust_either_way,
+    adjust_tracks,
+    halves_differ,
+    with_lost_frames,
+)
 from hsi_sc_nerf.poses.turntable import Turntable
+from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
 SIZE_PX = 256
 FOCAL_PX = 460.0
@@ -58,6 +64,23 @@ def test_exact_tracks_give_the_exact_machine(angles_deg):
     assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
     assert pose_error_deg(found.turntable, true) < 0.02
     assert found.overall_error_px < 0.01
+
+
+def narrow_machine(narrower=4.0):
+    """The machine far away, before a longer lens: the images keep their size."""
+    true = machine(np.arange(0, 360, 18.0))
+    middle = np.array([0.0, 0.0, np.median(true.points_3d[:, 2])])
+    height = np.array([0.0, 0.0, middle[2]])
+    points_3d = (true.points_3d - middle) / narrower + height
+    return replace(true, focal_px=narrower * true.focal_px, points_3d=points_3d)
+
+
+def test_a_turn_that_was_found_reversed_in_depth_is_set_right():
+    """An adjustment does not lead from one to the other."""
+    true = narrow_machine()
+    start, tracks = disturbed(reversed_in_depth(true)), point_tracks(true, noise_px=0.1)
+    assert pose_error_deg(adjust_tracks(start, tracks).turntable, true) > 90.0
+    assert pose_error_deg(adjust_either_way(start, tracks).turntable, true) < 2.0
 
 
 def test_wrong_sightings_are_thrown_out():

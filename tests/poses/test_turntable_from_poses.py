@@ -1,11 +1,14 @@
 """From free poses to the machine: exact round trips, partial turns, either direction, wrong poses, no turn at all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
+from hsi_sc_nerf.poses.turntable import Tracks
+from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth, turntable_from_poses
 
 CAMERA = 500.0, (128.0, 128.0)
 ELEVATION_DEG, ROLL_DEG, DISTANCE = 25.0, 4.0, 0.42
@@ -108,3 +111,18 @@ def test_two_poses_are_too_few():
     poses[1] = np.nan
     with pytest.raises(InputError, match="cannot fix"):
         turntable_from_poses(poses, np.zeros((0, 3)), *CAMERA)
+
+
+def test_a_camera_far_away_sees_the_same_of_the_turntable_reversed_in_depth():
+    poses, points, _ = free_poses(np.arange(0, 360, 18.0))
+    turntable, _ = turntable_from_poses(poses, points, *CAMERA)
+    tracks = Tracks(*(a.ravel() for a in np.meshgrid(turntable.frames, turntable.points)), pixels=np.zeros((100, 2)))
+    middle = np.array([0.0, 0.0, np.median(turntable.points_3d[:, 2])])
+    for factor, alike_px in ((10.0, 12.0), (100.0, 1.2), (1000.0, 0.12)):
+        small = (turntable.points_3d - middle) / factor + middle
+        far = replace(turntable, focal_px=factor * turntable.focal_px, points_3d=small)
+        turned = reversed_in_depth(far)
+        np.testing.assert_allclose(turned.reproject(tracks), far.reproject(tracks), atol=alike_px)
+        # It turns the other way.
+        np.testing.assert_allclose(turned.angles_rad, -far.angles_rad)
+        np.testing.assert_allclose(reversed_in_depth(turned).points_3d, far.points_3d, atol=1e-12)

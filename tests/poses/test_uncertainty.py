@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
-from hsi_sc_nerf.poses.hidden_errors import smooth_fields, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
-from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
+from hsi_sc_nerf.poses.uncertainty import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
 
 SEEDS = 12
 
@@ -27,7 +26,9 @@ def scores(adjusted, true):
     if len(true.markers):
         landmarks = found.marker_poses[:, :3, 3], true.marker_poses[:, :3, 3]
         found_z, true_z = (np.median(places[6:, 2]) if len(places) > 6 else 0.0 for places in landmarks)
-    position = np.hypot(found.distance - true.distance, found_z - true_z)
+    away = (poses - truth)[:, :3, 3]
+    away[:, 2] = found_z - true_z
+    position = np.linalg.norm(away, axis=1).max()
     found_size, true_size = (np.linalg.norm(places[:, :2]) for places in landmarks)
     return [
         np.log(found.focal_px / true.focal_px) / stated.focal,
@@ -73,3 +74,15 @@ def test_features_that_creep_are_covered(markers):
         adjusted, _ = adjust_together(adjust_tracks(alone, tracks), seen, FreeParameters(distance=markers))
         found.append(scores(adjusted, true)[0:3:2])
     assert (np.abs(found) < 2.0).mean() > 0.9
+
+
+def test_an_angle_that_is_not_known_moves_its_camera_along_the_circle():
+    true = marker_turntable(MarkerScene(size_px=256, frames=12))
+    problem = Problem(true, MarkerResiduals(true, marker_observations(true), 3.0))
+    covariance = np.zeros((problem.layout.motion_size,) * 2)
+    column = problem.layout.angle[5]
+    covariance[column, column] = 0.01**2
+    stated = pose_uncertainty(Adjusted(true, problem), covariance)
+    assert stated.rotation_deg == pytest.approx(np.rad2deg(0.01))
+    height = _landmark_gradients(Adjusted(true, problem))[0][column]
+    assert stated.position_m == pytest.approx(0.01 * np.hypot(true.distance, height))

@@ -91,7 +91,7 @@ class FakeServer:
 
     def __init__(self):
         self.camera = SimpleNamespace(aspect=1.5)
-        self.client = SimpleNamespace(camera=self.camera, atomic=contextlib.nullcontext)
+        self.client = SimpleNamespace(camera=self.camera, atomic=contextlib.nullcontext, client_id=0)
         self.pointer = None
         self.points = {}
         self.scene = SimpleNamespace(
@@ -99,11 +99,14 @@ class FakeServer:
             remove_pointer_callback=lambda: setattr(self, "pointer", None),
             add_icosphere=lambda name, **sphere: self.points.update({name: sphere}),
         )
-        self.opened = []
+        self.opened, self.closed = [], []
         self.gui = SimpleNamespace(add_markdown=lambda content, image_root: SimpleNamespace(content=content))
 
     def on_client_connect(self, callback):
         self.opened.append(callback)
+
+    def on_client_disconnect(self, callback):
+        self.closed.append(callback)
 
     def get_clients(self):
         return {0: self.client}
@@ -131,6 +134,7 @@ def attached(pipeline):
         pipeline=pipeline,
         viser_server=server,
         train_lock=None,
+        render_statemachines={0: SimpleNamespace(interrupt_render_flag=False)},
         get_model=lambda: model,
         control_panel=SimpleNamespace(output_render="spectral_angle", split=False),
         calls=(calls := []),
@@ -273,6 +277,15 @@ def test_a_browser_opens_behind_the_first_camera_and_turns_around_the_object(att
     assert (middle - looked_at) @ frame.camera_to_worlds[:, 2] == pytest.approx(0.0, abs=1e-4)
     viewer.init_scene("dataset", train_state="completed")
     assert viewer.calls == [("dataset", "completed"), "cameras hidden", "button switched"]
+
+
+def test_the_render_of_a_closed_browser_is_stopped(attached):
+    """nerfstudio forgets the browser before the panel hears of it."""
+    _, server, viewer = attached
+    server.opened[0](server.client)
+    renderer = viewer.render_statemachines.pop(0)
+    server.closed[0](server.client)
+    assert renderer.interrupt_render_flag
 
 
 def test_the_angle_is_zero_for_the_measured_view_and_blank_elsewhere(attached, pipeline):
