@@ -27,7 +27,7 @@ _shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 # for milliseconds after every operation.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 # The last of these does not bear a second launch beside the first, as from the viewer's thread.
-_one_at_a_time = Lock()
+ONE_AT_A_TIME = Lock()
 
 
 @_compiled
@@ -143,7 +143,7 @@ def _run(alone: Callable[..., None], at_once: Callable[..., None], points: int, 
     if threads == 1 or points < _SHARED_FROM:
         alone(*arguments, 0, 1)
         return
-    with _one_at_a_time:
+    with ONE_AT_A_TIME:
         numba.set_num_threads(threads)
         at_once(*arguments, threads)
 

@@ -93,6 +93,7 @@ class SpectralField(NerfactoField):
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
         density = self.average_init_density * trunc_exp(hidden[..., :1].to(inside)) * inside
+        self.last_density = density.detach()
         return density, hidden[..., 1:]
 
     def get_outputs(

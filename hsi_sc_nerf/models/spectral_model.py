@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
@@ -19,6 +21,7 @@ from nerfstudio.models.base_model import Model
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils import colormaps
 from torch import Tensor, nn
+from torch.nn import Parameter
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
@@ -31,12 +34,14 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over, matter_around_hull
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
+from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10
-from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
 
 
@@ -75,17 +80,11 @@ class SpectralModelConfig(NerfactoModelConfig):
     to be combined with the data parser's --scene cameras."""
     proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
     """Spacing of the first samples; uniform suits rays that are bounded by the box."""
-    num_proposal_samples_per_ray: tuple[int, ...] = (48, 24)
-    """Samples a ray for each proposal network; a box of 0.2 m needs far fewer than an unbounded scene."""
-    num_nerf_samples_per_ray: int = 24
+    num_proposal_iterations: int = 0
+    """Proposal networks that place the samples, as in nerfacto. 0: an occupancy grid that begins as the visual hull
+    of the masks places them; it needs the scene to be a box."""
+    num_nerf_samples_per_ray: int = 16
     """Samples a ray for the spectral field."""
-    proposal_net_args_list: list[dict] = field(
-        default_factory=lambda: [
-            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
-            for max_res in (64, 128)
-        ]
-    )
-    """The proposal networks, with smaller tables than nerfacto's for a scene of 0.2 m."""
     match_resolution: bool = True
     """Size the field's hash grid by what a pixel resolves in the scene box. False: by num-levels, max-res and
     log2-hashmap-size."""
@@ -136,7 +135,12 @@ class SpectralModel(NerfactoModel):
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
-        self._build_proposals(contraction)
+        self.proposal_networks = torch.nn.ModuleList()
+        self.density_fns, self.occupancy = [], None
+        if config.num_proposal_iterations > 0:
+            self._build_proposals(contraction)
+        else:
+            self._build_occupancy(dataset, metadata["frames"])
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
@@ -219,6 +223,29 @@ class SpectralModel(NerfactoModel):
             initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
         )
 
+    def _build_occupancy(self, dataset: PackedDataset, frames: Sequence[PackedFrame]) -> None:
+        """An occupancy grid from the masks, and the sampler that uses it."""
+        aabb = self.scene_box.aabb
+        shape, cell = grid_over(aabb)
+        box_m = dataset.scene_box_m
+        cell_m = cell * float((box_m[1] - box_m[0]).max() / (aabb[1] - aabb[0]).max())
+        matter = matter_around_hull(dataset, frames, shape, box_m[0], cell_m)
+        self.occupancy = OccupancyGrid(aabb, torch.from_numpy(matter))
+        self.proposal_sampler = OccupancySampler(self.occupancy, self.config.num_nerf_samples_per_ray)
+
+    def refresh_occupancy(self, step: int) -> None:
+        """Bring a part of the occupancy grid up to date, before a step of training."""
+        if self.occupancy is not None:
+            self.occupancy.refresh(self.field.density_fn, step)
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """Nerfacto's groups, without that of the proposals where there are none."""
+        return {name: group for name, group in super().get_param_groups().items() if group}
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Nerfacto's callbacks, which are the proposals'."""
+        return [] if self.occupancy is not None else super().get_training_callbacks(training_callback_attributes)
+
     def background_spectrum(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
         """Reflectance of the chamber behind rays as measured, before the pose refinement; 0 without a background."""
         if self.background is None:
@@ -231,6 +258,12 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
+        if isinstance(self.proposal_sampler, OccupancySampler):
+            outputs |= {
+                name: self.proposal_sampler.spread(value, len(ray_bundle))
+                for name, value in outputs.items()
+                if isinstance(value, Tensor)
+            }
         spectral = self.decoder(outputs["rgb"])
         if background is not None:
             spectral = spectral + background * (1.0 - outputs["accumulation"])
@@ -239,6 +272,15 @@ class SpectralModel(NerfactoModel):
         # An index of numbers would be a transfer to the device, for which that has to wait.
         outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
+
+    def _distortion(self, outputs: dict) -> Tensor:
+        """Distortion of the batch's rays."""
+        (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
+        if self.occupancy is None:
+            return distortion_loss([weights], [samples])
+        self.occupancy.note(samples.frustums.get_positions(), self.field.last_density)
+        distortion = separate_distortion(weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
+        return distortion.sum() / len(outputs["accumulation"])
 
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
         """Measured reflectance, and which of its values are measurements (None for all)."""
@@ -254,7 +296,7 @@ class SpectralModel(NerfactoModel):
             metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
-            metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
+            metrics["distortion"] = self._distortion(outputs)
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -271,9 +313,10 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             return losses
         assert metrics_dict is not None
-        losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
-            outputs["weights_list"], outputs["ray_samples_list"]
-        )
+        if self.occupancy is None:
+            losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
+                outputs["weights_list"], outputs["ray_samples_list"]
+            )
         losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
         if config.predict_normals:
             losses["orientation_loss"] = config.orientation_loss_mult * outputs["rendered_orientation_loss"].mean()

@@ -180,6 +180,7 @@ class StagedTrainer(Trainer):
         sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
         torch.manual_seed(step_seed(self.config.machine.seed, step))
+        self._model.refresh_occupancy(step)
         if self._captured is None:
             loss, loss_dict, metrics_dict = super().train_iteration(step)
         else:

@@ -1,0 +1,133 @@
+"""`ray_marching` as a compiled loop: a ray is sampled before the next one is begun, in a few kilobytes of memory."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from jaxtyping import Float32
+
+from hsi_sc_nerf.fields.hash_grid_cpu import ONE_AT_A_TIME
+
+_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+_shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
+
+
+def sample_occupied(
+    origins: Float32[np.ndarray, "rays 3"],
+    directions: Float32[np.ndarray, "rays 3"],
+    nears: Float32[np.ndarray, "rays"],
+    fars: Float32[np.ndarray, "rays"],
+    density: Float32[np.ndarray, "x y z"],
+    lower: Float32[np.ndarray, "3"],
+    cell: float,
+    num_samples: int,
+    jitter: Float32[np.ndarray, "rays"],
+    explored: float,
+    opaque: float,
+) -> tuple[Float32[np.ndarray, "rays samples"], Float32[np.ndarray, "rays samples"]]:
+    """Starts and ends of the samples; arguments are those of `ray_marching.sample_occupied` and its constants."""
+    steps = int(np.linalg.norm(density.shape)) + 2
+    starts = np.empty((len(origins), num_samples), np.float32)
+    ends = np.empty_like(starts)
+    with ONE_AT_A_TIME:
+        _sample_rays(
+            origins, directions, nears, fars, density, lower, np.float32(cell), jitter, np.float32(explored),
+            np.float32(opaque), steps, starts, ends,
+        )  # fmt: skip
+    return starts, ends
+
+
+@_shared
+def _sample_rays(
+    origins, directions, nears, fars, density, lower, cell, jitter, explored, opaque, steps, starts, ends
+):
+    parts = 16
+    for part in numba.prange(parts):
+        weights = np.empty(steps, np.float32)
+        seen = np.empty(steps, np.float32)
+        for i in range(len(origins) * part // parts, len(origins) * (part + 1) // parts):
+            count = _march(origins[i], directions[i], nears[i], fars[i], density, lower, cell, opaque, seen)
+            total = _spread(seen, count, explored, weights)
+            if total > 0.0:
+                _invert(weights, count, total, nears[i], cell, jitter[i], starts[i], ends[i])
+            else:
+                starts[i], ends[i] = nears[i], nears[i]
+
+
+@_compiled
+def _march(origin, direction, near, far, density, lower, cell, opaque, seen):
+    """Weight with which each step of a ray is seen, -1 where it holds no matter; returns the number of steps."""
+    transmittance = np.float32(1.0)
+    for k in range(len(seen)):
+        t = near + (np.float32(k) + np.float32(0.5)) * cell
+        if not t < far or transmittance < opaque:
+            return k
+        seen[k] = np.float32(-1.0)
+        x = np.int64(np.floor((origin[0] + direction[0] * t - lower[0]) / cell))
+        y = np.int64(np.floor((origin[1] + direction[1] * t - lower[1]) / cell))
+        z = np.int64(np.floor((origin[2] + direction[2] * t - lower[2]) / cell))
+        if 0 <= x < density.shape[0] and 0 <= y < density.shape[1] and 0 <= z < density.shape[2]:
+            value = density[x, y, z]
+            if value >= 0.0:
+                through = np.exp(-value * cell)
+                seen[k] = transmittance * (np.float32(1.0) - through)
+                transmittance *= through
+    return len(seen)
+
+
+@_compiled
+def _spread(seen, count, explored, weights):
+    """Weights by which samples are drawn, 0 where there is no matter; returns their sum."""
+    matter = 0
+    for k in range(count):
+        if seen[k] >= 0.0:
+            matter += 1
+    total = np.float32(0.0)
+    for k in range(count):
+        weights[k] = np.float32(0.0)
+        if seen[k] >= 0.0:
+            widened = seen[k]
+            if k > 0:
+                widened = max(widened, seen[k - 1])
+            if k + 1 < count:
+                widened = max(widened, seen[k + 1])
+            weights[k] = widened + explored / np.float32(matter)
+            total += weights[k]
+    return total
+
+
+@_compiled
+def _invert(weights, count, total, near, cell, jitter, starts, ends):
+    """Samples of equal weight, each within the stretch of matter that its middle is in."""
+    samples = len(starts)
+    share = total / np.float32(samples + 1)
+    k, passed = 0, np.float32(0.0)
+    while weights[k] == 0.0:
+        k += 1
+    first = k  # of the stretch of matter that step k is in
+    # Quantiles in half steps: starts at even ones, ends two later, middles at odd ones.
+    for half in range(2 * samples + 1):
+        level = (np.float32(half) * np.float32(0.5) + jitter) * share
+        while passed + weights[k] <= level:
+            following = k + 1
+            while following < count and weights[following] == 0.0:
+                following += 1
+            if following == count:
+                break
+            passed += weights[k]
+            if following > k + 1:
+                first = following
+            k = following
+        t = near + (np.float32(k) + min((level - passed) / weights[k], np.float32(1.0))) * cell
+        sample = half // 2
+        if half % 2 == 0:
+            if sample < samples:
+                starts[sample] = t
+            if sample > 0:
+                ends[sample - 1] = min(ends[sample - 1], t)
+        else:
+            last = k + 1
+            while last < count and weights[last] > 0.0:
+                last += 1
+            starts[sample] = max(starts[sample], near + np.float32(first) * cell)
+            ends[sample] = near + np.float32(last) * cell

@@ -1,0 +1,60 @@
+"""nerfstudio's sampler by an occupancy grid, in the place of proposal networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import Sampler
+from torch import Tensor
+
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
+
+
+class OccupancySampler(Sampler):
+    """Samples where the grid holds matter; it has the call of nerfstudio's `ProposalNetworkSampler`.
+
+    Args:
+        grid: over the scene box.
+        num_samples: samples a ray.
+
+    Attributes:
+        rays: of the last call, the indices of the rays that were sampled: those that meet matter. None for all.
+    """
+
+    rays: Int[Tensor, "sampled"] | None
+
+    def __init__(self, grid: OccupancyGrid, num_samples: int) -> None:
+        super().__init__(num_samples)
+        self.grid = grid
+        self.rays = None
+
+    def generate_ray_samples(  # type: ignore[override]
+        self, ray_bundle: RayBundle, density_fns: Sequence[object] = ()
+    ) -> tuple[RaySamples, list, list]:
+        """Samples of the rays that meet matter, and nothing for the proposals that there are not.
+
+        On a GPU all rays are sampled, so that shapes do not depend on the data.
+        """
+        assert ray_bundle.nears is not None and ray_bundle.fars is not None and self.num_samples is not None
+        count = len(ray_bundle)
+        device = ray_bundle.origins.device
+        jitter = torch.rand(count, device=device) if self.training else torch.full((count,), 0.5, device=device)
+        with torch.no_grad():
+            nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
+            starts, ends = self.grid.sample(
+                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
+            )
+        self.rays = None
+        if device.type == "cpu":
+            self.rays = (ends[:, -1] > nears).nonzero()[:, 0]
+            ray_bundle, starts, ends = ray_bundle[self.rays], starts[self.rays], ends[self.rays]
+        return ray_bundle.get_ray_samples(bin_starts=starts[..., None], bin_ends=ends[..., None]), [], []
+
+    def spread(self, values: Float[Tensor, "sampled *channels"], count: int) -> Float[Tensor, "rays *channels"]:
+        """Values of all rays from those of the sampled ones, 0 for the others."""
+        if self.rays is None:
+            return values
+        return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.rays, values)
