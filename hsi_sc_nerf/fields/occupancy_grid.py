@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from hsi_sc_nerf.fields.ray_marching import cell_of, sample_occupied
+from hsi_sc_nerf.fields.ray_marching import sample_occupied
 from hsi_sc_nerf.geometry.visual_hull import visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -22,15 +22,15 @@ GRID_CELLS = 128
 """Cells along the longest side of the scene box."""
 HULL_MARGIN_M = 0.003
 """Cells within this of the hull may hold matter: masks and poses are uncertain by a pixel or two."""
-REFRESH_EVERY = 8
-"""The field's density is asked for after so many steps, each time in this part of the cells."""
-DECAY = 0.6
-"""What is left of a cell's density when the field has less of it: one sample that misses a thin surface must not
-remove it."""
+REFRESH_EVERY, REFRESH_PARTS = 8, 4
+"""After so many steps, the field's density is asked for in one of so many parts of the cells."""
+LEARNED = 0.5
+"""Weight of a new opacity of a cell, in a moving average: a cell is as opaque as its points are on average, so that
+one dense point does not hide what lies behind the cell."""
 
 
 class OccupancyGrid(nn.Module):
-    """Densities of the cells of a grid over the scene box, -1 where there is no matter.
+    """Opacities of the cells of a grid over the scene box, -1 where there is no matter.
 
     Args:
         aabb: scene box, scene units.
@@ -42,16 +42,20 @@ class OccupancyGrid(nn.Module):
         >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16, jitter=torch.rand(1024))
     """
 
-    density: Tensor
+    opacity: Tensor
     lower: Tensor
     _candidates: Tensor
+    _solid: Tensor
 
-    def __init__(self, aabb: Float[Tensor, "2 3"], matter: Bool[Tensor, "x y z"]) -> None:
+    def __init__(
+        self, aabb: Float[Tensor, "2 3"], matter: Bool[Tensor, "x y z"], solid: Bool[Tensor, "x y z"]
+    ) -> None:
         super().__init__()
         self.cell = grid_over(aabb)[1]
         self.register_buffer("lower", aabb[0].clone())
-        self.register_buffer("density", matter.float() - 1.0)
+        self.register_buffer("opacity", matter.float() - 1.0)
         self.register_buffer("_candidates", matter.flatten().nonzero()[:, 0], persistent=False)
+        self.register_buffer("_solid", solid.flatten()[self._candidates], persistent=False)
 
     def sample(
         self,
@@ -61,32 +65,33 @@ class OccupancyGrid(nn.Module):
         fars: Float[Tensor, "rays"],
         num_samples: int,
         jitter: Float[Tensor, "rays"],
+        explored: float,
     ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
         """Starts and ends of samples along rays; see `sample_occupied`."""
         return sample_occupied(
-            origins, directions, nears, fars, self.density, self.lower, self.cell, num_samples, jitter
+            origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples, jitter, explored
         )
+
+    def random_points(self, count: int) -> tuple[Float[Tensor, "count 3"], Bool[Tensor, "count"]]:
+        """Points in cells that may hold matter, and whether they are in solid ones."""
+        chosen = torch.randint(len(self._candidates), (count,), device=self._candidates.device)
+        return self._points_in(self._candidates[chosen]), self._solid[chosen]
+
+    def _points_in(self, cells: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """A random point in each cell."""
+        _, y, z = self.opacity.shape
+        corners = torch.stack([cells // (y * z), cells // z % y, cells % z], dim=-1)
+        return self.lower + (corners + torch.rand(corners.shape, device=cells.device)) * self.cell
 
     @torch.no_grad()
     def refresh(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]], step: int) -> None:
         """Ask for the field's density at a random point of some of the cells, others at each step."""
         if step % REFRESH_EVERY:
             return
-        cells = self._candidates[step // REFRESH_EVERY % REFRESH_EVERY :: REFRESH_EVERY]
-        _, y, z = self.density.shape
-        corners = torch.stack([cells // (y * z), cells // z % y, cells % z], dim=-1)
-        points = self.lower + (corners + torch.rand(corners.shape, device=cells.device)) * self.cell
-        flat = self.density.view(-1)
-        flat[cells] = torch.maximum(DECAY * flat[cells], density_fn(points)[:, 0].to(flat))
-
-    @torch.no_grad()
-    def note(self, points: Float[Tensor, "*n 3"], densities: Float[Tensor, "*n 1"]) -> None:
-        """Raise the cells' densities to those at points inside them, which were computed for a step of training."""
-        cells, inside = cell_of(points, self.density.shape, self.lower, self.cell)
-        flat = self.density.view(-1)
-        cells = cells.flatten()
-        kept = inside.flatten() & (flat[cells] >= 0.0)
-        flat.scatter_reduce_(0, cells, torch.where(kept, densities.flatten().to(flat), -1.0), "amax")
+        cells = self._candidates[step // REFRESH_EVERY % REFRESH_PARTS :: REFRESH_PARTS]
+        density = density_fn(self._points_in(cells))[:, 0].to(self.opacity)
+        flat = self.opacity.view(-1)
+        flat[cells] += LEARNED * (1.0 - torch.exp(-self.cell * density) - flat[cells])
 
 
 def grid_over(aabb: Float[Tensor, "2 3"]) -> tuple[tuple[int, int, int], float]:
@@ -97,19 +102,21 @@ def grid_over(aabb: Float[Tensor, "2 3"]) -> tuple[tuple[int, int, int], float]:
     return (x, y, z), cell
 
 
-def matter_around_hull(
+def bounds_from_masks(
     dataset: PackedDataset,
     frames: Sequence[PackedFrame],
     shape: tuple[int, int, int],
     lower_m: Float[np.ndarray, "3"],
     cell_m: float,
-) -> Bool[np.ndarray, "x y z"]:
-    """Cells of a grid that may hold matter: the visual hull with a margin, and all that is lower than the object.
+) -> tuple[Bool[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
+    """Cells of a grid that may hold matter, and those of them that are taken to be solid until training knows better.
 
-    A few frames may contradict the hull (`visual_hull`). If the masks leave none, all cells may hold matter.
+    The former are the visual hull with a margin, and all that is lower than the object. The latter are the hull, the
+    container, and the disc under it. A few frames may contradict the hull (`visual_hull`). If the masks leave none,
+    all cells may hold matter, and none is solid.
 
     Args:
-        dataset: camera, and the object's box.
+        dataset: camera, container, and the object's box.
         frames: whose masks are used.
         shape: cells along each axis.
         lower_m: corner of the grid, object frame.
@@ -118,15 +125,29 @@ def matter_around_hull(
     centres_m = lower_m + (np.indices(shape).reshape(3, -1).T + 0.5) * cell_m
     low_m, high_m = dataset.object_box_m
     low_m, high_m = low_m - HULL_MARGIN_M, high_m + HULL_MARGIN_M
+    in_box = ((centres_m > low_m) & (centres_m < high_m)).all(axis=1)
     poses = np.stack([frame.camera_to_world for frame in frames])
     distance_m = np.linalg.norm(poses[:, :3, 3] - (low_m + high_m) / 2.0, axis=1).min()
+    masks = np.stack([frame.mask() for frame in frames])
     # By half a cell's diagonal more, so that parts thinner than a cell are kept.
     margin_px = dataset.intrinsics.fl_x * (HULL_MARGIN_M + 0.87 * cell_m) / distance_m
-    masks = np.stack([dilate(frame.mask(), 2 * int(np.ceil(margin_px)) + 1) for frame in frames])
-    in_box = centres_m[((centres_m > low_m) & (centres_m < high_m)).all(axis=1)]
-    hull_m = visual_hull(in_box, masks, poses, dataset.intrinsics)
-    if not len(hull_m) or not any(frame.mask().any() for frame in frames):
-        return np.ones(shape, bool)
-    matter = (centres_m[:, 2] < low_m[2] + 2.0 * HULL_MARGIN_M).reshape(shape)
-    matter[tuple(np.floor((hull_m - lower_m) / cell_m).astype(int).T)] = True
-    return matter
+    widened = np.stack([dilate(mask, 2 * int(np.ceil(margin_px)) + 1) for mask in masks])
+
+    def hull(silhouettes: Bool[np.ndarray, "frames h w"]) -> Bool[np.ndarray, "x y z"]:
+        cells = np.zeros(shape, bool)
+        points_m = visual_hull(centres_m[in_box], silhouettes, poses, dataset.intrinsics)
+        cells[tuple(np.floor((points_m - lower_m) / cell_m).astype(int).T)] = True
+        return cells
+
+    matter = hull(widened)
+    if not masks.any() or not matter.any():
+        return np.ones(shape, bool), np.zeros(shape, bool)
+    solid = hull(masks)
+    from_axis_m, z_m = np.hypot(centres_m[:, 0], centres_m[:, 1]), centres_m[:, 2]
+    below = z_m < low_m[2] + 2.0 * HULL_MARGIN_M
+    if dataset.container is not None:
+        radius_m, height_m = dataset.container.diameter_m / 2.0, dataset.container.height_m
+        below &= (from_axis_m < radius_m + HULL_MARGIN_M) | (z_m < HULL_MARGIN_M)
+        solid |= ((from_axis_m < radius_m) & (z_m < height_m) | (z_m < 0.0)).reshape(shape)
+    matter |= below.reshape(shape)
+    return matter, solid & matter

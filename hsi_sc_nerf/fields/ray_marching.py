@@ -13,11 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-EXPLORED = 0.1
-"""Samples are spread over all cells that may hold matter as if they had this weight together, beside a weight of at
-most 1 of what the ray sees, so that a surface is found where the grid does not have it yet."""
-OPAQUE = 1e-3
-"""Below this transmittance, nothing is sampled any more."""
+MAX_OPACITY = 0.95
+"""Most that a cell hides of what lies behind it: where it is not as opaque as the grid says, that has to be seen."""
 
 
 def sample_occupied(
@@ -25,11 +22,12 @@ def sample_occupied(
     directions: Float[Tensor, "rays 3"],
     nears: Float[Tensor, "rays"],
     fars: Float[Tensor, "rays"],
-    density: Float[Tensor, "x y z"],
+    opacity: Float[Tensor, "x y z"],
     lower: Float[Tensor, "3"],
     cell: float,
     num_samples: int,
     jitter: Float[Tensor, "rays"],
+    explored: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """Starts and ends of the samples along each ray, as distances from its origin.
 
@@ -41,23 +39,25 @@ def sample_occupied(
         directions: unit vectors.
         nears: distances at which the rays enter the grid.
         fars: distances at which they leave it.
-        density: of the cells, per unit length; below 0 where there is no matter.
+        opacity: of the cells along a side, in [0, 1]; below 0 where there is no matter.
         lower: corner of the grid.
         cell: side of a cell.
         num_samples: samples a ray.
         jitter: shift of a ray's samples, in [0, 1); 0.5 for none.
+        explored: weight, all together, of samples that are spread evenly over the cells with matter, beside a weight
+            of at most 1 of what the ray sees: they find a surface where the grid does not have it yet.
     """
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it
 
         rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars)]
-        grid = density.numpy(force=True), lower.numpy(force=True), cell
+        grid = opacity.numpy(force=True), lower.numpy(force=True), cell
         starts, ends = ray_marching_cpu.sample_occupied(
-            *rays, *grid, num_samples, jitter.numpy(force=True), EXPLORED, OPAQUE
+            *rays, *grid, num_samples, jitter.numpy(force=True), explored, MAX_OPACITY
         )
         return torch.from_numpy(starts), torch.from_numpy(ends)
     with torch.no_grad():
-        return sample_with_tensors(origins, directions, nears, fars, density, lower, cell, num_samples, jitter)
+        return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter, explored)
 
 
 def sample_with_tensors(
@@ -65,28 +65,29 @@ def sample_with_tensors(
     directions: Float[Tensor, "rays 3"],
     nears: Float[Tensor, "rays"],
     fars: Float[Tensor, "rays"],
-    density: Float[Tensor, "x y z"],
+    opacity: Float[Tensor, "x y z"],
     lower: Float[Tensor, "3"],
     cell: float,
     num_samples: int,
     jitter: Float[Tensor, "rays"],
+    explored: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """`sample_occupied` as tensor operations of fixed shapes, for a GPU."""
-    steps = march_steps(density.shape)
+    steps = march_steps(opacity.shape)
     index = torch.arange(steps, device=origins.device)
     middles = nears[:, None] + (index + 0.5) * cell
     points = origins[:, None] + directions[:, None] * middles[..., None]
-    cells, inside = cell_of(points, density.shape, lower, cell)
-    along = density.view(-1)[cells]
+    cells, inside = cell_of(points, opacity.shape, lower, cell)
+    along = opacity.view(-1)[cells]
     matter = inside & (along >= 0.0) & (middles < fars[:, None])
-    depth = torch.cumsum(torch.where(matter, along, 0.0) * cell, dim=1)
-    before = torch.nn.functional.pad(depth[:, :-1], (1, 0))
-    matter = matter & (torch.exp(-before) >= OPAQUE)
-    weights = torch.where(matter, torch.exp(-before) - torch.exp(-depth), 0.0)
+    through = 1.0 - torch.where(matter, along, 0.0).clamp_max(MAX_OPACITY)
+    transmittance = torch.cumprod(through, dim=1)
+    before = torch.nn.functional.pad(transmittance[:, :-1], (1, 0), value=1.0)
+    weights = torch.where(matter, before - transmittance, 0.0)
     # A surface may have moved by a cell since the grid was brought up to date.
     widened = torch.nn.functional.max_pool1d(weights[:, None], 3, stride=1, padding=1)[:, 0]
     count = matter.sum(dim=1, keepdim=True).clamp_min(1)
-    weights = torch.where(matter, widened + EXPLORED / count, 0.0)
+    weights = torch.where(matter, widened + explored / count, 0.0)
 
     # Stretches of cells with matter, of which no sample leaves the one that its middle is in.
     outside = torch.where(matter, -1, index)

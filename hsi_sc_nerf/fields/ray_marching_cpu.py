@@ -17,36 +17,36 @@ def sample_occupied(
     directions: Float32[np.ndarray, "rays 3"],
     nears: Float32[np.ndarray, "rays"],
     fars: Float32[np.ndarray, "rays"],
-    density: Float32[np.ndarray, "x y z"],
+    opacity: Float32[np.ndarray, "x y z"],
     lower: Float32[np.ndarray, "3"],
     cell: float,
     num_samples: int,
     jitter: Float32[np.ndarray, "rays"],
     explored: float,
-    opaque: float,
+    max_opacity: float,
 ) -> tuple[Float32[np.ndarray, "rays samples"], Float32[np.ndarray, "rays samples"]]:
-    """Starts and ends of the samples; arguments are those of `ray_marching.sample_occupied` and its constants."""
-    steps = int(np.linalg.norm(density.shape)) + 2
+    """Starts and ends of the samples; see `ray_marching.sample_occupied`."""
+    steps = int(np.linalg.norm(opacity.shape)) + 2
     starts = np.empty((len(origins), num_samples), np.float32)
     ends = np.empty_like(starts)
     with ONE_AT_A_TIME:
         _sample_rays(
-            origins, directions, nears, fars, density, lower, np.float32(cell), jitter, np.float32(explored),
-            np.float32(opaque), steps, starts, ends,
+            origins, directions, nears, fars, opacity, lower, np.float32(cell), jitter, np.float32(explored),
+            np.float32(max_opacity), steps, starts, ends,
         )  # fmt: skip
     return starts, ends
 
 
 @_shared
 def _sample_rays(
-    origins, directions, nears, fars, density, lower, cell, jitter, explored, opaque, steps, starts, ends
+    origins, directions, nears, fars, opacity, lower, cell, jitter, explored, max_opacity, steps, starts, ends
 ):
     parts = 16
     for part in numba.prange(parts):
         weights = np.empty(steps, np.float32)
         seen = np.empty(steps, np.float32)
         for i in range(len(origins) * part // parts, len(origins) * (part + 1) // parts):
-            count = _march(origins[i], directions[i], nears[i], fars[i], density, lower, cell, opaque, seen)
+            count = _march(origins[i], directions[i], nears[i], fars[i], opacity, lower, cell, max_opacity, seen)
             total = _spread(seen, count, explored, weights)
             if total > 0.0:
                 _invert(weights, count, total, nears[i], cell, jitter[i], starts[i], ends[i])
@@ -55,23 +55,23 @@ def _sample_rays(
 
 
 @_compiled
-def _march(origin, direction, near, far, density, lower, cell, opaque, seen):
+def _march(origin, direction, near, far, opacity, lower, cell, max_opacity, seen):
     """Weight with which each step of a ray is seen, -1 where it holds no matter; returns the number of steps."""
     transmittance = np.float32(1.0)
     for k in range(len(seen)):
         t = near + (np.float32(k) + np.float32(0.5)) * cell
-        if not t < far or transmittance < opaque:
+        if not t < far:
             return k
         seen[k] = np.float32(-1.0)
         x = np.int64(np.floor((origin[0] + direction[0] * t - lower[0]) / cell))
         y = np.int64(np.floor((origin[1] + direction[1] * t - lower[1]) / cell))
         z = np.int64(np.floor((origin[2] + direction[2] * t - lower[2]) / cell))
-        if 0 <= x < density.shape[0] and 0 <= y < density.shape[1] and 0 <= z < density.shape[2]:
-            value = density[x, y, z]
+        if 0 <= x < opacity.shape[0] and 0 <= y < opacity.shape[1] and 0 <= z < opacity.shape[2]:
+            value = opacity[x, y, z]
             if value >= 0.0:
-                through = np.exp(-value * cell)
-                seen[k] = transmittance * (np.float32(1.0) - through)
-                transmittance *= through
+                value = min(value, max_opacity)
+                seen[k] = transmittance * value
+                transmittance *= np.float32(1.0) - value
     return len(seen)
 
 

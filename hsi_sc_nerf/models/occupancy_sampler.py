@@ -29,6 +29,7 @@ class OccupancySampler(Sampler):
     def __init__(self, grid: OccupancyGrid, num_samples: int) -> None:
         super().__init__(num_samples)
         self.grid = grid
+        self.explored = 0.1
         self.rays = None
 
     def generate_ray_samples(  # type: ignore[override]
@@ -45,7 +46,7 @@ class OccupancySampler(Sampler):
         with torch.no_grad():
             nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
             starts, ends = self.grid.sample(
-                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
+                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter, self.explored
             )
         self.rays = None
         if device.type == "cpu":

@@ -34,7 +34,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
-from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over, matter_around_hull
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over, bounds_from_masks
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
@@ -177,6 +177,7 @@ class SpectralModel(NerfactoModel):
             self.scene_box.aabb,
             num_bands=len(dataset.wavelengths_nm),
             view_dependent=config.view_dependent,
+            skip_unseen=config.num_proposal_iterations == 0,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
             base_res=config.base_res,
@@ -229,14 +230,22 @@ class SpectralModel(NerfactoModel):
         shape, cell = grid_over(aabb)
         box_m = dataset.scene_box_m
         cell_m = cell * float((box_m[1] - box_m[0]).max() / (aabb[1] - aabb[0]).max())
-        matter = matter_around_hull(dataset, frames, shape, box_m[0], cell_m)
-        self.occupancy = OccupancyGrid(aabb, torch.from_numpy(matter))
+        matter, solid = bounds_from_masks(dataset, frames, shape, box_m[0], cell_m)
+        self.occupancy = OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
         self.proposal_sampler = OccupancySampler(self.occupancy, self.config.num_nerf_samples_per_ray)
 
     def refresh_occupancy(self, step: int) -> None:
         """Bring a part of the occupancy grid up to date, before a step of training."""
         if self.occupancy is not None:
+            import os
+            if step == 0 and os.environ.get('SS','80')!='0':
+                self.field.start_solid(self.occupancy.random_points)
+                for k in range(16): self.occupancy.refresh(self.field.density_fn, 8*k)
             self.occupancy.refresh(self.field.density_fn, step)
+            N,E,S=(float(x) for x in os.environ.get('EXPL','500,3,32').split(','))
+            left=max(0.0,1.0-step/N)
+            self.proposal_sampler.explored = float(os.environ.get('EX','0.2')) + E*left
+            self.proposal_sampler.num_samples = int(S) if left>0 else self.config.num_nerf_samples_per_ray
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nerfacto's groups, without that of the proposals where there are none."""
@@ -278,7 +287,6 @@ class SpectralModel(NerfactoModel):
         (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
         if self.occupancy is None:
             return distortion_loss([weights], [samples])
-        self.occupancy.note(samples.frustums.get_positions(), self.field.last_density)
         distortion = separate_distortion(weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
         return distortion.sum() / len(outputs["accumulation"])
 
