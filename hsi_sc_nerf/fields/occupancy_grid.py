@@ -11,9 +11,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_erosion, binary_fill_holes
 from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.ray_marching import sample_occupied
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.geometry.visual_hull import visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -151,3 +153,24 @@ def bounds_from_masks(
         solid |= ((from_axis_m < radius_m) & (z_m < height_m) | (z_m < 0.0)).reshape(shape)
     matter |= below.reshape(shape)
     return matter, solid & matter
+
+
+def pixels_of_cells(
+    cells: Bool[np.ndarray, "x y z"],
+    lower_m: Float[np.ndarray, "3"],
+    cell_m: float,
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+) -> Bool[np.ndarray, "frames h w"]:
+    """Pixels of each frame that look at some of the cells, and a few beside them; lens distortion is neglected."""
+    surface = cells & ~binary_erosion(cells)
+    centres_m = lower_m + (np.argwhere(surface) + 0.5) * cell_m
+    seen = np.zeros((len(camera_to_worlds), intrinsics.h, intrinsics.w), bool)
+    for pixels, pose in zip(seen, camera_to_worlds, strict=True):
+        places, depth_m = project(centres_m, pose, intrinsics)
+        x, y = np.floor(places).astype(int).T
+        inside = (depth_m > 0.0) & (x >= 0) & (x < intrinsics.w) & (y >= 0) & (y < intrinsics.h)
+        pixels[y[inside], x[inside]] = True
+        cell_px = intrinsics.fl_x * 1.8 * cell_m / depth_m.min()
+        pixels[:] = binary_fill_holes(dilate(pixels, 2 * int(np.ceil(cell_px)) + 3))
+    return seen

@@ -34,7 +34,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
-from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over, bounds_from_masks
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
@@ -136,7 +136,7 @@ class SpectralModel(NerfactoModel):
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
         self.proposal_networks = torch.nn.ModuleList()
-        self.density_fns, self.occupancy = [], None
+        self.density_fns, self.occupancy, self.pixels_with_matter = [], None, None
         if config.num_proposal_iterations > 0:
             self._build_proposals(contraction)
         else:
@@ -231,6 +231,8 @@ class SpectralModel(NerfactoModel):
         box_m = dataset.scene_box_m
         cell_m = cell * float((box_m[1] - box_m[0]).max() / (aabb[1] - aabb[0]).max())
         matter, solid = bounds_from_masks(dataset, frames, shape, box_m[0], cell_m)
+        poses = np.stack([frame.camera_to_world for frame in frames])
+        self.pixels_with_matter = pixels_of_cells(matter, box_m[0], cell_m, poses, dataset.intrinsics)
         self.occupancy = OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
         self.proposal_sampler = OccupancySampler(self.occupancy, self.config.num_nerf_samples_per_ray)
 
