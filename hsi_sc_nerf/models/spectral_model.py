@@ -44,6 +44,9 @@ from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
 
+METRIC_STRIDE = 8
+"""The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
+
 
 @dataclass
 class SpectralModelConfig(NerfactoModelConfig):
@@ -298,11 +301,11 @@ class SpectralModel(NerfactoModel):
         return batch["spectral"].to(self.device), None if valid is None else valid.to(self.device)
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
-        """SAM, RMSE and PSNR of the batch over all bands, distortion, size of the pose corrections."""
+        """SAM, RMSE and PSNR of some of the batch's rays, distortion, size of the pose corrections."""
         with torch.no_grad():
-            target, valid = self._measured(batch)
+            target, valid = (None if spectra is None else spectra[::METRIC_STRIDE] for spectra in self._measured(batch))
             # The metrics take images: the batch is one of a single line.
-            line = outputs["spectral"][None], target[None], None, None if valid is None else valid[None]
+            line = outputs["spectral"][None, ::METRIC_STRIDE], target[None], None, None if valid is None else valid[None]
             metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
