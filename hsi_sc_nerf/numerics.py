@@ -152,9 +152,11 @@ class _CompiledAngle(torch.autograd.Function):
 
         a, b = (spectra.numpy(force=True) for spectra in ctx.saved_tensors)
         upstream = gradient.contiguous().numpy(force=True)
-        wanted = zip(ctx.needs_input_grad, ((a, b), (b, a)), strict=True)
-        found = [torch.from_numpy(spectral_angle_cpu.angle_gradient(*pair, upstream)) if w else None for w, pair in wanted]
-        return found[0], found[1]
+        gradients: list[Tensor | None] = [None, None]
+        for i, pair in enumerate(((a, b), (b, a))):
+            if ctx.needs_input_grad[i]:
+                gradients[i] = torch.from_numpy(spectral_angle_cpu.angle_gradient(*pair, upstream))
+        return gradients[0], gradients[1]
 
 
 def one_minus_cosine(

@@ -16,9 +16,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 _compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
-def angles(
-    a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]
-) -> Float32[np.ndarray, "n"]:
+def angles(a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]) -> Float32[np.ndarray, "n"]:
     """`numerics.spectral_angle` of each pair of spectra."""
     found = np.empty(len(a), np.float32)
     _angles(a, b, found)

@@ -26,6 +26,8 @@ HULL_MARGIN_M = 0.003
 """Cells within this of the hull may hold matter: masks and poses are uncertain by a pixel or two."""
 REFRESH_EVERY, REFRESH_PARTS = 8, 4
 """After so many steps, the field's density is asked for in one of so many parts of the cells."""
+FULL_REFRESHES = 4
+"""A new field is asked so often in each cell, by when the average has forgotten what it began with."""
 LEARNED = 0.5
 """Weight of a new opacity of a cell, in a moving average: a cell is as opaque as its points are on average, so that
 one dense point does not hide what lies behind the cell."""
@@ -67,11 +69,10 @@ class OccupancyGrid(nn.Module):
         fars: Float[Tensor, "rays"],
         num_samples: int,
         jitter: Float[Tensor, "rays"],
-        explored: float,
     ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
         """Starts and ends of samples along rays; see `sample_occupied`."""
         return sample_occupied(
-            origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples, jitter, explored
+            origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples, jitter
         )
 
     def random_points(self, count: int) -> tuple[Float[Tensor, "count 3"], Bool[Tensor, "count"]]:
@@ -88,9 +89,18 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def refresh(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]], step: int) -> None:
         """Ask for the field's density at a random point of some of the cells, others at each step."""
-        if step % REFRESH_EVERY:
-            return
-        cells = self._candidates[step // REFRESH_EVERY % REFRESH_PARTS :: REFRESH_PARTS]
+        if step % REFRESH_EVERY == 0:
+            self._refresh_part(density_fn, step // REFRESH_EVERY % REFRESH_PARTS)
+
+    @torch.no_grad()
+    def refresh_all(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]]) -> None:
+        """Take over the field's density in all cells."""
+        for _ in range(FULL_REFRESHES):
+            for part in range(REFRESH_PARTS):
+                self._refresh_part(density_fn, part)
+
+    def _refresh_part(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]], part: int) -> None:
+        cells = self._candidates[part::REFRESH_PARTS]
         density = density_fn(self._points_in(cells))[:, 0].to(self.opacity)
         flat = self.opacity.view(-1)
         flat[cells] += LEARNED * (1.0 - torch.exp(-self.cell * density) - flat[cells])

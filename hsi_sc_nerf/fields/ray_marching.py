@@ -13,6 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+EXPLORED = 0.25
+"""Weight of samples that are spread over all cells with matter, beside at most 1 for what the ray sees. With 0.1, a
+surface that the grid does not have yet is found too late."""
 MAX_OPACITY = 0.95
 """Most that a cell hides of what lies behind it: where it is not as opaque as the grid says, that has to be seen."""
 
@@ -27,7 +30,6 @@ def sample_occupied(
     cell: float,
     num_samples: int,
     jitter: Float[Tensor, "rays"],
-    explored: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """Starts and ends of the samples along each ray, as distances from its origin.
 
@@ -44,8 +46,6 @@ def sample_occupied(
         cell: side of a cell.
         num_samples: samples a ray.
         jitter: shift of a ray's samples, in [0, 1); 0.5 for none.
-        explored: weight, all together, of samples that are spread evenly over the cells with matter, beside a weight
-            of at most 1 of what the ray sees: they find a surface where the grid does not have it yet.
     """
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it
@@ -53,11 +53,13 @@ def sample_occupied(
         rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars)]
         grid = opacity.numpy(force=True), lower.numpy(force=True), cell
         starts, ends = ray_marching_cpu.sample_occupied(
-            *rays, *grid, num_samples, jitter.numpy(force=True), explored, MAX_OPACITY
+            *rays, *grid, num_samples, jitter.numpy(force=True), EXPLORED, MAX_OPACITY
         )
         return torch.from_numpy(starts), torch.from_numpy(ends)
     with torch.no_grad():
-        return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter, explored)
+        return sample_with_tensors(
+            origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter, explored
+        )
 
 
 def sample_with_tensors(
@@ -70,7 +72,6 @@ def sample_with_tensors(
     cell: float,
     num_samples: int,
     jitter: Float[Tensor, "rays"],
-    explored: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """`sample_occupied` as tensor operations of fixed shapes, for a GPU."""
     steps = march_steps(opacity.shape)
@@ -87,7 +88,7 @@ def sample_with_tensors(
     # A surface may have moved by a cell since the grid was brought up to date.
     widened = torch.nn.functional.max_pool1d(weights[:, None], 3, stride=1, padding=1)[:, 0]
     count = matter.sum(dim=1, keepdim=True).clamp_min(1)
-    weights = torch.where(matter, widened + explored / count, 0.0)
+    weights = torch.where(matter, widened + EXPLORED / count, 0.0)
 
     # Stretches of cells with matter, of which no sample leaves the one that its middle is in.
     outside = torch.where(matter, -1, index)

@@ -30,9 +30,9 @@ BRIGHTNESS_GAIN = 0.05
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
 explains the views before a surface forms (docs/notes/dead_ends.md)."""
 
-START_DENSITIES = (float(__import__('os').environ.get('SD','40')), 0.5)
+START_DENSITIES = (40.0, 0.5)
 """Densities (per scene unit) that training begins with inside of what is taken to be solid, and outside."""
-START_STEPS, START_POINTS = int(__import__('os').environ.get('SS','80')), 8192
+START_STEPS, START_POINTS = 80, 8192
 NIL_WEIGHT = 1e-4
 """Samples of a smaller weight get no spectrum without a GPU: most lie behind the surface or before it."""
 

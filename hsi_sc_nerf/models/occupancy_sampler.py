@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
-from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 
 class OccupancySampler(Sampler):
@@ -29,7 +31,6 @@ class OccupancySampler(Sampler):
     def __init__(self, grid: OccupancyGrid, num_samples: int) -> None:
         super().__init__(num_samples)
         self.grid = grid
-        self.explored = 0.1
         self.rays = None
 
     def generate_ray_samples(  # type: ignore[override]
@@ -39,14 +40,16 @@ class OccupancySampler(Sampler):
 
         On a GPU all rays are sampled, so that shapes do not depend on the data.
         """
-        assert ray_bundle.nears is not None and ray_bundle.fars is not None and self.num_samples is not None
+        assert ray_bundle.nears is not None
+        assert ray_bundle.fars is not None
+        assert self.num_samples is not None
         count = len(ray_bundle)
         device = ray_bundle.origins.device
         jitter = torch.rand(count, device=device) if self.training else torch.full((count,), 0.5, device=device)
         with torch.no_grad():
             nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
             starts, ends = self.grid.sample(
-                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter, self.explored
+                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
             )
         self.rays = None
         if device.type == "cpu":
@@ -59,3 +62,22 @@ class OccupancySampler(Sampler):
         if self.rays is None:
             return values
         return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.rays, values)
+
+
+def build_occupancy(
+    dataset: PackedDataset, frames: Sequence[PackedFrame], aabb: Float[Tensor, "2 3"]
+) -> tuple[OccupancyGrid, Bool[np.ndarray, "frames h w"]]:
+    """The occupancy grid of a dataset, and the pixels of its frames that look at cells that may hold matter.
+
+    Args:
+        dataset: camera, container, and the boxes of the scene and of the object.
+        frames: whose masks bound the object.
+        aabb: the scene box in scene units.
+    """
+    shape, cell = grid_over(aabb)
+    low_m, high_m = dataset.scene_box_m
+    cell_m = cell * float((high_m - low_m).max() / (aabb[1] - aabb[0]).max())
+    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, cell_m)
+    poses = np.stack([frame.camera_to_world for frame in frames])
+    pixels = pixels_of_cells(matter, low_m, cell_m, poses, dataset.intrinsics)
+    return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid)), pixels

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
@@ -34,14 +32,14 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
-from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
-from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+from hsi_sc_nerf.fields.spectral_field import SpectralField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
-from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
+from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.numerics import safe_log10
-from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting.false_colour import ANGLE_DRAWN_RAD, ERROR_DRAWN
 
 METRIC_STRIDE = 8
@@ -138,12 +136,17 @@ class SpectralModel(NerfactoModel):
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
-        self.proposal_networks = torch.nn.ModuleList()
-        self.density_fns, self.occupancy, self.pixels_with_matter = [], None, None
+        self.occupancy = self.pixels_with_matter = None
+        self.proposal_networks = nn.ModuleList()
         if config.num_proposal_iterations > 0:
-            self._build_proposals(contraction)
+            networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
+            self.proposal_networks.extend(networks)
         else:
-            self._build_occupancy(dataset, metadata["frames"])
+            self.occupancy, self.pixels_with_matter = build_occupancy(
+                dataset, metadata["frames"], self.scene_box.aabb
+            )
+            self.proposal_sampler = OccupancySampler(self.occupancy, config.num_nerf_samples_per_ray)
+        self.density_fns = [network.density_fn for network in self.proposal_networks]
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
@@ -195,70 +198,29 @@ class SpectralModel(NerfactoModel):
             **options,
         )
 
-    def _build_proposals(self, contraction: SceneContraction | None) -> None:
-        """Proposal networks and the sampler that uses them, as in nerfacto."""
-        config = self.config
-        arguments = config.proposal_net_args_list
-        networks = [
-            SpectralProposalField(
-                self.scene_box.aabb,
-                **arguments[min(i, len(arguments) - 1)],
-                spatial_distortion=contraction,
-                average_init_density=config.average_init_density,
-                implementation=config.implementation,
-            )
-            for i in range(1 if config.use_same_proposal_network else config.num_proposal_iterations)
-        ]
-        self.proposal_networks = torch.nn.ModuleList(networks)
-        rounds = config.num_proposal_iterations
-        self.density_fns = [networks[min(i, len(networks) - 1)].density_fn for i in range(rounds)]
+    @property
+    def proposals(self) -> ProposalNetworkSampler | None:
+        """The sampler with proposal networks; None where an occupancy grid places the samples."""
+        return self.proposal_sampler if isinstance(self.proposal_sampler, ProposalNetworkSampler) else None
 
-        def update_schedule(step: int) -> float:
-            rise = step / max(1, config.proposal_warmup) * config.proposal_update_every
-            return float(np.clip(rise, 1, config.proposal_update_every))
-
-        uniform = config.proposal_initial_sampler == "uniform"
-        self.proposal_sampler = ProposalNetworkSampler(
-            num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
-            num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
-            num_proposal_network_iterations=rounds,
-            single_jitter=config.use_single_jitter,
-            update_sched=update_schedule,
-            initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
-        )
-
-    def _build_occupancy(self, dataset: PackedDataset, frames: Sequence[PackedFrame]) -> None:
-        """An occupancy grid from the masks, and the sampler that uses it."""
-        aabb = self.scene_box.aabb
-        shape, cell = grid_over(aabb)
-        box_m = dataset.scene_box_m
-        cell_m = cell * float((box_m[1] - box_m[0]).max() / (aabb[1] - aabb[0]).max())
-        matter, solid = bounds_from_masks(dataset, frames, shape, box_m[0], cell_m)
-        poses = np.stack([frame.camera_to_world for frame in frames])
-        self.pixels_with_matter = pixels_of_cells(matter, box_m[0], cell_m, poses, dataset.intrinsics)
-        self.occupancy = OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
-        self.proposal_sampler = OccupancySampler(self.occupancy, self.config.num_nerf_samples_per_ray)
-
-    def refresh_occupancy(self, step: int) -> None:
-        """Bring a part of the occupancy grid up to date, before a step of training."""
-        if self.occupancy is not None:
-            import os
-            if step == 0 and os.environ.get('SS','80')!='0':
-                self.field.start_solid(self.occupancy.random_points)
-                for k in range(16): self.occupancy.refresh(self.field.density_fn, 8*k)
-            self.occupancy.refresh(self.field.density_fn, step)
-            N,E,S=(float(x) for x in os.environ.get('EXPL','500,3,32').split(','))
-            left=max(0.0,1.0-step/N)
-            self.proposal_sampler.explored = float(os.environ.get('EX','0.2')) + E*left
-            self.proposal_sampler.num_samples = int(S) if left>0 else self.config.num_nerf_samples_per_ray
+    def prepare_step(self, step: int) -> None:
+        """Bring the occupancy grid up to date before a step of training; before the first, the field begins solid."""
+        if self.occupancy is None:
+            return
+        if step == 0:
+            self.field.start_solid(self.occupancy.random_points)
+            self.occupancy.refresh_all(self.field.density_fn)
+        self.occupancy.refresh(self.field.density_fn, step)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nerfacto's groups, without that of the proposals where there are none."""
         return {name: group for name, group in super().get_param_groups().items() if group}
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Nerfacto's callbacks, which are the proposals'."""
-        return [] if self.occupancy is not None else super().get_training_callbacks(training_callback_attributes)
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfacto's callbacks, which are those of the proposals."""
+        return [] if self.proposals is None else super().get_training_callbacks(training_callback_attributes)
 
     def background_spectrum(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
         """Reflectance of the chamber behind rays as measured, before the pose refinement; 0 without a background."""
@@ -292,7 +254,8 @@ class SpectralModel(NerfactoModel):
         (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
         if self.occupancy is None:
             return distortion_loss([weights], [samples])
-        distortion = separate_distortion(weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
+        frustums = samples.frustums
+        distortion = separate_distortion(weights[..., 0], frustums.starts[..., 0], frustums.ends[..., 0])
         return distortion.sum() / len(outputs["accumulation"])
 
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
@@ -303,10 +266,15 @@ class SpectralModel(NerfactoModel):
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
         """SAM, RMSE and PSNR of some of the batch's rays, distortion, size of the pose corrections."""
         with torch.no_grad():
-            target, valid = (None if spectra is None else spectra[::METRIC_STRIDE] for spectra in self._measured(batch))
+            target, valid = self._measured(batch)
+            some = slice(None, None, METRIC_STRIDE)
             # The metrics take images: the batch is one of a single line.
-            line = outputs["spectral"][None, ::METRIC_STRIDE], target[None], None, None if valid is None else valid[None]
-            metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
+            images = (outputs["spectral"][None, some], target[None, some])
+            flags = None if valid is None else valid[None, some]
+            metrics = {
+                "sam": spectral_angle_mapper(*images, valid=flags),
+                "rmse": spectral_rmse(*images, valid=flags),
+            }
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
             metrics["distortion"] = self._distortion(outputs)
