@@ -11,6 +11,7 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
@@ -73,9 +74,18 @@ def build_occupancy(
         dataset: camera, container, and the boxes of the scene and of the object.
         frames: whose masks bound the object.
         aabb: the scene box in scene units.
+
+    Raises:
+        InputError: the scene is not the dataset's box.
     """
     shape, cell = grid_over(aabb)
     low_m, high_m = dataset.scene_box_m
+    proportions = ((side := high - low) / side.max() for low, high in (dataset.scene_box_m, aabb.numpy(force=True)))
+    if not np.allclose(*proportions, atol=1e-3):
+        raise InputError(
+            "the data parser's --scene cameras is no box of what turns, which the occupancy grid needs; take "
+            "--pipeline.model.num-proposal-iterations 2 and --pipeline.model.disable-scene-contraction False with it."
+        )
     cell_m = cell * float((high_m - low_m).max() / (aabb[1] - aabb[0]).max())
     matter, solid = bounds_from_masks(dataset, frames, shape, low_m, cell_m)
     poses = np.stack([frame.camera_to_world for frame in frames])

@@ -101,6 +101,11 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Refinement of the measured poses."""
 
     def __post_init__(self) -> None:
+        if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
+            raise SystemExit(
+                "hsi-sc-nerf: an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 "
+                "with --pipeline.model.disable-scene-contraction False."
+            )
         if self.head == "basis" and self.background == "last-sample":
             raise SystemExit(
                 "hsi-sc-nerf: --pipeline.model.background last-sample needs a value in every band at each sample; "
