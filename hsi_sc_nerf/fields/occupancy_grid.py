@@ -42,8 +42,8 @@ class OccupancyGrid(nn.Module):
 
     Example:
         >>> shape, cell = grid_over(aabb)
-        >>> grid = OccupancyGrid(aabb, torch.ones(shape, dtype=torch.bool))
-        >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16, jitter=torch.rand(1024))
+        >>> grid = OccupancyGrid(aabb, matter, solid)
+        >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16, jitter=jitter)
     """
 
     opacity: Tensor

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 from jaxtyping import Float32
 
-from hsi_sc_nerf.fields.hash_grid_cpu import ONE_AT_A_TIME
-
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
-_shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
+from hsi_sc_nerf.fields.hash_grid_cpu import compiled, run_in_parts, shared
 
 
 def sample_occupied(
@@ -26,37 +25,39 @@ def sample_occupied(
     max_opacity: float,
 ) -> tuple[Float32[np.ndarray, "rays samples"], Float32[np.ndarray, "rays samples"]]:
     """Starts and ends of the samples; see `ray_marching.sample_occupied`."""
-    steps = int(np.linalg.norm(opacity.shape)) + 2
-    starts = np.empty((len(origins), num_samples), np.float32)
-    ends = np.empty_like(starts)
-    with ONE_AT_A_TIME:
-        _sample_rays(
-            origins, directions, nears, fars, opacity, lower, np.float32(cell), jitter, np.float32(explored),
-            np.float32(max_opacity), steps, starts, ends,
-        )  # fmt: skip
-    return starts, ends
+    results = np.empty((len(origins), num_samples), np.float32), np.empty((len(origins), num_samples), np.float32)
+    rays = origins, directions, nears, fars, jitter
+    grid = opacity, lower, np.float32(cell), np.float32(max_opacity)
+    run_in_parts(_sample, _sample_at_once, len(origins), rays, grid, np.float32(explored), results)
+    return results
 
 
-@_shared
-def _sample_rays(
-    origins, directions, nears, fars, opacity, lower, cell, jitter, explored, max_opacity, steps, starts, ends
-):
-    parts = 16
+@compiled
+def _sample(rays, grid, explored, results, part, parts):
+    origins, directions, nears, fars, jitter = rays
+    starts, ends = results
+    x, y, z = grid[0].shape
+    weights = np.empty(int(math.sqrt(x * x + y * y + z * z)) + 2, np.float32)
+    seen = np.empty_like(weights)
+    for i in range(len(origins) * part // parts, len(origins) * (part + 1) // parts):
+        count = _march(origins[i], directions[i], nears[i], fars[i], grid, seen)
+        total = _spread(seen, count, explored, weights)
+        if total > 0.0:
+            _invert(weights, count, total, nears[i], grid[2], jitter[i], starts[i], ends[i])
+        else:
+            starts[i], ends[i] = nears[i], nears[i]
+
+
+@shared
+def _sample_at_once(rays, grid, explored, results, parts):
     for part in numba.prange(parts):
-        weights = np.empty(steps, np.float32)
-        seen = np.empty(steps, np.float32)
-        for i in range(len(origins) * part // parts, len(origins) * (part + 1) // parts):
-            count = _march(origins[i], directions[i], nears[i], fars[i], opacity, lower, cell, max_opacity, seen)
-            total = _spread(seen, count, explored, weights)
-            if total > 0.0:
-                _invert(weights, count, total, nears[i], cell, jitter[i], starts[i], ends[i])
-            else:
-                starts[i], ends[i] = nears[i], nears[i]
+        _sample(rays, grid, explored, results, part, parts)
 
 
-@_compiled
-def _march(origin, direction, near, far, opacity, lower, cell, max_opacity, seen):
+@compiled
+def _march(origin, direction, near, far, grid, seen):
     """Weight with which each step of a ray is seen, -1 where it holds no matter; returns the number of steps."""
+    opacity, lower, cell, max_opacity = grid
     transmittance = np.float32(1.0)
     for k in range(len(seen)):
         t = near + (np.float32(k) + np.float32(0.5)) * cell
@@ -75,7 +76,7 @@ def _march(origin, direction, near, far, opacity, lower, cell, max_opacity, seen
     return len(seen)
 
 
-@_compiled
+@compiled
 def _spread(seen, count, explored, weights):
     """Weights by which samples are drawn, 0 where there is no matter; returns their sum."""
     matter = 0
@@ -96,7 +97,7 @@ def _spread(seen, count, explored, weights):
     return total
 
 
-@_compiled
+@compiled
 def _invert(weights, count, total, near, cell, jitter, starts, ends):
     """Samples of equal weight, each within the stretch of matter that its middle is in."""
     samples = len(starts)

@@ -58,11 +58,11 @@ class OccupancySampler(Sampler):
             ray_bundle, starts, ends = ray_bundle[self.rays], starts[self.rays], ends[self.rays]
         return ray_bundle.get_ray_samples(bin_starts=starts[..., None], bin_ends=ends[..., None]), [], []
 
-    def spread(self, values: Float[Tensor, "sampled *channels"], count: int) -> Float[Tensor, "rays *channels"]:
-        """Values of all rays from those of the sampled ones, 0 for the others."""
-        if self.rays is None:
-            return values
-        return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.rays, values)
+    def spread(
+        self, values: Float[Tensor, "sampled channels"], others: Float[Tensor, "rays channels"]
+    ) -> Float[Tensor, "rays channels"]:
+        """Values of all rays from those of the sampled ones, and what the ``others`` have."""
+        return values if self.rays is None else others.index_copy(0, self.rays, values)
 
 
 def build_occupancy(

@@ -240,11 +240,7 @@ class SpectralModel(NerfactoModel):
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
         if isinstance(self.proposal_sampler, OccupancySampler):
-            outputs |= {
-                name: self.proposal_sampler.spread(value, len(ray_bundle))
-                for name, value in outputs.items()
-                if isinstance(value, Tensor)
-            }
+            outputs |= self._of_all_rays(outputs, ray_bundle, self.proposal_sampler)
         spectral = self.decoder(outputs["rgb"])
         if background is not None:
             spectral = spectral + background * (1.0 - outputs["accumulation"])
@@ -253,6 +249,16 @@ class SpectralModel(NerfactoModel):
         # An index of numbers would be a transfer to the device, for which that has to wait.
         outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
+
+    def _of_all_rays(self, outputs: dict, rays: RayBundle, sampler: OccupancySampler) -> dict[str, Tensor]:
+        """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
+        assert rays.fars is not None
+        fills = {"depth": rays.fars, "expected_depth": rays.fars}
+        return {
+            name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), value.shape[1])))
+            for name, value in outputs.items()
+            if isinstance(value, Tensor)
+        }
 
     def _distortion(self, outputs: dict) -> Tensor:
         """Distortion of the batch's rays."""
