@@ -34,7 +34,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-proposal-networks": (
         OURS,
         "--pipeline.model.num-proposal-iterations 2 --pipeline.model.num-proposal-samples-per-ray 48 24 "
-        "--pipeline.model.num-nerf-samples-per-ray 24",
+        "--pipeline.model.num-nerf-samples-per-ray 24 --pipeline.model.distortion-loss-mult 0.02",
     ),
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),

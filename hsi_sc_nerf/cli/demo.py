@@ -19,8 +19,6 @@ MARK = ".hsi-sc-nerf-demo"
 # Fewer rays a step than the default, for two cores.
 DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
-    # The default weight is for thousands of steps; in some hundred steps it would cost about one decibel.
-    "pipeline.model.distortion-loss-mult": "0.007",
     "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
     "steps-per-eval-image": "1000000",

@@ -57,9 +57,7 @@ def sample_occupied(
         )
         return torch.from_numpy(starts), torch.from_numpy(ends)
     with torch.no_grad():
-        return sample_with_tensors(
-            origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter, explored
-        )
+        return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter)
 
 
 def sample_with_tensors(

@@ -65,9 +65,9 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
     """Weight of the reflectance errors over pixels and bands."""
-    distortion_loss_mult: float = 0.02
-    """Weight of the distortion loss, which concentrates the density along a ray. nerfacto's 0.002 leaves surfaces
-    thicker, and with 0.2 no surface forms (docs/validation/reconstruction.md)."""
+    distortion_loss_mult: float = 0.001
+    """Weight of the distortion loss, which concentrates the density along a ray. Distances are scene units, or with
+    proposal networks fractions of the ray (docs/notes/dead_ends.md)."""
     view_dependent: bool = True
     """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
     stand still while the object turns."""
@@ -212,7 +212,7 @@ class SpectralModel(NerfactoModel):
         """Bring the occupancy grid up to date before a step of training; before the first, the field begins solid."""
         if self.occupancy is None:
             return
-        if step == 0:
+        if step == 0 and next(self.field.parameters()).requires_grad:  # not if the first stage freezes the field
             self.field.start_solid(self.occupancy.random_points)
             self.occupancy.refresh_all(self.field.density_fn)
         self.occupancy.refresh(self.field.density_fn, step)
