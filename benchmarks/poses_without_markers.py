@@ -48,7 +48,7 @@ from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.spectra.pseudo_rgb import to_8_bit
+from hsi_sc_nerf.spectra import to_8_bit
 
 COLUMNS = (
     "object",

@@ -110,6 +110,7 @@ hsi_sc_nerf_paper = MethodSpecification(
                 far_plane=paper.NEAR_FAR[1],
                 disable_scene_contraction=False,
                 proposal_initial_sampler="piecewise",
+                num_proposal_iterations=2,
                 num_proposal_samples_per_ray=(256, 96),
                 num_nerf_samples_per_ray=48,
                 proposal_net_args_list=[

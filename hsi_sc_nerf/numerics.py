@@ -19,6 +19,7 @@ import math
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 
 def _wider(dtype: torch.dtype) -> torch.dtype:
@@ -121,6 +122,10 @@ def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: 
         >>> spectral_angle(torch.tensor([1.0, 0.0]), torch.tensor([2.0, 2.0]))
         tensor(0.7854)
     """
+    if a.device.type == b.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and a.shape == b.shape:
+        last = a.movedim(dim, -1), b.movedim(dim, -1)
+        flat = (spectra.reshape(-1, spectra.shape[-1]).contiguous() for spectra in last)
+        return _CompiledAngle.apply(*flat).reshape(last[0].shape[:-1])
     u, u_short = _direction(widen(a), dim, 0.0)
     v, v_short = _direction(widen(b), dim, 0.0)
     undirected = ((u_short > 0) | (v_short > 0)).squeeze(dim)
@@ -128,6 +133,30 @@ def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: 
     total = torch.where(undirected, 1.0, _root((u + v).square().sum(dim)))
     angle = torch.where(undirected, math.pi / 2, 2.0 * torch.atan2(difference, total))
     return narrow(angle, a, b)
+
+
+class _CompiledAngle(torch.autograd.Function):
+    """The angle between rows of float32 spectra on the processor; it can be differentiated once."""
+
+    @staticmethod
+    def forward(ctx, a: Tensor, b: Tensor) -> Tensor:
+        from hsi_sc_nerf import spectral_angle_cpu  # compiles; a GPU does without it
+
+        ctx.save_for_backward(a, b)
+        return torch.from_numpy(spectral_angle_cpu.angles(a.numpy(force=True), b.numpy(force=True)))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        from hsi_sc_nerf import spectral_angle_cpu
+
+        a, b = (spectra.numpy(force=True) for spectra in ctx.saved_tensors)
+        upstream = gradient.contiguous().numpy(force=True)
+        gradients: list[Tensor | None] = [None, None]
+        for i, pair in enumerate(((a, b), (b, a))):
+            if ctx.needs_input_grad[i]:
+                gradients[i] = torch.from_numpy(spectral_angle_cpu.angle_gradient(*pair, upstream))
+        return gradients[0], gradients[1]
 
 
 def one_minus_cosine(

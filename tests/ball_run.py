@@ -89,4 +89,4 @@ def fill_with_ball(run) -> None:
         return {FieldHeadNames.DENSITY: densities, FieldHeadNames.RGB: spectrum.expand(*densities.shape[:-1], -1)}
 
     model.field.forward, model.field.density_fn = field, density
-    model.density_fns = [density] * len(model.density_fns)
+    model.occupancy.refresh_all(density)

@@ -221,3 +221,18 @@ def test_left_out_pixels_touch_nothing() -> None:
 def test_a_mask_of_the_wrong_kind_is_refused(mask: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="mask"):
         select_pixels(torch.ones(2, 3, 5), mask)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_the_compiled_angle_and_its_gradients_equal_those_in_float64(scale):
+    torch.manual_seed(0)
+    a, b = scale * torch.rand(50, 204), torch.rand(50, 204)
+    b[:25] = a[:25] / scale + 1e-3 * torch.rand(25, 204)
+    upstream = torch.rand(50) * min(scale, 1.0)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        pair = [spectra.to(dtype).requires_grad_() for spectra in (a, b)]
+        angle = spectral_angle(*pair)
+        found.append([angle, *torch.autograd.grad((angle * upstream).sum(), pair)])
+    for compiled, exact in zip(*found, strict=True):
+        torch.testing.assert_close(compiled.double(), exact, rtol=1e-4, atol=1e-5 * exact.abs().max().item())

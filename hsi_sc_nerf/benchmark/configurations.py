@@ -28,7 +28,13 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
         OURS,
         "--pipeline.datamanager.dataparser.scene cameras --pipeline.model.disable-scene-contraction False "
         "--pipeline.model.proposal-initial-sampler piecewise --pipeline.model.far-plane 5.0 "
-        "--pipeline.model.num-proposal-samples-per-ray 256 96 --pipeline.model.num-nerf-samples-per-ray 48",
+        "--pipeline.model.num-proposal-iterations 2 --pipeline.model.num-proposal-samples-per-ray 256 96 "
+        "--pipeline.model.num-nerf-samples-per-ray 48",
+    ),
+    "ours-proposal-networks": (
+        OURS,
+        "--pipeline.model.num-proposal-iterations 2 --pipeline.model.num-proposal-samples-per-ray 48 24 "
+        "--pipeline.model.num-nerf-samples-per-ray 24 --pipeline.model.distortion-loss-mult 0.02",
     ),
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
     "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),

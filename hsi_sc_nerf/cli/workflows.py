@@ -32,13 +32,9 @@ ITERATIONS_ON_GPU = 40_000
 DEMO_MARK = ".hsi-sc-nerf-demo"
 """File that marks the folder of a demo, whose contents may be replaced."""
 
-# Fewer rays a step than the default, for two cores, and schedules for a run of some hundred steps.
+# Fewer rays a step than the default, for two cores.
 DEMO_TRAINING = {
     "pipeline.datamanager.train-num-rays-per-batch": "1024",
-    "pipeline.model.proposal-warmup": "200",
-    "pipeline.model.proposal-weights-anneal-max-num-iters": "100",
-    # The default weight is for thousands of steps; in some hundred steps it would cost about one decibel.
-    "pipeline.model.distortion-loss-mult": "0.007",
     "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
     "steps-per-eval-image": "1000000",

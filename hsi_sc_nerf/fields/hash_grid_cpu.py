@@ -20,8 +20,8 @@ _PRIME_Y, _PRIME_Z = 2654435761, 805459861  # Müller et al. 2022, Eq. 4; the fi
 _SHARED_FROM = 4096
 """Points from which on threads are worth waking."""
 
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
-_shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
+compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 
 # On Linux these are the threads of torch: others would have to wait for its own, which go on spinning on their cores
 # for milliseconds after every operation.
@@ -30,7 +30,7 @@ numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ign
 _one_at_a_time = Lock()
 
 
-@_compiled
+@compiled
 def _corners(x, y, z, scale, mask, offset):
     """Rows of a cell's eight corners, numbered 4 x + 2 y + z, and where in the cell the point lies."""
     x, y, z = x * scale, y * scale, z * scale
@@ -50,7 +50,7 @@ def _corners(x, y, z, scale, mask, offset):
     return rows, x - floor_x, y - floor_y, z - floor_z
 
 
-@_compiled
+@compiled
 def _weights(x, y, z):
     """Trilinear weights of the corners."""
     one = np.float32(1.0)
@@ -62,7 +62,7 @@ def _weights(x, y, z):
 # The three below do one part of ``parts``.
 
 
-@_compiled
+@compiled
 def _interpolate(positions, table, scalings, mask, features, part, parts):
     channels = table.shape[1]
     first, last = len(positions) * part // parts, len(positions) * (part + 1) // parts
@@ -78,7 +78,7 @@ def _interpolate(positions, table, scalings, mask, features, part, parts):
                 features[i, level * channels + f] = total
 
 
-@_compiled
+@compiled
 def _add_to_table(positions, scalings, mask, gradient, grad_table, part, parts):
     """Gradient with respect to the table. Every part gets coarse and fine levels: the coarse ones are done sooner."""
     channels = grad_table.shape[1]
@@ -93,7 +93,7 @@ def _add_to_table(positions, scalings, mask, gradient, grad_table, part, parts):
                     grad_table[rows[corner], f] += weights[corner] * upstream
 
 
-@_compiled
+@compiled
 def _position_gradients(positions, table, scalings, mask, gradient, grad_positions, part, parts):
     channels = table.shape[1]
     first, last = len(positions) * part // parts, len(positions) * (part + 1) // parts
@@ -119,26 +119,33 @@ def _position_gradients(positions, table, scalings, mask, gradient, grad_positio
             grad_positions[i, 2] += scalings[level] * along_z
 
 
-@_shared
+@shared
 def _interpolate_at_once(positions, table, scalings, mask, features, parts):
     for part in numba.prange(parts):
         _interpolate(positions, table, scalings, mask, features, part, parts)
 
 
-@_shared
+@shared
 def _add_to_table_at_once(positions, scalings, mask, gradient, grad_table, parts):
     for part in numba.prange(parts):
         _add_to_table(positions, scalings, mask, gradient, grad_table, part, parts)
 
 
-@_shared
+@shared
 def _position_gradients_at_once(positions, table, scalings, mask, gradient, grad_positions, parts):
     for part in numba.prange(parts):
         _position_gradients(positions, table, scalings, mask, gradient, grad_positions, part, parts)
 
 
-def _run(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
-    """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it."""
+def run_in_parts(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
+    """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it.
+
+    Args:
+        alone: takes the arguments, the number of a part and how many parts there are.
+        at_once: takes the arguments and the number of parts, and does them side by side.
+        points: how many there are to work on.
+        *arguments: of the kernel.
+    """
     threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     if threads == 1 or points < _SHARED_FROM:
         alone(*arguments, 0, 1)
@@ -157,7 +164,7 @@ def interpolate(
     """Trilinear interpolation of a stack of hashed grids, as `hash_grid.interpolate_hash_grid` describes it."""
     features = np.empty((len(positions), len(scalings) * table.shape[1]), np.float32)
     arguments = positions, table, scalings, table_size - 1, features
-    _run(_interpolate, _interpolate_at_once, len(positions), *arguments)
+    run_in_parts(_interpolate, _interpolate_at_once, len(positions), *arguments)
     return features
 
 
@@ -171,7 +178,7 @@ def table_gradient(
     """Gradient with respect to the table; threads share the levels, whose rows are apart."""
     grad_table = np.zeros_like(table)
     arguments = positions, scalings, table_size - 1, gradient, grad_table
-    _run(_add_to_table, _add_to_table_at_once, len(positions), *arguments)
+    run_in_parts(_add_to_table, _add_to_table_at_once, len(positions), *arguments)
     return grad_table
 
 
@@ -185,5 +192,5 @@ def position_gradient(
     """Gradient with respect to the positions."""
     grad_positions = np.zeros_like(positions)
     arguments = positions, table, scalings, table_size - 1, gradient, grad_positions
-    _run(_position_gradients, _position_gradients_at_once, len(positions), *arguments)
+    run_in_parts(_position_gradients, _position_gradients_at_once, len(positions), *arguments)
     return grad_positions

@@ -8,8 +8,11 @@ channels are coefficients of a spectral basis, linear so that they can be compos
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.activations import trunc_exp
@@ -27,6 +30,12 @@ BRIGHTNESS_GAIN = 0.05
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
 explains the views before a surface forms (docs/notes/dead_ends.md)."""
 
+START_DENSITIES = (40.0, 0.5)
+"""Densities (per scene unit) that training begins with inside of what is taken to be solid, and outside."""
+START_STEPS, START_POINTS = 80, 8192
+NIL_WEIGHT = 1e-4
+"""Samples of a smaller weight get no spectrum without a GPU: most lie behind the surface or before it."""
+
 
 class SpectralField(NerfactoField):
     """Nerfacto's field whose radiance head has a channel for each band, or for each coefficient of a spectral basis.
@@ -40,6 +49,7 @@ class SpectralField(NerfactoField):
         view_dependent: whether spectra depend on the viewing direction.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
+        skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
         **nerfacto: other arguments of `NerfactoField`.
 
     Example:
@@ -57,10 +67,12 @@ class SpectralField(NerfactoField):
         view_dependent: bool = True,
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
+        skip_unseen: bool = False,
         **nerfacto,
     ) -> None:
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
         self.view_dependent = view_dependent
+        self.skip_unseen = skip_unseen
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
             in_dim=direction_channels + self.geo_feat_dim + self.appearance_embedding_dim,
@@ -93,7 +105,14 @@ class SpectralField(NerfactoField):
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
         density = self.average_init_density * trunc_exp(hidden[..., :1].to(inside)) * inside
+        self.last_density = density.detach()
         return density, hidden[..., 1:]
+
+    def _seen(self, ray_samples: RaySamples) -> Int[Tensor, "seen"] | None:
+        """Samples (flat) with a weight worth a spectrum; None for all. A GPU is faster with shapes that are fixed."""
+        if not self.skip_unseen or ray_samples.frustums.directions.device.type != "cpu":
+            return None
+        return (ray_samples.get_weights(self.last_density) > NIL_WEIGHT).flatten().nonzero()[:, 0]
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
@@ -105,16 +124,30 @@ class SpectralField(NerfactoField):
             positions = self.position_encoding(ray_samples.frustums.get_positions())
             hidden = self.mlp_pred_normals(torch.cat([positions, density_embedding], dim=-1))
             outputs[FieldHeadNames.PRED_NORMALS] = self.field_head_pred_normals(hidden)
-        inputs = [density_embedding]
+        seen = self._seen(ray_samples)
+        samples = ray_samples.frustums.shape
+
+        def of_samples(values: Float[Tensor, "*bs channels"]) -> Float[Tensor, "seen channels"]:
+            """Values of the samples that are seen, from those of samples or (a sample long) of rays."""
+            if seen is None:
+                return values.expand(*samples, -1)
+            if values.shape[-2] == 1:
+                return values.flatten(0, -2)[seen // samples[-1]]
+            return values.flatten(0, -2)[seen]
+
+        inputs = [of_samples(density_embedding)]
         if self.view_dependent:
             # Encoded once a ray, not at every sample as in nerfacto, which saves time without a GPU.
-            directions = get_normalized_directions(ray_samples.frustums.directions[..., 0, :])
-            encoded = self.direction_encoding(directions)[..., None, :]
-            inputs.insert(0, encoded.expand(*density_embedding.shape[:-1], -1))
+            directions = get_normalized_directions(ray_samples.frustums.directions[..., :1, :])
+            inputs.insert(0, of_samples(self.direction_encoding(directions)))
         if self.embedding_appearance is not None:
-            inputs.append(self._appearance(ray_samples).expand(*density_embedding.shape[:-1], -1))
+            inputs.append(of_samples(self._appearance(ray_samples).expand(*samples, -1)))
         # tiny-cuda-nn's encodings are in half precision, the head's weights are not.
-        outputs[FieldHeadNames.RGB] = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
+        spectra = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
+        if seen is not None:
+            nothing = spectra.new_zeros(samples.numel(), spectra.shape[-1])
+            spectra = nothing.index_copy(0, seen, spectra).view(*samples, -1)
+        outputs[FieldHeadNames.RGB] = spectra
         return outputs
 
     def _appearance(self, ray_samples: RaySamples) -> Float[Tensor, "#rays #samples embedding"]:
@@ -125,6 +158,26 @@ class SpectralField(NerfactoField):
             return self.embedding_appearance(ray_samples.camera_indices[..., 0])
         average = self.embedding_appearance.mean(dim=0)
         return average if self.use_average_appearance_embedding else torch.zeros_like(average)
+
+    def start_solid(
+        self, draw: Callable[[int], tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]], steps: int = START_STEPS
+    ) -> None:
+        """Teach the density where the scene is taken to be solid, before the first step of training.
+
+        Args:
+            draw: gives random points in scene units, and whether they lie in what is solid.
+            steps: of gradient descent.
+        """
+        optimizer = torch.optim.Adam(self.mlp_base.parameters(), lr=1e-2, eps=1e-15)
+        solid, thin = (math.log(density / self.average_init_density) for density in START_DENSITIES)
+        for _ in range(steps):
+            points, is_solid = draw(START_POINTS)
+            hidden = self.mlp_base(grid_positions(points, self.aabb, self.spatial_distortion))[..., 0]
+            loss = (hidden - torch.where(is_solid, solid, thin)).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        optimizer.zero_grad()
 
     def density_gradient(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Gradient of the log density at points in scene units; its negative points out of the surface."""

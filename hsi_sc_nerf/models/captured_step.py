@@ -79,13 +79,15 @@ class CapturedSteps:
             batch: tensors on the device, likewise.
             seed: draws the step's random numbers anew; called before each pass.
         """
-        sampler = self._model.proposal_sampler
-        anneal, counter = sampler._anneal, sampler._steps_since_update
-        self._anneal.fill_(float(anneal))
         self._load(rays, batch)
+        sampler = self._model.proposals
+        if sampler is not None:
+            anneal, counter = sampler._anneal, sampler._steps_since_update
+            self._anneal.fill_(float(anneal))
         if kind not in self._steps:
             self._steps[kind] = self._capture(seed)
-        sampler._anneal, sampler._steps_since_update = anneal, counter
+        if sampler is not None:
+            sampler._anneal, sampler._steps_since_update = anneal, counter
         captured = self._steps[kind]
         seed()
         captured.graph.replay()
@@ -113,19 +115,27 @@ class CapturedSteps:
         return run_step(self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"])
 
     def _capture(self, seed: Callable[[], object]) -> _Captured:
-        sampler = self._model.proposal_sampler
-        sampler._anneal = self._anneal  # type: ignore[assignment]
-        counter = sampler._steps_since_update
+        sampler = self._model.proposals
+        counter = 0
+        if sampler is not None:
+            sampler._anneal = self._anneal  # type: ignore[assignment]
+            counter = sampler._steps_since_update
+
+        def rewind() -> None:
+            """Let the proposals learn in each pass, or in none."""
+            if sampler is not None:
+                sampler._steps_since_update = counter
+
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
             for _ in range(_WARM_UP_PASSES):
-                sampler._steps_since_update = counter
+                rewind()
                 seed()
                 self._pass()
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
-        sampler._steps_since_update = counter
+        rewind()
         with torch.cuda.graph(graph, pool=self._pool):
             result = self._pass()
         self._pool = self._pool or graph.pool()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -84,6 +85,27 @@ def angle_loss(
     """
     p, t, counted = _pixels_with_an_angle(predicted, target, valid)
     return narrow(masked_mean(spectral_angle(p, t), counted), predicted, target)
+
+
+def separate_distortion(
+    weights: Float[Tensor, "rays samples"], starts: Float[Tensor, "rays samples"], ends: Float[Tensor, "rays samples"]
+) -> Float[Tensor, "rays"]:
+    """Distortion of the weights along each ray (Barron et al. 2022, Eq. 15), of samples that may lie apart.
+
+    The mean distance between two points of the ray that are drawn by its weights, unnormalised: it is small where the
+    weights are concentrated.
+
+    Args:
+        weights: of the samples.
+        starts: of the samples, in order.
+        ends: likewise.
+    """
+    middles = (starts + ends) / 2.0
+    # Samples are in order: pairs are summed once, by what lies before each sample.
+    before = torch.cumsum(weights, dim=-1) - weights
+    moment_before = torch.cumsum(weights * middles, dim=-1) - weights * middles
+    between = 2.0 * (weights * (middles * before - moment_before)).sum(dim=-1)
+    return between + (weights.square() * (ends - starts)).sum(dim=-1) / 3.0
 
 
 def _pixels_with_an_angle(

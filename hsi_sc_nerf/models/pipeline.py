@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 SCENE_BUFFERS = ("aabb", "axis_origin")
 """Buffers that place the scene; weights are meaningless in another scene box."""
@@ -26,6 +27,12 @@ class SpectralPipeline(VanillaPipeline):
     """Data and model of a run."""
 
     datamanager: SpectralDataManager
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        pixels = cast(SpectralModel, self.model).pixels_with_matter
+        if pixels is not None:
+            self.datamanager.train_pixel_sampler.restrict_background(pixels)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the weights of a checkpoint that was made with the same model settings and dataset.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, NormalsRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.model_components.shaders import NormalsShader
@@ -19,6 +19,7 @@ from nerfstudio.models.base_model import Model
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils import colormaps
 from torch import Tensor, nn
+from torch.nn import Parameter
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
@@ -31,13 +32,18 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
-from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+from hsi_sc_nerf.fields.spectral_field import SpectralField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
+from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting import ANGLE_DRAWN_RAD, ERROR_DRAWN
+
+METRIC_STRIDE = 8
+"""The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
 
 
 @dataclass
@@ -59,9 +65,9 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the spectral angle's loss."""
     hsi_loss_mult: float = paper.HSI_LOSS_WEIGHT
     """Weight of the reflectance errors over pixels and bands."""
-    distortion_loss_mult: float = 0.02
-    """Weight of the distortion loss, which concentrates the density along a ray. nerfacto's 0.002 leaves surfaces
-    thicker, and with 0.2 no surface forms (docs/validation/reconstruction.md)."""
+    distortion_loss_mult: float = 0.001
+    """Weight of the distortion loss, which concentrates the density along a ray. Distances are scene units, or with
+    proposal networks fractions of the ray (docs/notes/dead_ends.md)."""
     view_dependent: bool = True
     """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
     stand still while the object turns."""
@@ -75,17 +81,11 @@ class SpectralModelConfig(NerfactoModelConfig):
     to be combined with the data parser's --scene cameras."""
     proposal_initial_sampler: Literal["piecewise", "uniform"] = "uniform"
     """Spacing of the first samples; uniform suits rays that are bounded by the box."""
-    num_proposal_samples_per_ray: tuple[int, ...] = (48, 24)
-    """Samples a ray for each proposal network; a box of 0.2 m needs far fewer than an unbounded scene."""
-    num_nerf_samples_per_ray: int = 24
+    num_proposal_iterations: int = 0
+    """Proposal networks that place the samples, as in nerfacto. 0: an occupancy grid that begins as the visual hull
+    of the masks places them; it needs the scene to be a box."""
+    num_nerf_samples_per_ray: int = 16
     """Samples a ray for the spectral field."""
-    proposal_net_args_list: list[dict] = field(
-        default_factory=lambda: [
-            {"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": max_res, "use_linear": False}
-            for max_res in (64, 128)
-        ]
-    )
-    """The proposal networks, with smaller tables than nerfacto's for a scene of 0.2 m."""
     match_resolution: bool = True
     """Size the field's hash grid by what a pixel resolves in the scene box. False: by num-levels, max-res and
     log2-hashmap-size."""
@@ -101,6 +101,11 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Refinement of the measured poses."""
 
     def __post_init__(self) -> None:
+        if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
+            raise SystemExit(
+                "hsi-sc-nerf: an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 "
+                "with --pipeline.model.disable-scene-contraction False."
+            )
         if self.head == "basis" and self.background == "last-sample":
             raise SystemExit(
                 "hsi-sc-nerf: --pipeline.model.background last-sample needs a value in every band at each sample; "
@@ -136,7 +141,17 @@ class SpectralModel(NerfactoModel):
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
-        self._build_proposals(contraction)
+        self.occupancy = self.pixels_with_matter = None
+        self.proposal_networks = nn.ModuleList()
+        if config.num_proposal_iterations > 0:
+            networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
+            self.proposal_networks.extend(networks)
+        else:
+            self.occupancy, self.pixels_with_matter = build_occupancy(
+                dataset, metadata["frames"], self.scene_box.aabb
+            )
+            self.proposal_sampler = OccupancySampler(self.occupancy, config.num_nerf_samples_per_ray)
+        self.density_fns = [network.density_fn for network in self.proposal_networks]
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
@@ -173,6 +188,7 @@ class SpectralModel(NerfactoModel):
             self.scene_box.aabb,
             num_bands=len(dataset.wavelengths_nm),
             view_dependent=config.view_dependent,
+            skip_unseen=config.num_proposal_iterations == 0,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,
             base_res=config.base_res,
@@ -187,37 +203,29 @@ class SpectralModel(NerfactoModel):
             **options,
         )
 
-    def _build_proposals(self, contraction: SceneContraction | None) -> None:
-        """Proposal networks and the sampler that uses them, as in nerfacto."""
-        config = self.config
-        arguments = config.proposal_net_args_list
-        networks = [
-            SpectralProposalField(
-                self.scene_box.aabb,
-                **arguments[min(i, len(arguments) - 1)],
-                spatial_distortion=contraction,
-                average_init_density=config.average_init_density,
-                implementation=config.implementation,
-            )
-            for i in range(1 if config.use_same_proposal_network else config.num_proposal_iterations)
-        ]
-        self.proposal_networks = torch.nn.ModuleList(networks)
-        rounds = config.num_proposal_iterations
-        self.density_fns = [networks[min(i, len(networks) - 1)].density_fn for i in range(rounds)]
+    @property
+    def proposals(self) -> ProposalNetworkSampler | None:
+        """The sampler with proposal networks; None where an occupancy grid places the samples."""
+        return self.proposal_sampler if isinstance(self.proposal_sampler, ProposalNetworkSampler) else None
 
-        def update_schedule(step: int) -> float:
-            rise = step / max(1, config.proposal_warmup) * config.proposal_update_every
-            return float(np.clip(rise, 1, config.proposal_update_every))
+    def prepare_step(self, step: int) -> None:
+        """Bring the occupancy grid up to date before a step of training; before the first, the field begins solid."""
+        if self.occupancy is None:
+            return
+        if step == 0 and next(self.field.parameters()).requires_grad:  # not if the first stage freezes the field
+            self.field.start_solid(self.occupancy.random_points)
+            self.occupancy.refresh_all(self.field.density_fn)
+        self.occupancy.refresh(self.field.density_fn, step)
 
-        uniform = config.proposal_initial_sampler == "uniform"
-        self.proposal_sampler = ProposalNetworkSampler(
-            num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
-            num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
-            num_proposal_network_iterations=rounds,
-            single_jitter=config.use_single_jitter,
-            update_sched=update_schedule,
-            initial_sampler=UniformSampler(single_jitter=config.use_single_jitter) if uniform else None,
-        )
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """Nerfacto's groups, without that of the proposals where there are none."""
+        return {name: group for name, group in super().get_param_groups().items() if group}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfacto's callbacks, which are those of the proposals."""
+        return [] if self.proposals is None else super().get_training_callbacks(training_callback_attributes)
 
     def background_spectrum(self, ray_bundle: RayBundle) -> Float[Tensor, "*rays bands"]:
         """Reflectance of the chamber behind rays as measured, before the pose refinement; 0 without a background."""
@@ -231,6 +239,8 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = super().get_outputs(ray_bundle)
+        if isinstance(self.proposal_sampler, OccupancySampler):
+            outputs |= self._of_all_rays(outputs, ray_bundle, self.proposal_sampler)
         spectral = self.decoder(outputs["rgb"])
         if background is not None:
             spectral = spectral + background * (1.0 - outputs["accumulation"])
@@ -240,21 +250,45 @@ class SpectralModel(NerfactoModel):
         outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
 
+    def _of_all_rays(self, outputs: dict, rays: RayBundle, sampler: OccupancySampler) -> dict[str, Tensor]:
+        """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
+        assert rays.fars is not None
+        fills = {"depth": rays.fars, "expected_depth": rays.fars}
+        return {
+            name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), value.shape[1])))
+            for name, value in outputs.items()
+            if isinstance(value, Tensor)
+        }
+
+    def _distortion(self, outputs: dict) -> Tensor:
+        """Distortion of the batch's rays."""
+        (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
+        if self.occupancy is None:
+            return distortion_loss([weights], [samples])
+        frustums = samples.frustums
+        distortion = separate_distortion(weights[..., 0], frustums.starts[..., 0], frustums.ends[..., 0])
+        return distortion.sum() / len(outputs["accumulation"])
+
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
         """Measured reflectance, and which of its values are measurements (None for all)."""
         valid = batch.get("valid")
         return batch["spectral"].to(self.device), None if valid is None else valid.to(self.device)
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
-        """SAM, RMSE and PSNR of the batch over all bands, distortion, size of the pose corrections."""
+        """SAM, RMSE and PSNR of some of the batch's rays, distortion, size of the pose corrections."""
         with torch.no_grad():
             target, valid = self._measured(batch)
+            some = slice(None, None, METRIC_STRIDE)
             # The metrics take images: the batch is one of a single line.
-            line = outputs["spectral"][None], target[None], None, None if valid is None else valid[None]
-            metrics = {"sam": spectral_angle_mapper(*line), "rmse": spectral_rmse(*line)}
+            images = (outputs["spectral"][None, some], target[None, some])
+            flags = None if valid is None else valid[None, some]
+            metrics = {
+                "sam": spectral_angle_mapper(*images, valid=flags),
+                "rmse": spectral_rmse(*images, valid=flags),
+            }
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
-            metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
+            metrics["distortion"] = self._distortion(outputs)
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -271,9 +305,10 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             return losses
         assert metrics_dict is not None
-        losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
-            outputs["weights_list"], outputs["ray_samples_list"]
-        )
+        if self.occupancy is None:
+            losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
+                outputs["weights_list"], outputs["ray_samples_list"]
+            )
         losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
         if config.predict_normals:
             losses["orientation_loss"] = config.orientation_loss_mult * outputs["rendered_orientation_loss"].mean()

@@ -175,17 +175,20 @@ class StagedTrainer(Trainer):
             self._enter(stage)
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
         rates = self._set_learning_rates(stage, step)
-        sampler = self._model.proposal_sampler
-        # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
-        sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
+        sampler = self._model.proposals
+        if sampler is not None:
+            # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
+            sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
         torch.manual_seed(step_seed(self.config.machine.seed, step))
+        self._model.prepare_step(step)
         if self._captured is None:
             loss, loss_dict, metrics_dict = super().train_iteration(step)
         else:
             loss, loss_dict, metrics_dict = self._captured_iteration(self._captured, step)
 
-        self._steps_since_update = sampler._steps_since_update + 1
+        if sampler is not None:
+            self._steps_since_update = sampler._steps_since_update + 1
         warning = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
         if warning is not None:
             CONSOLE.print(f"[yellow]{escape(warning)}")
@@ -198,9 +201,11 @@ class StagedTrainer(Trainer):
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
         """What nerfstudio does in a step, its forward and backward pass as a graph."""
-        sampler = self._model.proposal_sampler
+        sampler = self._model.proposals
         # As the sampler will say itself, in the steps that are not captured.
-        proposals_learn = sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+        proposals_learn = sampler is not None and (
+            sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+        )
         rays, batch = self.pipeline.datamanager.next_train(step)
         kind = (id(self._stage), frozenset(self._frozen or ()), proposals_learn)
         seed = partial(torch.manual_seed, step_seed(self.config.machine.seed, step))
@@ -212,7 +217,7 @@ class StagedTrainer(Trainer):
             seed()
             return super().train_iteration(step)
         self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
-        if proposals_learn:
+        if sampler is not None and proposals_learn:
             sampler._steps_since_update = 0
         return found
 

@@ -99,6 +99,11 @@ class PixelSampler:
         # Number of background pixels before each foreground pixel.
         self._background_before = self._foreground - np.arange(len(self._foreground))
         self._has_flagged = has_flagged
+        self._drawn_background: Int[np.ndarray, "count"] | None = None
+
+    def restrict_background(self, pixels: Bool[np.ndarray, "frames lines samples"]) -> None:
+        """From now on, draw background pixels among these alone: those whose rays can meet something."""
+        self._drawn_background = np.flatnonzero(pixels & ~self.masks)
 
     def sample(
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
@@ -135,7 +140,7 @@ class PixelSampler:
         on_boundary = 0
         if boundary_ray_fraction > 0.0 and len(self._boundary) > 0:
             on_boundary = round((count - in_foreground) * boundary_ray_fraction)
-        in_background, background_size = count - in_foreground - on_boundary, self.masks.size - len(self._foreground)
+        in_background, background_size = count - in_foreground - on_boundary, self._background_size
         if in_background > 0 and background_size == 0:
             raise InputError(
                 "the masks of all training frames cover whole images, so that nothing tells where the object "
@@ -170,12 +175,21 @@ class PixelSampler:
         """Background pixels within ``BOUNDARY_PX`` of the foreground (flat indices)."""
         return np.flatnonzero(np.stack([dilate(mask, 2 * BOUNDARY_PX + 1) & ~mask for mask in self.masks]))
 
+    @property
+    def _background_size(self) -> int:
+        """How many background pixels are drawn from."""
+        if self._drawn_background is not None:
+            return len(self._drawn_background)
+        return self.masks.size - len(self._foreground)
+
     def _background(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
         """Flat indices of the background pixels with these ranks.
 
         A list of all background pixels would be the largest array of a session. A pixel's index is its rank plus the
         number of foreground pixels before it.
         """
+        if self._drawn_background is not None:
+            return self._drawn_background[ranks]
         return ranks + np.searchsorted(self._background_before, ranks, side="right")
 
 

@@ -11,6 +11,7 @@ from hsi_sc_nerf.models.losses import (
     angle_loss,
     angular_loss,
     hsi_loss,
+    separate_distortion,
 )
 
 LOSSES = [hsi_loss, angular_loss, angle_loss]
@@ -147,3 +148,20 @@ def test_the_angle_loss_is_the_angle() -> None:
     predicted = torch.stack([torch.cos(angles), torch.sin(angles)], dim=-1)
     target = torch.tensor([3.0, 0.0], dtype=torch.float64).expand(4, 2)
     assert angle_loss(predicted, target).item() == pytest.approx(angles.mean().item(), rel=1e-12)
+
+
+def test_distortion_equals_nerfstudios_where_samples_touch() -> None:
+    from nerfstudio.model_components.losses import lossfun_distortion
+
+    torch.manual_seed(0)
+    edges = torch.rand(20, 9).sort(dim=-1).values.double()
+    weights = torch.rand(20, 8).double()
+    expected = lossfun_distortion(edges, weights)
+    torch.testing.assert_close(separate_distortion(weights, edges[:, :-1], edges[:, 1:]), expected)
+
+
+def test_distortion_of_samples_apart_counts_the_gap() -> None:
+    weights, starts = torch.tensor([[0.5, 0.5]]), torch.tensor([[0.0, 3.0]])
+    # Twice 0.5 x 0.5 over a distance of 3, and 0.25 x 0.1 / 3 within each.
+    expected = 2 * 0.25 * 3.0 + 2 * 0.25 * 0.1 / 3
+    assert separate_distortion(weights, starts, starts + 0.1).item() == pytest.approx(expected)

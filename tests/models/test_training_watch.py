@@ -80,12 +80,12 @@ def events(tiny_dataset, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_events_of_a_run(events):
     tags = events.Tags()
-    losses = ["hsi_loss", "angular_loss", "interlevel_loss", "distortion_loss"]
+    losses = ["hsi_loss", "angular_loss", "distortion_loss"]
     metrics = ["sam", "rmse", "psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
     expected = {
         *(f"Train Loss Dict/{name}" for name in [*losses, "camera_opt_regularizer"]),
         *(f"Train Metrics Dict/{name}" for name in metrics),
-        *(f"learning_rate/{group}" for group in ("fields", "proposal_networks", "camera_opt")),
+        *(f"learning_rate/{group}" for group in ("fields", "camera_opt")),
         *(f"Eval Images Metrics/{name}" for name in ("sam", "rmse", "psnr", "full_sam", "full_rmse", "full_psnr")),
         *("Eval Images Metrics Dict (all images)/sam", "Eval Metrics Dict/psnr", "Train Rays / Sec"),
     }

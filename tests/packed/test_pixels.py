@@ -194,6 +194,17 @@ def test_without_an_object_or_anything_else_there_is_nothing_to_train_on(
     assert (pixels.sample(0, float(covered))["mask"] == covered).all()
 
 
+def test_a_restricted_background_is_drawn_from_alone(sampler, masks):
+    pixels = np.zeros(masks.shape, bool)
+    pixels[:, 1:3] = True
+    pixel_sampler = sampler(64)
+    pixel_sampler.restrict_background(pixels)
+    drawn = np.concatenate([pixel_sampler.draw(step, 0.25) for step in range(20)])
+    background = drawn[~masks[tuple(drawn.T)]]
+    assert pixels[tuple(background.T)].all()
+    assert len(np.unique(background, axis=0)) == (pixels & ~masks).sum()
+
+
 def test_fixed_pixels_are_spread_over_the_object(masks):
     flat = [np.ravel_multi_index(tuple(pixel), masks.shape) for pixel in spread_over(masks, 3)]
     foreground = np.flatnonzero(masks)  # 14 pixels

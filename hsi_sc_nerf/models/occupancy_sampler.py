@@ -1,0 +1,93 @@
+"""nerfstudio's sampler by an occupancy grid, in the place of proposal networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import Sampler
+from torch import Tensor
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+
+
+class OccupancySampler(Sampler):
+    """Samples where the grid holds matter; it has the call of nerfstudio's `ProposalNetworkSampler`.
+
+    Args:
+        grid: over the scene box.
+        num_samples: samples a ray.
+
+    Attributes:
+        rays: of the last call, the indices of the rays that were sampled: those that meet matter. None for all.
+    """
+
+    rays: Int[Tensor, "sampled"] | None
+
+    def __init__(self, grid: OccupancyGrid, num_samples: int) -> None:
+        super().__init__(num_samples)
+        self.grid = grid
+        self.rays = None
+
+    def generate_ray_samples(  # type: ignore[override]
+        self, ray_bundle: RayBundle, density_fns: Sequence[object] = ()
+    ) -> tuple[RaySamples, list, list]:
+        """Samples of the rays that meet matter, and nothing for the proposals that there are not.
+
+        On a GPU all rays are sampled, so that shapes do not depend on the data.
+        """
+        assert ray_bundle.nears is not None
+        assert ray_bundle.fars is not None
+        assert self.num_samples is not None
+        count = len(ray_bundle)
+        device = ray_bundle.origins.device
+        jitter = torch.rand(count, device=device) if self.training else torch.full((count,), 0.5, device=device)
+        with torch.no_grad():
+            nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
+            starts, ends = self.grid.sample(
+                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
+            )
+        self.rays = None
+        if device.type == "cpu":
+            self.rays = (ends[:, -1] > nears).nonzero()[:, 0]
+            ray_bundle, starts, ends = ray_bundle[self.rays], starts[self.rays], ends[self.rays]
+        return ray_bundle.get_ray_samples(bin_starts=starts[..., None], bin_ends=ends[..., None]), [], []
+
+    def spread(
+        self, values: Float[Tensor, "sampled channels"], others: Float[Tensor, "rays channels"]
+    ) -> Float[Tensor, "rays channels"]:
+        """Values of all rays from those of the sampled ones, and what the ``others`` have."""
+        return values if self.rays is None else others.index_copy(0, self.rays, values)
+
+
+def build_occupancy(
+    dataset: PackedDataset, frames: Sequence[PackedFrame], aabb: Float[Tensor, "2 3"]
+) -> tuple[OccupancyGrid, Bool[np.ndarray, "frames h w"]]:
+    """The occupancy grid of a dataset, and the pixels of its frames that look at cells that may hold matter.
+
+    Args:
+        dataset: camera, container, and the boxes of the scene and of the object.
+        frames: whose masks bound the object.
+        aabb: the scene box in scene units.
+
+    Raises:
+        InputError: the scene is not the dataset's box.
+    """
+    shape, cell = grid_over(aabb)
+    low_m, high_m = dataset.scene_box_m
+    proportions = ((side := high - low) / side.max() for low, high in (dataset.scene_box_m, aabb.numpy(force=True)))
+    if not np.allclose(*proportions, atol=1e-3):
+        raise InputError(
+            "the data parser's --scene cameras is no box of what turns, which the occupancy grid needs; take "
+            "--pipeline.model.num-proposal-iterations 2 and --pipeline.model.disable-scene-contraction False with it."
+        )
+    cell_m = cell * float((high_m - low_m).max() / (aabb[1] - aabb[0]).max())
+    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, cell_m)
+    poses = np.stack([frame.camera_to_world for frame in frames])
+    pixels = pixels_of_cells(matter, low_m, cell_m, poses, dataset.intrinsics)
+    return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid)), pixels

@@ -1,0 +1,82 @@
+"""The spectral angle of float32 spectra and its gradient as compiled loops, for training without a GPU.
+
+Sums are float64, as in `numerics.spectral_angle`, but no spectrum is written to memory in that type.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from jaxtyping import Float32
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+
+
+def angles(a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]) -> Float32[np.ndarray, "n"]:
+    """`numerics.spectral_angle` of each pair of spectra."""
+    found = np.empty(len(a), np.float32)
+    _angles(a, b, found)
+    return found
+
+
+def angle_gradient(
+    a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"], upstream: Float32[np.ndarray, "n"]
+) -> Float32[np.ndarray, "n bands"]:
+    """Gradient of a sum of the angles, each times its ``upstream``, with respect to ``a``."""
+    gradient = np.empty_like(a)
+    _angle_gradient(a, b, upstream, gradient)
+    return gradient
+
+
+@_compiled
+def _norm(spectrum):
+    total = 0.0
+    for value in spectrum:
+        total += np.float64(value) * np.float64(value)
+    return math.sqrt(total)
+
+
+@_compiled
+def _chords(a, b, norm_a, norm_b):
+    """Lengths of the difference and of the sum of the unit vectors."""
+    difference, total = 0.0, 0.0
+    for k in range(len(a)):
+        u, v = a[k] / norm_a, b[k] / norm_b
+        difference += (u - v) * (u - v)
+        total += (u + v) * (u + v)
+    return math.sqrt(difference), math.sqrt(total)
+
+
+@_compiled
+def _angles(a, b, found):
+    for i in range(len(a)):
+        norm_a, norm_b = _norm(a[i]), _norm(b[i])
+        if norm_a == 0.0 or norm_b == 0.0:
+            # A NaN of the other spectrum is not hidden.
+            found[i] = math.pi / 2.0 + 0.0 * (norm_a + norm_b)
+        else:
+            difference, total = _chords(a[i], b[i], norm_a, norm_b)
+            found[i] = 2.0 * math.atan2(difference, total)
+
+
+@_compiled
+def _angle_gradient(a, b, upstream, gradient):
+    for i in range(len(a)):
+        norm_a, norm_b = _norm(a[i]), _norm(b[i])
+        gradient[i] = 0.0
+        if norm_a == 0.0 or norm_b == 0.0:
+            continue
+        difference, total = _chords(a[i], b[i], norm_a, norm_b)
+        if difference == 0.0 or total == 0.0:
+            continue
+        # d angle / d u = -(v - cos u) / sin, with 1 - cos = difference^2 / 2 and sin = difference total / 2.
+        factor = -upstream[i] / (norm_a * 0.5 * difference * total)
+        past = 0.5 * difference * difference
+        for k in range(a.shape[1]):
+            u, v = a[i, k] / norm_a, b[i, k] / norm_b
+            value = factor * ((v - u) + past * u)
+            gradient[i, k] = min(max(value, -_LARGEST), _LARGEST)

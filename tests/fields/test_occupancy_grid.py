@@ -1,0 +1,122 @@
+"""The occupancy grid begins as the hull of a known ball, and follows a field's density."""
+
+import numpy as np
+import pytest
+import torch
+from ball_run import write_ball_dataset
+from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M
+
+from hsi_sc_nerf.fields.occupancy_grid import (
+    GRID_CELLS,
+    HULL_MARGIN_M,
+    OccupancyGrid,
+    bounds_from_masks,
+    grid_over,
+    pixels_of_cells,
+)
+from hsi_sc_nerf.packed.dataset import open_packed
+
+SHAPE, CELL_M = (40, 40, 54), 0.003
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return open_packed(write_ball_dataset(tmp_path_factory.mktemp("ball")))
+
+
+class WithoutMask:
+    """The first frame with an empty mask."""
+
+    def __init__(self, dataset):
+        self.camera_to_world = dataset.frames[0].camera_to_world
+        self.shape = dataset.intrinsics.h, dataset.intrinsics.w
+
+    def mask(self):
+        return np.zeros(self.shape, bool)
+
+
+def centres_m(lower_m):
+    return lower_m + (np.indices(SHAPE).reshape(3, -1).T + 0.5) * CELL_M
+
+
+def test_matter_holds_the_ball_and_solid_is_within_it(ball):
+    lower_m = ball.scene_box_m[0]
+    matter, solid = bounds_from_masks(ball, ball.frames, SHAPE, lower_m, CELL_M)
+    from_centre_m = np.linalg.norm(centres_m(lower_m) - SPHERE_CENTRE_M, axis=1).reshape(SHAPE)
+    assert matter[from_centre_m < SPHERE_RADIUS_M + HULL_MARGIN_M / 2].all()
+    assert solid[from_centre_m < SPHERE_RADIUS_M - 2 * CELL_M].all()
+    # Cameras that all look down at one angle leave a cone on the ball, below and above.
+    height_m = centres_m(lower_m)[:, 2].reshape(SHAPE)
+    at_height = abs(height_m - SPHERE_CENTRE_M[2]) < SPHERE_RADIUS_M / 2
+    assert not matter[at_height & (from_centre_m > SPHERE_RADIUS_M + 5 * HULL_MARGIN_M)].any()
+    assert not solid[at_height & (from_centre_m > SPHERE_RADIUS_M + 2 * CELL_M)].any()
+    assert matter[height_m < ball.object_box_m[0, 2] - CELL_M].all()
+
+
+def test_one_wrong_mask_in_twenty_cuts_nothing_off(ball):
+    lower_m = ball.scene_box_m[0]
+    frames = ball.frames * 2
+    whole, _ = bounds_from_masks(ball, frames, SHAPE, lower_m, CELL_M)
+    cut, _ = bounds_from_masks(ball, [WithoutMask(ball), *frames[1:]], SHAPE, lower_m, CELL_M)
+    assert cut.sum() > 0.98 * whole.sum()
+
+
+def test_without_a_hull_all_may_hold_matter(ball):
+    matter, solid = bounds_from_masks(ball, [WithoutMask(ball)] * 4, SHAPE, ball.scene_box_m[0], CELL_M)
+    assert matter.all()
+    assert not solid.any()
+
+
+def test_pixels_of_cells_hold_the_masks(ball):
+    lower_m = ball.scene_box_m[0]
+    _, solid = bounds_from_masks(ball, ball.frames, SHAPE, lower_m, CELL_M)
+    pixels = pixels_of_cells(solid, lower_m, CELL_M, ball.camera_to_worlds, ball.intrinsics)
+    masks = np.stack([frame.mask() for frame in ball.frames])
+    assert pixels[masks].all()
+    assert pixels.mean() < 3.0 * masks.mean()
+
+
+def box():
+    return torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]])
+
+
+def test_grid_covers_the_box():
+    shape, cell = grid_over(box())
+    assert shape == (GRID_CELLS, GRID_CELLS, GRID_CELLS // 2)
+    assert cell == pytest.approx(2.0 / GRID_CELLS)
+
+
+def test_refreshed_cells_are_as_opaque_as_the_field_and_others_stay_empty():
+    shape, cell = grid_over(box())
+    matter = torch.zeros(shape, dtype=torch.bool)
+    matter[24:40] = True
+    grid = OccupancyGrid(box(), matter, matter)
+    torch.manual_seed(0)
+    grid.refresh_all(lambda points: torch.where(points[:, :1] < -0.5, 100.0, 0.0))
+    expected = 1.0 - np.exp(-100.0 * cell)
+    assert (grid.opacity[40:] == -1.0).all()
+    np.testing.assert_allclose(grid.opacity[24:31].numpy(), expected, rtol=0.1)
+    np.testing.assert_allclose(grid.opacity[33:40].numpy(), 0.0, atol=1e-6)
+
+
+def test_a_cell_with_one_dense_point_is_thin():
+    shape, _ = grid_over(box())
+    matter = torch.zeros(shape, dtype=torch.bool)
+    matter[:16] = True
+    grid = OccupancyGrid(box(), matter, matter)
+    torch.manual_seed(0)
+    for step in range(0, 320, 8):
+        grid.refresh(lambda points: torch.where(torch.rand(len(points), 1) < 0.02, 1e9, 0.0), step)
+    assert grid.opacity[:16].mean() == pytest.approx(0.02, abs=0.005)
+
+
+def test_random_points_lie_in_their_cells():
+    shape, cell = grid_over(box())
+    matter = torch.zeros(shape, dtype=torch.bool)
+    matter[10:20, 10:30, 5:9] = True
+    solid = matter.clone()
+    solid[15:] = False
+    points, is_solid = OccupancyGrid(box(), matter, solid).random_points(4000)
+    x = (points[:, 0] + 1.0) / cell
+    assert ((x >= 10) & (x <= 20)).all()
+    assert ((x < 15) == is_solid).float().mean() > 0.999

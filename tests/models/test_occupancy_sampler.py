@@ -1,0 +1,78 @@
+"""The sampler by an occupancy grid: which rays it samples, and what it gives for the others."""
+
+import numpy as np
+import pytest
+import torch
+from ball_run import write_ball_dataset
+from nerfstudio.cameras.rays import RayBundle
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over
+from hsi_sc_nerf.fields.spectral_field import START_DENSITIES, SpectralField
+from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
+from hsi_sc_nerf.packed.dataset import open_packed
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+
+def ball_grid():
+    shape, cell = grid_over(BOX)
+    centres = BOX[0] + cell * (torch.from_numpy(np.indices(shape)).permute(1, 2, 3, 0) + 0.5)
+    radius = centres.norm(dim=-1)
+    return OccupancyGrid(BOX, radius < 0.6, radius < 0.5)
+
+
+def rays_along_x(y):
+    origins = torch.stack([torch.full_like(y, -3.0), y, torch.zeros_like(y)], dim=-1)
+    return RayBundle(
+        origins=origins,
+        directions=torch.tensor([1.0, 0.0, 0.0]).expand(len(y), 3),
+        pixel_area=torch.full((len(y), 1), 1e-6),
+        nears=torch.full((len(y), 1), 2.0),
+        fars=torch.full((len(y), 1), 4.0),
+    )
+
+
+def test_only_rays_that_meet_matter_are_sampled():
+    sampler = OccupancySampler(ball_grid(), num_samples=8)
+    rays = rays_along_x(torch.tensor([-0.9, -0.3, 0.0, 0.7]))
+    samples, *proposals = sampler(rays)
+    assert proposals == [[], []]
+    assert sampler.rays.tolist() == [1, 2]
+    assert samples.frustums.shape == (2, 8)
+    assert (samples.frustums.get_positions().norm(dim=-1) < 0.65).all()
+    spread = sampler.spread(torch.tensor([[1.0], [2.0]]), torch.full((4, 1), 9.0))
+    assert spread[:, 0].tolist() == [9.0, 1.0, 2.0, 9.0]
+
+
+def test_evaluation_is_repeatable_and_training_is_jittered():
+    sampler = OccupancySampler(ball_grid(), num_samples=8)
+    rays = rays_along_x(torch.zeros(1))
+    starts = [sampler(rays)[0].frustums.starts for _ in range(2)]
+    assert not torch.equal(*starts)
+    sampler.eval()
+    starts = [sampler(rays)[0].frustums.starts for _ in range(2)]
+    assert torch.equal(*starts)
+
+
+def test_the_field_begins_solid_inside_the_hull():
+    torch.manual_seed(0)
+    grid = ball_grid()
+    field = SpectralField(
+        BOX, num_bands=3, num_images=1, num_levels=8, max_res=64, log2_hashmap_size=14, implementation="torch"
+    )
+    field.start_solid(grid.random_points)
+    radius = torch.tensor([0.0, 0.2, 0.4, 0.57])
+    points = torch.nn.functional.normalize(torch.randn(500, 1, 3), dim=-1) * radius[:, None]
+    with torch.no_grad():
+        density = field.density_fn(points)[..., 0].log().mean(dim=0).exp()
+    solid, thin = START_DENSITIES
+    assert (density[:3] > solid / 3).all()
+    assert density[3] < 6 * thin
+    assert all(parameter.grad is None for parameter in field.parameters())
+
+
+def test_a_scene_that_is_not_the_datasets_box_is_refused(tmp_path):
+    dataset = open_packed(write_ball_dataset(tmp_path))
+    with pytest.raises(InputError, match="num-proposal-iterations"):
+        build_occupancy(dataset, dataset.frames, BOX)
