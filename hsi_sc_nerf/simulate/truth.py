@@ -204,6 +204,10 @@ def write_mesh(path: Path, part: Part) -> None:
     """Write a part as binary PLY with one vertex property ``weight_NAME`` for each material."""
     columns = dict(zip("xyz", part.mesh.vertices.T, strict=True))
     columns |= {f"weight_{n}": w for n, w in zip(part.materials, part.weights.T.astype(np.float32), strict=True)}
-    faces = np.zeros(len(part.mesh.triangles), [("vertex_indices", "i4", (3,))])
-    faces["vertex_indices"] = part.mesh.triangles
-    PlyData([ply_vertices(columns), PlyElement.describe(faces, "face")]).write(str(path))
+    vertices = ply_vertices(columns)
+    faces = np.zeros(len(part.mesh.triangles), [("vertex_indices", "<i4", (3,))])
+    header = PlyData([vertices, PlyElement.describe(faces, "face")], byte_order="<").header
+    # plyfile writes each list by itself, which is most of the time of a small session.
+    rows = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
+    rows["count"], rows["corners"] = 3, part.mesh.triangles
+    path.write_bytes(header.encode("ascii") + b"\n" + vertices.data.tobytes() + rows.tobytes())
