@@ -77,6 +77,8 @@ def at_half_coverage(
     Returns:
         The mask, at most `GROWTH_PX` larger and one pixel smaller. Parts too thin to have an inside keep their edge.
     """
+    if not mask.any():
+        return mask
     for _ in range(GROWTH_PX):
         inside = _nearby(score, binary_erosion(mask, _FACES))
         rim = binary_dilation(mask, _FACES) & ~mask & may_grow
