@@ -74,7 +74,7 @@ def smoothing_basis(
     weight = np.diag(precision[order])
     penalty *= np.trace(weight) / max(float(np.trace(penalty)), 1e-300)
     told, functions = linalg.eigh(weight, weight + penalty)
-    terms = min(MAX_TERMS, np.count_nonzero(precision))
+    terms = min(MAX_TERMS, int(np.count_nonzero(precision)))
     told, functions = told[::-1][:terms], functions[:, ::-1][:, :terms]
     roughness = np.maximum(1.0 / told - 1.0, 0.0)
     roughness[:2] = 0.0

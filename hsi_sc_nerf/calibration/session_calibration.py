@@ -209,7 +209,7 @@ def _drift(
     captures = session.frames
     lines = {0 if capture.dark is None else capture.dark.shape[0] for capture in captures}
     if len(lines) == 1 and 0 not in lines:
-        darks = pooled_darks(darks, *lines, noise.read_noise)
+        darks = pooled_darks(darks, lines.pop(), noise.read_noise)
     survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 

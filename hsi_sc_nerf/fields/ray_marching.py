@@ -50,11 +50,9 @@ def sample_occupied(
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it
 
-        rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars)]
+        rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars, jitter)]
         grid = opacity.numpy(force=True), lower.numpy(force=True), cell
-        starts, ends = ray_marching_cpu.sample_occupied(
-            *rays, *grid, num_samples, jitter.numpy(force=True), EXPLORED, MAX_OPACITY
-        )
+        starts, ends = ray_marching_cpu.sample_occupied(rays, grid, num_samples, EXPLORED, MAX_OPACITY)
         return torch.from_numpy(starts), torch.from_numpy(ends)
     with torch.no_grad():
         return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -12,23 +13,26 @@ from hsi_sc_nerf.fields.hash_grid_cpu import compiled, run_in_parts, shared
 
 
 def sample_occupied(
-    origins: Float32[np.ndarray, "rays 3"],
-    directions: Float32[np.ndarray, "rays 3"],
-    nears: Float32[np.ndarray, "rays"],
-    fars: Float32[np.ndarray, "rays"],
-    opacity: Float32[np.ndarray, "x y z"],
-    lower: Float32[np.ndarray, "3"],
-    cell: float,
+    rays: Sequence[Float32[np.ndarray, "rays *components"]],
+    grid: tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "3"], float],
     num_samples: int,
-    jitter: Float32[np.ndarray, "rays"],
     explored: float,
     max_opacity: float,
 ) -> tuple[Float32[np.ndarray, "rays samples"], Float32[np.ndarray, "rays samples"]]:
-    """Starts and ends of the samples; see `ray_marching.sample_occupied`."""
-    results = np.empty((len(origins), num_samples), np.float32), np.empty((len(origins), num_samples), np.float32)
-    rays = origins, directions, nears, fars, jitter
-    grid = opacity, lower, np.float32(cell), np.float32(max_opacity)
-    run_in_parts(_sample, _sample_at_once, len(origins), rays, grid, np.float32(explored), results)
+    """Starts and ends of the samples, as `ray_marching.sample_occupied` describes them.
+
+    Args:
+        rays: origins, directions, nears, fars and jitter.
+        grid: opacity, lower corner and cell.
+        num_samples: samples a ray.
+        explored: `ray_marching.EXPLORED`.
+        max_opacity: `ray_marching.MAX_OPACITY`.
+    """
+    count = len(rays[0])
+    results = np.empty((count, num_samples), np.float32), np.empty((count, num_samples), np.float32)
+    opacity, lower, cell = grid
+    cells = opacity, lower, np.float32(cell), np.float32(max_opacity)
+    run_in_parts(_sample, _sample_at_once, count, tuple(rays), cells, np.float32(explored), results)
     return results
 
 

@@ -145,7 +145,7 @@ class SpectralField(NerfactoField):
         # tiny-cuda-nn's encodings are in half precision, the head's weights are not.
         spectra = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
         if seen is not None:
-            nothing = spectra.new_zeros(samples.numel(), spectra.shape[-1])
+            nothing = spectra.new_zeros(math.prod(samples), spectra.shape[-1])
             spectra = nothing.index_copy(0, seen, spectra).view(*samples, -1)
         outputs[FieldHeadNames.RGB] = spectra
         return outputs

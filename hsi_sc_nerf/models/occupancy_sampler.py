@@ -80,8 +80,8 @@ def build_occupancy(
     """
     shape, cell = grid_over(aabb)
     low_m, high_m = dataset.scene_box_m
-    proportions = ((side := high - low) / side.max() for low, high in (dataset.scene_box_m, aabb.numpy(force=True)))
-    if not np.allclose(*proportions, atol=1e-3):
+    sides, sides_m = np.ptp(aabb.numpy(force=True), axis=0), high_m - low_m
+    if not np.allclose(sides / sides.max(), sides_m / sides_m.max(), atol=1e-3):
         raise InputError(
             "the data parser's --scene cameras is no box of what turns, which the occupancy grid needs; take "
             "--pipeline.model.num-proposal-iterations 2 and --pipeline.model.disable-scene-contraction False with it."

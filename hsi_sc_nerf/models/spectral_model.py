@@ -123,6 +123,7 @@ class SpectralModel(NerfactoModel):
     field: SpectralField
     camera_optimizer: PoseRefinement
     decoder: nn.Module
+    proposal_sampler: ProposalNetworkSampler | OccupancySampler  # type: ignore[assignment]
     renderer_rgb: nn.Module  # type: ignore[assignment]
 
     def populate_modules(self) -> None:
@@ -142,16 +143,16 @@ class SpectralModel(NerfactoModel):
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
         self.occupancy = self.pixels_with_matter = None
-        self.proposal_networks = nn.ModuleList()
+        self.proposal_networks, self.density_fns = nn.ModuleList(), []
         if config.num_proposal_iterations > 0:
             networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
             self.proposal_networks.extend(networks)
+            self.density_fns = [network.density_fn for network in networks]
         else:
             self.occupancy, self.pixels_with_matter = build_occupancy(
                 dataset, metadata["frames"], self.scene_box.aabb
             )
             self.proposal_sampler = OccupancySampler(self.occupancy, config.num_nerf_samples_per_ray)
-        self.density_fns = [network.density_fn for network in self.proposal_networks]
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )

@@ -243,9 +243,9 @@ def undistort(points: Float[np.ndarray, "*n 2"], coefficients: Coefficients) -> 
     """Inverse of `distort` (OpenCV); None if it does not converge, because the model is not invertible there."""
     flat = np.ascontiguousarray(points, float).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, UNDISTORTION_STEPS, UNDISTORTION_GOAL)
-    found = cv2.undistortPointsIter(flat, np.eye(3), np.array(coefficients), None, None, criteria).reshape(
-        points.shape
-    )
+    lens = np.array(coefficients)
+    found = np.asarray(cv2.undistortPointsIter(flat, np.eye(3), lens, np.eye(3), np.eye(3), criteria))
+    found = found.reshape(points.shape)
     missing = distort(found, coefficients) - points
     return found if np.abs(missing).max(initial=0.0) < UNDISTORTED_TO else None
 
