@@ -54,7 +54,9 @@ class OccupancySampler(Sampler):
             )
         self.rays = None
         if device.type == "cpu":
-            self.rays = (ends[:, -1] > nears).nonzero()[:, 0]
+            met = (ends[:, -1] > nears).nonzero()[:, 0]
+            # One ray with samples of no length keeps the shapes of what follows where none meets matter.
+            self.rays = met if len(met) else met.new_zeros(1)
             ray_bundle, starts, ends = ray_bundle[self.rays], starts[self.rays], ends[self.rays]
         return ray_bundle.get_ray_samples(bin_starts=starts[..., None], bin_ends=ends[..., None]), [], []
 

@@ -32,6 +32,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
 from hsi_sc_nerf.fields.spectral_field import SpectralField
 from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
@@ -142,17 +143,15 @@ class SpectralModel(NerfactoModel):
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
-        self.occupancy = self.pixels_with_matter = None
+        self.pixels_with_matter = None
         self.proposal_networks, self.density_fns = nn.ModuleList(), []
         if config.num_proposal_iterations > 0:
             networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
             self.proposal_networks.extend(networks)
             self.density_fns = [network.density_fn for network in networks]
         else:
-            self.occupancy, self.pixels_with_matter = build_occupancy(
-                dataset, metadata["frames"], self.scene_box.aabb
-            )
-            self.proposal_sampler = OccupancySampler(self.occupancy, config.num_nerf_samples_per_ray)
+            grid, self.pixels_with_matter = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb)
+            self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray)
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )
@@ -203,6 +202,11 @@ class SpectralModel(NerfactoModel):
             implementation=config.implementation,
             **options,
         )
+
+    @property
+    def occupancy(self) -> OccupancyGrid | None:
+        """The grid that places the samples; None where proposal networks do."""
+        return self.proposal_sampler.grid if isinstance(self.proposal_sampler, OccupancySampler) else None
 
     @property
     def proposals(self) -> ProposalNetworkSampler | None:

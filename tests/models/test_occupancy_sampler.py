@@ -45,6 +45,13 @@ def test_only_rays_that_meet_matter_are_sampled():
     assert spread[:, 0].tolist() == [9.0, 1.0, 2.0, 9.0]
 
 
+def test_a_bundle_that_meets_nothing_keeps_one_ray_without_length():
+    sampler = OccupancySampler(ball_grid(), num_samples=8)
+    samples, *_ = sampler(rays_along_x(torch.tensor([0.9, -0.8])))
+    assert samples.frustums.shape == (1, 8)
+    assert (samples.deltas == 0.0).all()
+
+
 def test_evaluation_is_repeatable_and_training_is_jittered():
     sampler = OccupancySampler(ball_grid(), num_samples=8)
     rays = rays_along_x(torch.zeros(1))
