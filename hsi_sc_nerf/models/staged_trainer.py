@@ -172,7 +172,9 @@ class StagedTrainer(Trainer):
         """One step of its stage."""
         stage = self.plan.at(step)
         if stage is not self._stage:
-            self._enter(stage)
+            manager, self._stage = self.pipeline.datamanager, stage
+            manager.foreground_ray_fraction = stage.config.foreground_ray_fraction
+            manager.boundary_ray_fraction = stage.config.boundary_ray_fraction
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
         rates = self._set_learning_rates(stage, step)
         sampler = self._model.proposals
@@ -220,12 +222,6 @@ class StagedTrainer(Trainer):
         if sampler is not None and proposals_learn:
             sampler._steps_since_update = 0
         return found
-
-    def _enter(self, stage: Stage) -> None:
-        """Set the rays of ``stage``."""
-        self.pipeline.datamanager.foreground_ray_fraction = stage.config.foreground_ray_fraction
-        self.pipeline.datamanager.boundary_ray_fraction = stage.config.boundary_ray_fraction
-        self._stage = stage
 
     def _freeze(self, frozen: set[str]) -> None:
         """Freeze these parameter groups, and no others."""

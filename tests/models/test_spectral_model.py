@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from hsi_sc_nerf.models.spectral_model import BasisDecoder, SpectralRenderer
+from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
