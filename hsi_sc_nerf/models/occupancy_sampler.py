@@ -22,6 +22,7 @@ class OccupancySampler(Sampler):
     Args:
         grid: over the scene box.
         num_samples: samples a ray.
+        every_ray: sample rays that meet no matter as well, as where something is done for each ray.
 
     Attributes:
         rays: of the last call, the indices of the rays that were sampled: those that meet matter. None for all.
@@ -29,9 +30,9 @@ class OccupancySampler(Sampler):
 
     rays: Int[Tensor, "sampled"] | None
 
-    def __init__(self, grid: OccupancyGrid, num_samples: int) -> None:
+    def __init__(self, grid: OccupancyGrid, num_samples: int, every_ray: bool = False) -> None:
         super().__init__(num_samples)
-        self.grid = grid
+        self.grid, self.every_ray = grid, every_ray
         self.rays = None
 
     def generate_ray_samples(  # type: ignore[override]
@@ -53,7 +54,7 @@ class OccupancySampler(Sampler):
                 ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
             )
         self.rays = None
-        if device.type == "cpu":
+        if device.type == "cpu" and not self.every_ray:
             met = (ends[:, -1] > nears).nonzero()[:, 0]
             # One ray with samples of no length keeps the shapes of what follows where none meets matter.
             self.rays = met if len(met) else met.new_zeros(1)

@@ -152,7 +152,7 @@ class SpectralModel(NerfactoModel):
             self.density_fns = [network.density_fn for network in networks]
         else:
             grid, self.pixels_with_matter = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb)
-            self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray)
+            self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
         )

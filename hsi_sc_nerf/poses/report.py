@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +21,8 @@ _STEPS_SHORT_OF_A_TURN = 1.5
 # Length of an arrow over the camera's distance, and of the error axis over the largest error.
 _ARROW_FRACTION = 0.15
 _AXIS_OVER_LARGEST = 1.4
+# What fits into a line of the figure's title.
+_TITLE_CHARACTERS = 190
 
 
 def pose_report(poses: TurntablePoses, info: SessionInfo, findings: Sequence[Finding] = ()) -> dict:
@@ -109,9 +112,9 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
         InputError: the operating system refused to write.
     """
     figure = Figure(figsize=(13, 6), dpi=110)
-    figure.subplots_adjust(left=0.06, right=0.98, bottom=0.1, top=0.86, wspace=0.2, hspace=0.35)
-    words = ", ".join(describe_poses(poses, report))
-    figure.suptitle(f"By {poses.method}: {words}\n{len(report['warnings'])} warnings (see poses.json)", fontsize=9)
+    figure.subplots_adjust(left=0.06, right=0.98, bottom=0.1, top=0.82, wspace=0.2, hspace=0.35)
+    words = textwrap.fill(f"By {poses.method}: {', '.join(describe_poses(poses, report))}", _TITLE_CHARACTERS)
+    figure.suptitle(f"{words}\n{len(report['warnings'])} warnings (see poses.json)", fontsize=9)
     eyes = poses.camera_to_world[poses.used, :3, 3]
     arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_FRACTION * np.linalg.norm(eyes[0])
 
