@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.ray_marching import sample_occupied
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
-from hsi_sc_nerf.geometry.visual_hull import visual_hull
+from hsi_sc_nerf.geometry.visual_hull import MAX_MISSED_FRACTION, visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
@@ -24,6 +24,9 @@ GRID_CELLS = 128
 """Cells along the longest side of the scene box."""
 HULL_MARGIN_M = 0.003
 """Cells within this of the hull may hold matter: masks and poses are uncertain by a pixel or two."""
+MISSED_FRACTION = 0.2
+"""Frames whose masks may miss a point that may hold matter. A stem of one pixel is missed in a tenth of the masks; a
+looser bound costs samples, a tighter one the stem."""
 REFRESH_EVERY, REFRESH_PARTS = 8, 4
 """After so many steps, the field's density is asked for in one of so many parts of the cells."""
 FULL_REFRESHES = 4
@@ -124,7 +127,7 @@ def bounds_from_masks(
     """Cells of a grid that may hold matter, and those of them that are taken to be solid until training knows better.
 
     The former are the visual hull with a margin, and all that is lower than the object. The latter are the hull, the
-    container, and the disc under it. A few frames may contradict the hull (`visual_hull`). If the masks leave none,
+    container, and the disc under it. A fifth of the frames may contradict the former hull, few the latter. If the masks leave none,
     all cells may hold matter, and none is solid.
 
     Args:
@@ -145,16 +148,16 @@ def bounds_from_masks(
     margin_px = dataset.intrinsics.fl_x * (HULL_MARGIN_M + 0.87 * cell_m) / distance_m
     widened = np.stack([dilate(mask, 2 * int(np.ceil(margin_px)) + 1) for mask in masks])
 
-    def hull(silhouettes: Bool[np.ndarray, "frames h w"]) -> Bool[np.ndarray, "x y z"]:
+    def hull(silhouettes: Bool[np.ndarray, "frames h w"], missed_fraction: float) -> Bool[np.ndarray, "x y z"]:
         cells = np.zeros(shape, bool)
-        points_m = visual_hull(centres_m[in_box], silhouettes, poses, dataset.intrinsics)
+        points_m = visual_hull(centres_m[in_box], silhouettes, poses, dataset.intrinsics, missed_fraction)
         cells[tuple(np.floor((points_m - lower_m) / cell_m).astype(int).T)] = True
         return cells
 
-    matter = hull(widened)
+    matter = hull(widened, MISSED_FRACTION)
     if not masks.any() or not matter.any():
         return np.ones(shape, bool), np.zeros(shape, bool)
-    solid = hull(masks)
+    solid = hull(masks, MAX_MISSED_FRACTION)
     from_axis_m, z_m = np.hypot(centres_m[:, 0], centres_m[:, 1]), centres_m[:, 2]
     below = z_m < low_m[2] + 2.0 * HULL_MARGIN_M
     if dataset.container is not None:
