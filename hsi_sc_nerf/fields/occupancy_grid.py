@@ -127,8 +127,8 @@ def bounds_from_masks(
     """Cells of a grid that may hold matter, and those of them that are taken to be solid until training knows better.
 
     The former are the visual hull with a margin, and all that is lower than the object. The latter are the hull, the
-    container, and the disc under it. A fifth of the frames may contradict the former hull, few the latter. If the masks leave none,
-    all cells may hold matter, and none is solid.
+    container, and the disc under it. A fifth of the frames may contradict the former hull, few the latter. If the
+    masks leave none, all cells may hold matter, and none is solid.
 
     Args:
         dataset: camera, container, and the object's box.
