@@ -26,9 +26,9 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
 
-BRIGHTNESS_GAIN = 0.3
-"""Gain of the first coefficient of a spectral basis. With 1, brightness is learned faster than the density and
-explains part of the views before the surface is where it belongs (docs/notes/dead_ends.md)."""
+BRIGHTNESS_GAIN = 0.05
+"""Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
+explains the views before a surface forms (docs/notes/dead_ends.md)."""
 
 START_DENSITIES = (40.0, 0.5)
 """Densities (per scene unit) that training begins with inside of what is taken to be solid, and outside."""

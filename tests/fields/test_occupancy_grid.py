@@ -45,10 +45,10 @@ def test_matter_holds_the_ball_and_solid_is_within_it(ball):
     from_centre_m = np.linalg.norm(centres_m(lower_m) - SPHERE_CENTRE_M, axis=1).reshape(SHAPE)
     assert matter[from_centre_m < SPHERE_RADIUS_M + HULL_MARGIN_M / 2].all()
     assert solid[from_centre_m < SPHERE_RADIUS_M - 2 * CELL_M].all()
-    # Cameras that all look down at one angle leave a cone on the ball, below and above, and two of the ten may miss it.
+    # Cameras that all look down at one angle leave cones on the ball, and two of the ten may miss it.
     height_m = centres_m(lower_m)[:, 2].reshape(SHAPE)
     at_height = abs(height_m - SPHERE_CENTRE_M[2]) < SPHERE_RADIUS_M / 2
-    assert not matter[at_height & (from_centre_m > SPHERE_RADIUS_M + 5 * HULL_MARGIN_M)].any()
+    assert not matter[at_height & (from_centre_m > SPHERE_RADIUS_M + 6 * HULL_MARGIN_M)].any()
     assert not solid[at_height & (from_centre_m > SPHERE_RADIUS_M + 2 * CELL_M)].any()
     assert matter[height_m < ball.object_box_m[0, 2] - CELL_M].all()
 
