@@ -31,8 +31,9 @@ class SpectralPipeline(VanillaPipeline):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         pixels = cast(SpectralModel, self.model).pixels_with_matter
-        if pixels is not None:
-            self.datamanager.train_pixel_sampler.restrict_background(pixels)
+        sampler = self.datamanager.train_pixel_sampler  # None where a command only renders
+        if pixels is not None and sampler is not None:
+            sampler.restrict_background(pixels)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the weights of a checkpoint that was made with the same model settings and dataset.

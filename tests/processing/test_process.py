@@ -327,7 +327,7 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
 @pytest.mark.slow
 def test_wrong_masks_are_refused_after_their_picture_is_drawn(session, tmp_path):
     everything = MaskConfig(threshold=-1.0)
-    with pytest.raises(InputError, match="--accept masks-cut"):
+    with pytest.raises(InputError, match="--accept masks-border"):
         run(session, tmp_path / "data", ProcessConfig(masks=everything))
     assert (tmp_path / "data" / "report" / "masks.png").is_file()
     assert not (tmp_path / "data" / "transforms.json").exists()
