@@ -12,7 +12,13 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, bounds_from_masks, grid_over, pixels_of_cells
+from hsi_sc_nerf.fields.occupancy_grid import (
+    GRID_CELLS,
+    OccupancyGrid,
+    bounds_from_masks,
+    grid_over,
+    pixels_of_cells,
+)
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 
@@ -70,8 +76,8 @@ class OccupancySampler(Sampler):
 
 def build_occupancy(
     dataset: PackedDataset, frames: Sequence[PackedFrame], aabb: Float[Tensor, "2 3"]
-) -> tuple[OccupancyGrid, Bool[np.ndarray, "frames h w"]]:
-    """The occupancy grid of a dataset, and the pixels of its frames that look at cells that may hold matter.
+) -> OccupancyGrid:
+    """The occupancy grid of a dataset.
 
     Args:
         dataset: camera, container, and the boxes of the scene and of the object.
@@ -81,7 +87,6 @@ def build_occupancy(
     Raises:
         InputError: the scene is not the dataset's box.
     """
-    shape, cell = grid_over(aabb)
     low_m, high_m = dataset.scene_box_m
     sides, sides_m = np.ptp(aabb.numpy(force=True), axis=0), high_m - low_m
     if not np.allclose(sides / sides.max(), sides_m / sides_m.max(), atol=1e-3):
@@ -89,8 +94,16 @@ def build_occupancy(
             "the data parser's --scene cameras is no box of what turns, which the occupancy grid needs; take "
             "--pipeline.model.num-proposal-iterations 2 and --pipeline.model.disable-scene-contraction False with it."
         )
-    cell_m = cell * float((high_m - low_m).max() / (aabb[1] - aabb[0]).max())
-    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, cell_m)
+    shape, _ = grid_over(aabb)
+    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, sides_m.max() / GRID_CELLS)
+    return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
+
+
+def pixels_with_matter(
+    grid: OccupancyGrid, dataset: PackedDataset, frames: Sequence[PackedFrame]
+) -> Bool[np.ndarray, "frames h w"]:
+    """The pixels of the frames that look at cells that may hold matter: background rays elsewhere meet nothing."""
+    low_m, high_m = dataset.scene_box_m
+    matter = (grid.opacity >= 0.0).numpy(force=True)
     poses = np.stack([frame.camera_to_world for frame in frames])
-    pixels = pixels_of_cells(matter, low_m, cell_m, poses, dataset.intrinsics)
-    return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid)), pixels
+    return pixels_of_cells(matter, low_m, float((high_m - low_m).max()) / GRID_CELLS, poses, dataset.intrinsics)

@@ -10,6 +10,7 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.models.occupancy_sampler import pixels_with_matter
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 SCENE_BUFFERS = ("aabb", "axis_origin")
@@ -30,10 +31,11 @@ class SpectralPipeline(VanillaPipeline):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        pixels = cast(SpectralModel, self.model).pixels_with_matter
-        sampler = self.datamanager.train_pixel_sampler  # None where a command only renders
-        if pixels is not None and sampler is not None:
-            sampler.restrict_background(pixels)
+        grid = cast(SpectralModel, self.model).occupancy
+        if grid is not None and self.test_mode == "val":  # nerfstudio's name for training
+            metadata = self.datamanager.train_dataparser_outputs.metadata
+            pixels = pixels_with_matter(grid, metadata["dataset"], metadata["frames"])
+            self.datamanager.train_pixel_sampler.restrict_background(pixels)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the weights of a checkpoint that was made with the same model settings and dataset.

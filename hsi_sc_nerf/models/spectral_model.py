@@ -144,14 +144,13 @@ class SpectralModel(NerfactoModel):
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
-        self.pixels_with_matter = None
         self.proposal_networks, self.density_fns = nn.ModuleList(), []
         if config.num_proposal_iterations > 0:
             networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
             self.proposal_networks.extend(networks)
             self.density_fns = [network.density_fn for network in networks]
         else:
-            grid, self.pixels_with_matter = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb)
+            grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
