@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from results_table import RESULTS
@@ -12,7 +12,7 @@ from hsi_sc_nerf.benchmark.configurations import Configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.scene import EFFECTS, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
 METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 1)}
@@ -47,12 +47,13 @@ class PaperTable:
     """Folder of the CSV file."""
 
     def simulated(self, name: str, session: Path, effects: Sequence[str] = ()) -> Path:
-        """Dataset, ``SESSION-data``, of a scene that is simulated if it is missing."""
+        """Dataset, ``SESSION-data``, of a scene with more effects than its own, simulated if it is missing."""
         if not session.exists():
-            scene = override(
-                load_scene(name), frames=self.frames, size_px=self.size, bands=self.bands, effects=effects
-            )
-            simulate_session(scene, session)
+            own = load_scene(name)
+            scene = override(own, frames=self.frames, size_px=self.size, bands=self.bands, effects=effects)
+            # Effects act in a fixed order.
+            both = sorted((*own.effects, *scene.effects), key=lambda effect: list(EFFECTS).index(effect.name))
+            simulate_session(replace(scene, effects=tuple(both)), session)
         return process_session(session, session.with_name(f"{session.name}-data"))
 
     def trained(self, configurations: Sequence[Configuration], data: Path, runs: Path) -> list[BenchmarkRun]:

@@ -31,7 +31,7 @@ class SimulateCommand:
     """Simulate a turntable session in the camera's file layout, with its truth beside the captures."""
 
     scene: tyro.conf.Positional[str]
-    """pear, apple, maize, pepper, sphere, cylinder, or the path of a scene file (YAML)."""
+    """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file (YAML)."""
     session: tyro.conf.Positional[Path]
     """Folder to write: new, empty, or an earlier simulated session, which is replaced."""
     frames: int | None = None

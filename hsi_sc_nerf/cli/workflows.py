@@ -220,7 +220,7 @@ class DemoCommand:
     output_dir: Path = Path("hsi-sc-nerf-demo")
     """Folder for all results; an earlier demo there is replaced."""
     scene: str = "pear"
-    """pear, apple, maize, pepper, sphere, cylinder, or the path of a scene file."""
+    """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
     iterations: int = 1000
     """Training steps of both stages together."""
     points: int = 60_000

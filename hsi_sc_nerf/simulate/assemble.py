@@ -31,6 +31,7 @@ from hsi_sc_nerf.simulate.scene import (
     OwnMesh,
     Scene,
     Sphere,
+    Tomato,
     TurntableSettings,
 )
 
@@ -101,6 +102,9 @@ def _object_on_zero(settings: Object, rng: np.random.Generator) -> Part:
     if isinstance(settings, MaizeEar):
         shape = plants.maize(settings.height_m, rng)
         return Part(shape.mesh, plants.MAIZE_MATERIALS, plants.maize_weights(shape, settings, rng))
+    if isinstance(settings, Tomato):
+        shape = plants.tomato(settings.height_m, rng)
+        return Part(shape.mesh, plants.TOMATO_MATERIALS, plants.tomato_weights(shape, settings, rng))
     shape = {"pear": plants.pear, "apple": plants.apple}[settings.shape](settings.height_m, rng)
     return Part(shape.mesh, plants.FRUIT_MATERIALS[settings.shape], plants.fruit_weights(shape, settings, rng))
 

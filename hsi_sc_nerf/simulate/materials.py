@@ -74,6 +74,9 @@ MATERIALS: dict[str, Material] = {
     "kernel_purple": PlantTissue(0.60, carotenoid=0.30, anthocyanin=1.3, brown=0.55, water=0.040),
     "cob": PlantTissue(0.58, carotenoid=0.25, anthocyanin=0.10, brown=0.50, water=0.035),
     "husk": PlantTissue(0.62, chlorophyll=0.28, carotenoid=0.34, brown=0.22, water=0.055),
+    # Lycopene, a carotenoid, absorbs further into the green than the others; its place is taken by a red pigment's.
+    "tomato_red": PlantTissue(0.66, chlorophyll=0.05, carotenoid=0.95, anthocyanin=1.00, brown=0.05, water=0.095),
+    "tomato_green": PlantTissue(0.58, chlorophyll=0.60, carotenoid=0.70, brown=0.08, water=0.095),
     "container_plastic": Plain(0.62, slope_per_um=0.05, blue_loss=0.12),
     "paper": Plain(0.86, slope_per_um=0.04, blue_loss=0.25),
     "marker_ink": Plain(0.045, slope_per_um=0.03),

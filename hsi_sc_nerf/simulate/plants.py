@@ -1,4 +1,4 @@
-"""Pear, apple and maize ear: meshes that stand on z = 0, and the distribution of their materials."""
+"""Pear, apple, maize ear and tomato: meshes that stand on z = 0, and the distribution of their materials."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import over, smooth_noise, smoothstep
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, revolve, steps
-from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar
+from hsi_sc_nerf.simulate.scene import Fruit, MaizeEar, Tomato
 
 # Profiles of (radius, height) in units of the object's height; the body is a smooth curve, the stem a polyline.
 PEAR_BODY = np.array(
@@ -40,10 +40,23 @@ MAIZE_KERNEL_PITCH_M = 0.0052
 MAIZE_KERNEL_RELIEF_M = 0.0022
 MAIZE_KERNEL_SPAN = (0.085, 0.975)
 """Range with kernels as fractions of the ear's height; shank and husk are below it."""
+# Over the shoulder and down to the floor of the hollow.
+TOMATO_BODY = np.array(
+    [
+        (0.0, 0.04), (0.16, 0.02), (0.34, 0.0), (0.56, 0.10), (0.71, 0.28), (0.77, 0.50), (0.73, 0.73), (0.60, 0.91),
+        (0.45, 0.985), (0.33, 0.97), (0.24, 0.88), (0.17, 0.76), (0.09, 0.70), (0.0, 0.69),
+    ]
+)  # fmt: skip
+TOMATO_RIBS = 7
+TOMATO_RIB_RELIEF = (0.04, 0.16)
+"""Depth of the grooves between ribs at the base and on the shoulder, as a fraction of the radius."""
+TOMATO_SCAR_RADIUS = 0.10
+"""Radius of the scar of the stem on the floor of the hollow, as a fraction of the height."""
 FRUIT_MATERIALS = {
     "pear": ("pear_skin", "pear_blush", "lenticel", "bruise", "stem"),
     "apple": ("apple_skin", "apple_blush", "lenticel", "bruise", "stem"),
 }
+TOMATO_MATERIALS = ("tomato_red", "tomato_green", "stem")
 MAIZE_MATERIALS = ("kernel_yellow", "kernel_white", "kernel_purple", "cob", "husk")
 LENTICELS_PER_CM2 = 3.0
 STREAK_STRETCH = np.array([1.0, 1.0, 0.15])
@@ -55,7 +68,7 @@ class PlantMesh:
 
     mesh: Mesh
     stem: Float[np.ndarray, "v"]
-    """Fraction of stem (fruit) or of husk (maize), in [0, 1]."""
+    """Fraction of stem (fruit), of its scar (tomato) or of husk (maize), in [0, 1]."""
     kernel: Int[np.ndarray, "v"] | None = None
     """Number of the kernel of each vertex (maize)."""
     groove: Float[np.ndarray, "v"] | None = None
@@ -102,6 +115,24 @@ def maize(height_m: float, rng: np.random.Generator) -> PlantMesh:
         kernel=row * (int(along.max()) + 2) + np.floor(along).astype(int),
         groove=1.0 - smoothstep((dome - 0.25) / 0.3),
     )
+
+
+def tomato(height_m: float, rng: np.random.Generator) -> PlantMesh:
+    """A flat tomato with uneven ribs that are deepest on the shoulder, and a hollow where the stem was."""
+    profile = _resample(_smooth(TOMATO_BODY, closed_top=True) * height_m)
+    mesh = revolve(profile, SEGMENTS)
+    x, y, z = mesh.vertices.T
+    azimuth, phase = np.arctan2(y, x), rng.uniform(0.0, 2.0 * np.pi, 4)
+    uneven = azimuth + 0.16 * np.sin(azimuth + phase[0]) + 0.10 * np.sin(2.0 * azimuth + phase[1])
+    # Round ribs with narrow grooves between them; 0 in a groove, 1 on a rib.
+    rib = np.sqrt(0.015 + 0.985 * np.sin(0.5 * TOMATO_RIBS * uneven + phase[2]) ** 2)
+    low, high = TOMATO_RIB_RELIEF
+    depth = low + (high - low) * smoothstep((z / height_m - 0.15) / 0.7)
+    swell = 1.0 + 0.03 * np.cos(2.0 * azimuth + phase[3]) - depth * (1.0 - rib)
+    vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
+    on_floor = 1.0 - smoothstep((np.hypot(x, y) / height_m - 0.75 * TOMATO_SCAR_RADIUS) / (0.5 * TOMATO_SCAR_RADIUS))
+    scar = np.where(z > 0.5 * height_m, on_floor, 0.0)
+    return PlantMesh(mesh=Mesh(_stand(_bend(vertices, height_m, 0.04, rng), height_m), mesh.triangles), stem=scar)
 
 
 def _fruit(
@@ -207,6 +238,19 @@ def maize_weights(shape: PlantMesh, ear: MaizeEar, rng: np.random.Generator) -> 
     of_kernel = over(of_kernel, purple, np.where(is_purple, rng.uniform(0.6, 0.95, kernels), 0.0))
     weights = over(of_kernel[shape.kernel], cob, 0.9 * shape.groove)
     return over(weights, husk, shape.stem)
+
+
+def tomato_weights(shape: PlantMesh, fruit: Tomato, rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
+    """Fractions of red and green skin and of the scar (in the order of `TOMATO_MATERIALS`)."""
+    points = shape.mesh.vertices
+    red, green, scar = np.eye(3)
+    mottle, patches = smooth_noise(points, 0.006, rng), smooth_noise(points, 0.020, rng)
+    on_shoulder = smoothstep((points[:, 2] / fruit.height_m - 0.55) / 0.45 + 0.15 * mottle + 0.15 * patches)
+    weights = np.tile(red, (len(points), 1))
+    weights = over(weights, green, fruit.green_shoulder * on_shoulder)
+    # A little chlorophyll is left everywhere.
+    weights = over(weights, green, 0.3 * fruit.green_shoulder * smoothstep(0.4 + 0.6 * mottle))
+    return over(weights, scar, shape.stem)
 
 
 def speckle(shape: PlantMesh, diameter_m: float, rng: np.random.Generator) -> Float[np.ndarray, "v"]:

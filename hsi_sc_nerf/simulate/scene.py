@@ -23,7 +23,7 @@ from hsi_sc_nerf.simulate.effects import detector, image, light, motion
 from hsi_sc_nerf.simulate.effects.detector import SensorSettings
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 
-SHIPPED_SCENES = ("pear", "apple", "maize", "pepper", "sphere", "cylinder")
+SHIPPED_SCENES = ("pear", "apple", "maize", "tomato", "pepper", "sphere", "cylinder")
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect for effect in (*motion.EFFECTS, *light.EFFECTS, *image.EFFECTS, *detector.EFFECTS)
 }
@@ -53,6 +53,16 @@ class MaizeEar:
     height_m: float = between(0.01, 0.5)
     coloured_kernels: float = between(0.0, 1.0, default=0.0)
     """Fraction of purple kernels; the fraction of white kernels is the same."""
+
+
+@dataclass(frozen=True)
+class Tomato:
+    """A ribbed tomato with a hollow where the stem was."""
+
+    shape: Literal["tomato"]
+    height_m: float = between(0.01, 0.5)
+    green_shoulder: float = between(0.0, 1.0, default=0.0)
+    """Largest fraction of green skin, which is around the hollow, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +104,7 @@ class OwnMesh:
     """Vertical axis of the file; ``by_format`` is y for glTF and GLB, z for PLY and OBJ."""
 
 
-Object: TypeAlias = Fruit | MaizeEar | Sphere | Cylinder | OwnMesh
+Object: TypeAlias = Fruit | MaizeEar | Tomato | Sphere | Cylinder | OwnMesh
 
 
 @dataclass(frozen=True)

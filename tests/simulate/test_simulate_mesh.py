@@ -66,6 +66,7 @@ def test_revolve_refuses_a_profile_that_cannot_close(profile):
         (plants.pear, 0.10, (110, 200), 0.040),
         (plants.apple, 0.075, (130, 230), 0.043),
         (plants.maize, 0.16, (170, 300), 0.03),
+        (plants.tomato, 0.055, (130, 230), 0.047),
     ],
 )
 @pytest.mark.parametrize("seed", [0, 7])
@@ -89,3 +90,19 @@ def test_maize_kernels_are_relief_and_not_paint():
     radius = np.hypot(x, y)[ring]
     assert radius[shape.groove[ring] < 0.01].mean() - radius[shape.groove[ring] > 0.9].mean() > 0.0008
     assert len(np.unique(shape.kernel[shape.stem < 0.5])) > 250
+
+
+def test_a_tomato_has_deep_ribs_and_a_hollow_top():
+    height_m = 0.055
+    shape = plants.tomato(height_m, np.random.default_rng(0))
+    x, y, z = shape.mesh.vertices.T
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    on_axis = (radius < 0.004) & (z > 0.4 * height_m)
+    assert z[on_axis].max() < 0.8 * height_m
+    outer = (np.abs(z - 0.75 * height_m) < 0.001) & (radius > 0.02)
+    around = np.array([radius[outer & (np.abs(azimuth - a) < 0.02)].mean() for a in np.linspace(-3.1, 3.1, 150)])
+    assert around.max() - around.min() > 0.004
+    ribs = np.diff(np.sign(np.diff(around))) < 0
+    assert 6 <= ribs.sum() <= 9
+    assert shape.stem[on_axis].min() > 0.9
+    assert 0.001 < (shape.stem > 0.5).mean() < 0.1

@@ -148,6 +148,7 @@ def test_object_weights_are_only_where_the_object_is(small_session):
         ("sphere", ("matte_white",)),
         ("cylinder", ("matte_grey",)),
         ("pepper", ("pepper_red", "pepper_green", "pepper_stem")),
+        ("tomato", ("tomato_red", "tomato_green", "stem")),
     ],
 )
 def test_sessions_of_solids_and_meshes_have_their_truth(tmp_path, name, materials):
@@ -238,7 +239,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_fruit(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pear", "apple", "maize"])
+@pytest.mark.parametrize("name", ["pear", "apple", "maize", "tomato"])
 def test_another_seed_grows_another_fruit_and_the_same_seed_the_same(name):
     scene = load_scene(name)
     one, same, other = (assemble.object_part(override(scene, seed=seed)) for seed in (5, 5, 6))
