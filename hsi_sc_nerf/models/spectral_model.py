@@ -25,9 +25,9 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
 from hsi_sc_nerf.evaluation.spectral_metrics import (
+    metrics_of_regions,
     spectral_angle_map,
     spectral_angle_mapper,
-    spectral_metrics,
     spectral_rmse,
     squared_error_map,
 )
@@ -326,8 +326,7 @@ class SpectralModel(NerfactoModel):
         truth, valid = self._measured(batch)
         rendered = outputs["spectral"].to(self.device)
         mask = batch["mask"].to(self.device)[..., 0].bool()
-        metrics = spectral_metrics(rendered, truth, mask, valid)
-        metrics |= {f"full_{name}": value for name, value in spectral_metrics(rendered, truth, None, valid).items()}
+        metrics = metrics_of_regions(rendered, truth, {"": mask, "full_": None}, valid)
 
         angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_DRAWN_RAD[1]
         error = squared_error_map(rendered, truth, valid).nan_to_num().sqrt()[..., None] / ERROR_DRAWN[1]

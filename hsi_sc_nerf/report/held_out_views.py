@@ -11,14 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.spectral_metrics import (
-    PSNR_DELTA,
-    per_band_mse,
-    per_band_ssim,
-    spectral_angle_map,
-    spectral_metrics,
-    squared_error_map,
-)
+from hsi_sc_nerf.evaluation.band_scores import PSNR_DELTA, per_band_mse, per_band_ssim
+from hsi_sc_nerf.evaluation.spectral_metrics import metrics_of_regions, spectral_angle_map, squared_error_map
 from hsi_sc_nerf.packed.pixels import spread_over
 
 if TYPE_CHECKING:
@@ -108,10 +102,9 @@ def score_view(
     """Scores of a view, with the paper's metrics (section "Evaluation Metrics")."""
     known = valid[mask].any(0).cpu().numpy()
     mse = np.where(known, per_band_mse(rendered, measured, mask, valid).cpu().numpy(), np.nan)
-    whole_frame = spectral_metrics(rendered, measured, None, valid)
     return ViewScores(
         name,
-        spectral_metrics(rendered, measured, mask, valid) | {f"full_{key}": v for key, v in whole_frame.items()},
+        metrics_of_regions(rendered, measured, {"": mask, "full_": None}, valid),
         rmse=np.sqrt(mse),
         psnr_db=-10.0 * np.log10(mse + PSNR_DELTA),
         ssim=np.where(known, per_band_ssim(rendered, measured, mask, valid).double().cpu().numpy(), np.nan),

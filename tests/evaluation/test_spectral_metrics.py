@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hsi_sc_nerf.evaluation import band_scores, image_blocks
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 
 H, W, BANDS = 17, 23, 5
@@ -70,7 +71,7 @@ def test_windowed_ssim_is_wangs(mask: torch.Tensor | None) -> None:
     x, y = predicted.double().numpy(), target.double().numpy()
     everywhere = np.ones((H, W), bool)
     by_band = [score_of_windows(x[..., b], y[..., b], everywhere, centres, reach=5) for b in range(BANDS)]
-    found = metrics.per_band_windowed_ssim(predicted, target, mask)
+    found = band_scores.per_band_windowed_ssim(predicted, target, mask)
     np.testing.assert_allclose(found.numpy(), by_band, rtol=1e-5)
     assert metrics.windowed_ssim(predicted, target, mask).item() == pytest.approx(np.mean(by_band), rel=1e-5)
 
@@ -273,7 +274,7 @@ def test_errors_of_valid_values_are_not_hidden(metric) -> None:
 def test_blocks_of_valid_values_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
     predicted, target = pair()
     whole = metric(predicted, target, blob(), some_valid())
-    monkeypatch.setattr(metrics, "_BLOCK_VALUES", 2 * H * W)
+    monkeypatch.setattr(image_blocks, "BLOCK_VALUES", 2 * H * W)
     torch.testing.assert_close(metric(predicted, target, blob(), some_valid()), whole, rtol=1e-6, atol=0)
 
 
@@ -283,3 +284,34 @@ def test_a_validity_that_does_not_fit_is_refused(metric) -> None:
     for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
         with pytest.raises(ValueError, match="the validity of values of shape"):
             metric(predicted, target, blob(), valid)
+
+
+@pytest.mark.parametrize("valid", [None, some_valid()], ids=["all", "some"])
+def test_compiled_scores_are_those_of_tensors(valid: torch.Tensor | None) -> None:
+    predicted, target = pair()
+    masks = [blob(), None, torch.zeros(H, W, dtype=torch.bool)]
+    compiled = band_scores.band_scores(predicted, target, masks, valid)
+    for found, mask in zip(compiled, masks, strict=True):
+        (expected,) = band_scores.band_scores(predicted.double(), target.double(), [mask], valid)
+        for score, reference in zip(found, expected, strict=True):
+            torch.testing.assert_close(score, reference, rtol=1e-9, atol=1e-12)
+
+
+def test_regions_are_scored_as_if_alone() -> None:
+    predicted, target = pair()
+    found = metrics.metrics_of_regions(predicted, target, {"": blob(), "full_": None}, some_valid())
+    assert found == pytest.approx(
+        metrics.spectral_metrics(predicted, target, blob(), some_valid())
+        | {f"full_{k}": v for k, v in metrics.spectral_metrics(predicted, target, None, some_valid()).items()}
+    )
+
+
+def test_threads_change_nothing_but_rounding() -> None:
+    predicted, target = pair()
+    threads = torch.get_num_threads()
+    scores = []
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        scores.append(metrics.spectral_metrics(predicted, target, blob()))
+    torch.set_num_threads(threads)
+    assert scores[0] == pytest.approx(scores[1], rel=1e-9)

@@ -1,0 +1,205 @@
+"""Moments of two images by band, over masks and over Gaussian windows, as compiled loops for float32 images.
+
+A tensor library would write every moment of every window to memory in float64. Here a line of windows is kept, and
+the bands of a pixel, which lie side by side, are worked on at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+
+_BANDS_AT_ONCE = 32
+"""Bands whose window sums of a line of pixels are kept at a time: they fit into a processor's cache."""
+
+_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+Images = tuple[Float32[np.ndarray, "h w bands"], Float32[np.ndarray, "h w bands"], Bool[np.ndarray, "h w bands"]]
+"""Predicted, target, and which values of the target count; the last has no pixels where all do."""
+
+
+def moments(images: Images, masks: Bool[np.ndarray, "masks h w"]) -> Float[np.ndarray, "6 masks bands"]:
+    """Moments over the valid pixels of each mask, which are 0 where there are none.
+
+    Returns:
+        Means of predicted and target, their variances, their covariance, mean squared error.
+    """
+    bands = images[0].shape[2]
+    counts, sums = np.zeros((len(masks), bands), np.int64), np.zeros((6, len(masks), bands))
+
+    def add(kernel: Callable[..., None], *arguments: np.ndarray) -> None:
+        for part_counts, part_sums in _in_parts(kernel, images, masks, *arguments):
+            counts[:] += part_counts
+            sums[:] += part_sums
+
+    add(_add_values)
+    number = np.maximum(counts, 1)
+    sums /= number
+    means = sums[:2].copy()
+    sums[2:] = 0.0
+    # Deviations from the means keep large offsets from cancelling.
+    add(_add_deviations, means)
+    sums[:2] = means
+    sums[2:] /= number
+    return sums
+
+
+def window_scores(
+    images: Images,
+    masks: Bool[np.ndarray, "masks h w"],
+    taps: Float[np.ndarray, "window"],
+    stability: tuple[float, float],
+) -> tuple[Int[np.ndarray, "masks bands"], Float[np.ndarray, "masks bands"]]:
+    """Numbers of the valid pixels of each mask, and sums of SSIM over the windows around them.
+
+    Args:
+        images: see `Images`.
+        masks: centres of windows.
+        taps: weights of a window along a line, of odd length; they are cut at the image's borders.
+        stability: constants of the index.
+    """
+    counts, sums = np.zeros((2, len(masks), images[0].shape[2]))
+    for part_counts, part_sums in _in_parts(_add_windows, images, masks, taps, np.array(stability)):
+        counts += part_counts
+        sums += part_sums[0]
+    return counts.astype(np.int64), sums
+
+
+def _in_parts(
+    kernel: Callable[..., None], images: Images, masks: np.ndarray, *arguments: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Numbers of pixels and sums of each part of the lines; a thread of torch's number works on each part."""
+    shape = masks.shape[0], images[0].shape[2]
+    parts = max(1, min(torch.get_num_threads(), images[0].shape[0]))
+    edges = np.linspace(0, images[0].shape[0], parts + 1).astype(int)
+
+    def work(part: int) -> tuple[np.ndarray, np.ndarray]:
+        found = np.zeros(shape, np.int64), np.zeros((6, *shape))
+        kernel(images, masks, *arguments, edges[part], edges[part + 1], *found)
+        return found
+
+    if parts == 1:
+        return [work(0)]
+    with ThreadPoolExecutor(parts) as pool:
+        return list(pool.map(work, range(parts)))
+
+
+@_compiled
+def _add_values(images, masks, first, last, counts, sums):
+    predicted, target, valid = images
+    for m in range(len(masks)):
+        for y in range(first, last):
+            for x in range(predicted.shape[1]):
+                if masks[m, y, x]:
+                    for b in range(predicted.shape[2]):
+                        if len(valid) == 0 or valid[y, x, b]:
+                            counts[m, b] += 1
+                            sums[0, m, b] += predicted[y, x, b]
+                            sums[1, m, b] += target[y, x, b]
+
+
+@_compiled
+def _add_deviations(images, masks, means, first, last, counts, sums):
+    predicted, target, valid = images
+    for m in range(len(masks)):
+        for y in range(first, last):
+            for x in range(predicted.shape[1]):
+                if masks[m, y, x]:
+                    for b in range(predicted.shape[2]):
+                        if len(valid) == 0 or valid[y, x, b]:
+                            p, t = np.float64(predicted[y, x, b]), np.float64(target[y, x, b])
+                            error = p - t
+                            p -= means[0, m, b]
+                            t -= means[1, m, b]
+                            counts[m, b] += 1
+                            sums[2, m, b] += p * p
+                            sums[3, m, b] += t * t
+                            sums[4, m, b] += p * t
+                            sums[5, m, b] += error * error
+
+
+@_compiled
+def _add_windows(images, masks, taps, stability, first, last, counts, sums):
+    """SSIM over the windows of some lines; the kept sums are those of p, t, p², t², p t and of what is valid."""
+    valid = images[2]
+    _, width, bands = images[0].shape
+    reach = len(taps) // 2
+    down = np.empty((6, width, _BANDS_AT_ONCE))
+    window = np.empty((6, _BANDS_AT_ONCE))
+    for y in range(first, last):
+        left, right = _extent(masks[:, y])
+        if left == right:
+            continue
+        for start in range(0, bands, _BANDS_AT_ONCE):
+            some = min(_BANDS_AT_ONCE, bands - start)
+            for x in range(max(left - reach, 0), min(right + reach, width)):
+                _sum_down(images, taps, y, x, start, some, down[:, x])
+            for x in range(left, right):
+                if not masks[:, y, x].any():
+                    continue
+                _sum_across(down, taps, x, some, window)
+                for k in range(some):
+                    if len(valid) > 0 and not valid[y, x, start + k]:
+                        continue
+                    score = _ssim(window[:, k] / window[5, k], stability)
+                    for m in range(len(masks)):
+                        if masks[m, y, x]:
+                            counts[m, start + k] += 1
+                            sums[0, m, start + k] += score
+
+
+@_compiled
+def _extent(lines):
+    """First and end of the pixels of a line that lie in some mask."""
+    left, right = lines.shape[1], 0
+    for x in range(lines.shape[1]):
+        if lines[:, x].any():
+            left, right = min(left, x), x + 1
+    return min(left, right), right
+
+
+@_compiled
+def _sum_down(images, taps, y, x, start, some, sums):
+    predicted, target, valid = images
+    reach = len(taps) // 2
+    sums[:, :some] = 0.0
+    for line in range(max(y - reach, 0), min(y + reach + 1, predicted.shape[0])):
+        weight = taps[line - y + reach]
+        for k in range(some):
+            p, t = np.float64(predicted[line, x, start + k]), np.float64(target[line, x, start + k])
+            counted = weight
+            if len(valid) > 0 and not valid[line, x, start + k]:
+                # What stands there, NaN included, counts nowhere.
+                p, t, counted = 0.0, 0.0, 0.0
+            sums[0, k] += weight * p
+            sums[1, k] += weight * t
+            sums[2, k] += weight * p * p
+            sums[3, k] += weight * t * t
+            sums[4, k] += weight * p * t
+            sums[5, k] += counted
+
+
+@_compiled
+def _sum_across(down, taps, x, some, window):
+    reach = len(taps) // 2
+    window[:, :some] = 0.0
+    for sample in range(max(x - reach, 0), min(x + reach + 1, down.shape[1])):
+        weight = taps[sample - x + reach]
+        for moment in range(6):
+            for k in range(some):
+                window[moment, k] += weight * down[moment, sample, k]
+
+
+@_compiled
+def _ssim(window, stability):
+    """Wang et al. 2004, Eq. 13, in [-1, 1] even where rounding has bent the moments."""
+    mean_p, mean_t = window[0], window[1]
+    variance_p, variance_t = max(window[2] - mean_p * mean_p, 0.0), max(window[3] - mean_t * mean_t, 0.0)
+    bound = np.sqrt(variance_p * variance_t)
+    covariance = min(max(window[4] - mean_p * mean_t, -bound), bound)
+    luminance = (2.0 * mean_p * mean_t + stability[0]) / (mean_p * mean_p + mean_t * mean_t + stability[0])
+    return luminance * (2.0 * covariance + stability[1]) / (variance_p + variance_t + stability[1])

@@ -1,0 +1,216 @@
+"""Scores of each band of a view: mean squared error, peak signal-to-noise ratio, structural similarity.
+
+Arguments are those of `spectral_metrics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hsi_sc_nerf.evaluation.image_blocks import (
+    Image,
+    Mask,
+    Valid,
+    check_shapes,
+    check_valid,
+    cleared,
+    image_blocks,
+)
+from hsi_sc_nerf.numerics import check_mask, narrow, safe_log10, select_pixels
+
+# The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
+PSNR_DELTA = 1e-10
+# Stability constants of Wang et al. 2004 (K1 = 0.01, K2 = 0.03) for a dynamic range of 1, and their window.
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+SSIM_WINDOW_PX = 11
+SSIM_WINDOW_SIGMA_PX = 1.5
+
+
+def band_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
+) -> list[tuple[Float[Tensor, "bands"], Float[Tensor, "bands"], Float[Tensor, "bands"]]]:
+    """`per_band_mse`, `per_band_ssim` and `per_band_windowed_ssim` over each of several masks."""
+    if _is_compiled(predicted, target):
+        by_mask = _compiled_moment_scores(predicted, target, masks, valid)
+        windowed = _compiled_windowed_ssim(predicted, target, masks, valid)
+        return [(*scores, windows) for scores, windows in zip(by_mask, windowed, strict=True)]
+    return [
+        (
+            per_band_mse(predicted, target, mask, valid),
+            per_band_ssim(predicted, target, mask, valid),
+            per_band_windowed_ssim(predicted, target, mask, valid),
+        )
+        for mask in masks
+    ]
+
+
+def per_band_mse(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, "bands"]:
+    """Mean squared error over the pixels of each band, float64 (paper, MSE_b)."""
+    if _is_compiled(predicted, target):
+        return _compiled_moment_scores(predicted, target, [mask], valid)[0][0]
+    return _over_pixels(lambda p, t, v: _band_mean((p - t).square(), v), predicted, target, mask, valid)
+
+
+def per_band_psnr(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, "bands"]:
+    """Peak signal-to-noise ratio of each band, dB, for a peak of 1; at most ``-10 log10(PSNR_DELTA)`` = 100 dB."""
+    return narrow(decibel(per_band_mse(predicted, target, mask, valid)), predicted)
+
+
+def decibel(mse: Float[Tensor, "bands"]) -> Float[Tensor, "bands"]:
+    """The peak signal-to-noise ratio of mean squared errors, dB."""
+    return -10.0 * safe_log10(mse + PSNR_DELTA)
+
+
+def per_band_ssim(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, "bands"]:
+    """SSIM of each band with means, variances and covariance over all the pixels of the mask: one window."""
+    if _is_compiled(predicted, target):
+        return narrow(_compiled_moment_scores(predicted, target, [mask], valid)[0][1], predicted)
+    return narrow(_over_pixels(_ssim_over_pixels, predicted, target, mask, valid), predicted)
+
+
+def per_band_windowed_ssim(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, "bands"]:
+    """``windowed_ssim`` of each band."""
+    if _is_compiled(predicted, target):
+        return narrow(_compiled_windowed_ssim(predicted, target, [mask], valid)[0], predicted)
+    height, width, bands = predicted.shape
+    if mask is None:
+        mask = torch.ones(height, width, dtype=torch.bool, device=predicted.device)
+    if len(select_pixels(predicted[..., :1], mask)) == 0:
+        return narrow(predicted.new_ones(bands), predicted)
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    weights_rows, weights_columns = _gaussian_weights(height, rows), _gaussian_weights(width, columns)
+    centres = mask[rows][:, columns]
+
+    def window_sum(values: Float[Tensor, "some h w"]) -> Float[Tensor, "some rows columns"]:
+        return weights_rows @ (values @ weights_columns.T)
+
+    scores = []
+    for some_p, some_t, some_valid in image_blocks(predicted, target, valid, -1):
+        p, t = some_p.double().movedim(-1, 0), some_t.double().movedim(-1, 0)
+        moments = [window_sum(values) for values in (p, t, p.square(), t.square(), p * t)]
+        if some_valid is not None:
+            # What is not valid is 0 and added nothing: the rest's weights are scaled to sum to 1.
+            weight = window_sum(some_valid.double().movedim(-1, 0)).clamp_min(torch.finfo(torch.float64).tiny)
+            moments = [moment / weight for moment in moments]
+        mean_p, mean_t, square_p, square_t, product = moments
+        local = _ssim(
+            mean_p, mean_t, square_p - mean_p.square(), square_t - mean_t.square(), product - mean_p * mean_t
+        )[:, centres].T
+        if some_valid is None:
+            scores.append(local.mean(0))
+        else:
+            at_centres = some_valid[mask]
+            scores.append(torch.where(at_centres.any(0), _band_mean(cleared(local, at_centres), at_centres), 1.0))
+    return narrow(torch.cat(scores), predicted)
+
+
+def _over_pixels(
+    band_score: Callable[[Tensor, Tensor, Tensor | None], Tensor],
+    predicted: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    valid: Tensor | None,
+) -> Float[Tensor, "bands"]:
+    """A score of each band from its selected pixels: ``band_score`` gets (n, some bands) of both and of ``valid``."""
+    scores = [
+        band_score(
+            select_pixels(p, mask).double(),
+            select_pixels(t, mask).double(),
+            None if v is None else select_pixels(v, mask),
+        )
+        for p, t, v in image_blocks(predicted, target, valid, -1)
+    ]
+    return torch.cat(scores)
+
+
+def _band_mean(values: Float[Tensor, "n bands"], valid: Bool[Tensor, "n bands"] | None) -> Float[Tensor, "bands"]:
+    """Mean of each band over its valid pixels, of values that are 0 elsewhere; 0 without any."""
+    if valid is None:
+        return values.sum(0) / max(values.shape[0], 1)
+    return values.sum(0) / valid.sum(0, dtype=torch.int32).clamp_min(1)
+
+
+def _ssim(mean_p: Tensor, mean_t: Tensor, variance_p: Tensor, variance_t: Tensor, covariance: Tensor) -> Tensor:
+    """SSIM from the moments (Wang et al. 2004, Eq. 13), in [-1, 1] even where rounding has bent the moments."""
+    variance_p, variance_t = variance_p.clamp_min(0), variance_t.clamp_min(0)
+    bound = (variance_p * variance_t).sqrt()
+    covariance = covariance.clamp(-bound, bound)
+    luminance = (2 * mean_p * mean_t + SSIM_C1) / (mean_p.square() + mean_t.square() + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
+
+
+def _ssim_over_pixels(
+    p: Float[Tensor, "n bands"], t: Float[Tensor, "n bands"], valid: Bool[Tensor, "n bands"] | None
+) -> Float[Tensor, "bands"]:
+    mean_p, mean_t = _band_mean(p, valid), _band_mean(t, valid)
+    p, t = p - mean_p, t - mean_t
+    if valid is not None:
+        p, t = cleared(p, valid), cleared(t, valid)
+    variance_p, variance_t = _band_mean(p.square(), valid), _band_mean(t.square(), valid)
+    return _ssim(mean_p, mean_t, variance_p, variance_t, _band_mean(p * t, valid))
+
+
+def _gaussian_weights(size: int, centres: Tensor) -> Float[Tensor, "centres size"]:
+    """One row a centre: the window's weights over a line of ``size`` pixels, cut at its ends and summing to 1."""
+    distance = torch.arange(size, dtype=torch.float64, device=centres.device) - centres[:, None]
+    weights = torch.exp(-0.5 * (distance / SSIM_WINDOW_SIGMA_PX).square())
+    weights = torch.where(distance.abs() <= SSIM_WINDOW_PX // 2, weights, 0.0)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def _is_compiled(predicted: Image, target: Image) -> bool:
+    """Whether images are such as compiled loops take: those of the processor, in single precision."""
+    return all(image.device.type == "cpu" and image.dtype == torch.float32 for image in (predicted, target))
+
+
+def _for_loops(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """The images and all masks as `band_moments_cpu` takes them."""
+    check_shapes(predicted, target)
+    if valid is not None:
+        check_valid(target, valid)
+    for mask in masks:
+        if mask is not None:
+            check_mask(predicted, mask)
+    flags = torch.zeros(0, 0, 0, dtype=torch.bool) if valid is None else valid
+    whole = torch.ones(predicted.shape[:2], dtype=torch.bool)
+    chosen = np.stack([(whole if mask is None else mask).numpy() for mask in masks])
+    first, second, third = (image.contiguous().numpy(force=True) for image in (predicted, target, flags))
+    return (first, second, third), chosen
+
+
+def _compiled_moment_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
+) -> list[tuple[Float[Tensor, "bands"], Float[Tensor, "bands"]]]:
+    """`per_band_mse` and `per_band_ssim` over each mask, float64."""
+    from hsi_sc_nerf.evaluation import band_moments_cpu  # compiles; a GPU does without it
+
+    found = torch.from_numpy(band_moments_cpu.moments(*_for_loops(predicted, target, masks, valid)))
+    return list(zip(found[5], _ssim(*found[:5]), strict=True))
+
+
+def _compiled_windowed_ssim(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
+) -> Float[Tensor, "masks bands"]:
+    """`per_band_windowed_ssim` over each mask, float64."""
+    from hsi_sc_nerf.evaluation import band_moments_cpu
+
+    taps = _gaussian_weights(SSIM_WINDOW_PX, torch.tensor([SSIM_WINDOW_PX // 2]))[0].numpy()
+    loops = _for_loops(predicted, target, masks, valid)
+    counts, sums = map(torch.from_numpy, band_moments_cpu.window_scores(*loops, taps, (SSIM_C1, SSIM_C2)))
+    return torch.where(counts > 0, sums / counts.clamp_min(1), 1.0)
