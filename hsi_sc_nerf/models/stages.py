@@ -51,13 +51,13 @@ class StageConfig:
 def full_frame_stage() -> StageConfig:
     """The paper's first stage: whole frames, poses refined.
 
-    The surface forms in this stage, and a turntable's object covers less than a tenth of the pixels. A fraction of
-    the rays is therefore drawn from the object and its boundary.
+    A turntable's object covers less than a tenth of the pixels, and the occupancy grid bounds it from the start. Most
+    rays are therefore drawn from the object; the others see its boundary, the container and the disc.
     """
     return StageConfig(
         name="full-frame",
         fraction=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
-        foreground_ray_fraction=0.2,
+        foreground_ray_fraction=0.8,
         boundary_ray_fraction=0.2,
     )
 
