@@ -1,8 +1,8 @@
 """Points spread evenly over the surface of a trained model (scene units).
 
-The depth maps of the training frames are fused into a mesh. Points are spread evenly over its area, and each is moved
-along the ray of the frame that sees it most from the front to the model's surface. Points that no frame sees are left
-out. The ray gives the point's spectrum too: seen from the front, as the white reference was.
+The depth maps of the training frames are fused into a mesh, whose vertices are moved to the model's silhouettes. Points
+are spread evenly over its area. Points that no frame sees are left out. The ray of the frame that sees a point most from
+the front gives its spectrum: seen from the front, as the white reference was.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import EVERYWHERE, Region, in_box
-from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, SEARCH_DEPTH, SEARCH_STEPS, surface_depth
+from hsi_sc_nerf.surface.silhouette_surface import move_to_silhouettes
+from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
 from hsi_sc_nerf.terminal import progress_bar
 
 MAX_SHIFT = 0.02
-"""Points of the mesh are moved by at most this along their normal (about 2 mm)."""
+"""Vertices of the mesh are moved by at most this along their normal (about 2 mm)."""
+OPAQUE_WITHIN, _STEP = 0.1, 0.004
+"""A vertex lies on a surface if a ray along its normal meets something opaque within this (about a centimetre)."""
 _PILOT_POINTS = (1_000, 20_000)
 _MARGIN = 1.02
 """Factor on the number of candidates, so that one more batch is rarely needed."""
@@ -106,22 +109,22 @@ def sample_surface_points(
             f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
             "longer, and look at the masks in the dataset's report folder."
         )
+    mesh = _at_silhouettes(model, mesh, rays_per_batch)
     found = 0
 
     def keep(candidates: Float[np.ndarray, "n 3"]) -> SurfacePoints:
         nonlocal found
         parts = []
         for start in range(0, len(candidates), rays_per_batch):
-            moved = _move_to_surface(model, renders, mesh, candidates[start : start + rays_per_batch])
-            kept = in_box(moved.points, box) & region.contains(moved.points, moved.mesh_normals)
-            parts.append(moved.select(kept))
+            seen = _seen(renders, mesh, candidates[start : start + rays_per_batch])
+            kept = in_box(seen.points, box) & region.contains(seen.points, seen.mesh_normals)
+            parts.append(seen.select(kept))
             found += len(parts[-1])
             update(found)
         return SurfacePoints.concatenate(parts)
 
     with progress_bar("spreading points", "points", num_points) as update:
-        # An oblique ray moves a point by more than MAX_SHIFT, but no further than the surface is searched.
-        triangles = mesh.triangles_near(region.bounds, SEARCH_DEPTH)
+        triangles = mesh.triangles_near(region.bounds, 0.0)
         points = even_points(mesh.vertices, triangles, num_points, keep) if len(triangles) else None
     if points is None or not len(points):
         raise InputError("no point of the object lies in the selected region; make it larger.")
@@ -157,27 +160,34 @@ def even_points(
 
 
 @torch.no_grad()
-def _move_to_surface(
-    model: SpectralModel, renders: DepthRenders, mesh: SurfaceMesh, candidates: Float[np.ndarray, "n 3"]
-) -> SurfacePoints:
-    """Points of the mesh, moved to the surface along their most frontal rays, if these hit it."""
-    points = torch.from_numpy(candidates).float().to(model.device)
+def _seen(renders: DepthRenders, mesh: SurfaceMesh, candidates: Float[np.ndarray, "n 3"]) -> SurfacePoints:
+    """Points of the mesh that a frame sees."""
+    points = torch.from_numpy(candidates).float().to(renders.depths.device)
     normals = torch.from_numpy(mesh.normals_at(candidates)).to(points)
     frames, xy_px, cosines = renders.most_frontal(points, normals)
+    incidence_deg = torch.rad2deg(cosines.clamp_max(1.0).arccos())
     seen = frames >= 0
-    points, normals, frames, xy_px, cosines = (t[seen] for t in (points, normals, frames, xy_px, cosines[:, None]))
-    origins = renders.camera_to_world[frames, :3, 3]
-    distances = (points - origins).norm(dim=-1, keepdim=True)
-    directions = (points - origins) / distances
-    depth, opacity = surface_depth(model, origins, directions, distances, cosines)
-    shift = (depth - distances).abs()
-    # Further away is another part of the surface, which has its own candidates. A hit at the very start of the
-    # searched interval has its surface before it.
-    near = (shift * cosines < MAX_SHIFT) & (shift < SEARCH_DEPTH * (1.0 - 2.0 / SEARCH_STEPS))
-    hit = ((opacity > MIN_OPACITY) & near)[:, 0]
-    incidence_deg = torch.rad2deg(cosines[:, 0].clamp_max(1.0).arccos())
-    columns = (origins + directions * depth, normals, frames, xy_px, incidence_deg)
-    return SurfacePoints(*(column[hit].cpu().numpy() for column in columns))
+    columns = (points, normals, frames, xy_px, incidence_deg)
+    return SurfacePoints(*(column[seen].cpu().numpy() for column in columns))
+
+
+@torch.no_grad()
+def _at_silhouettes(model: SpectralModel, mesh: SurfaceMesh, points_per_batch: int) -> SurfaceMesh:
+    """The mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it."""
+    vertices, kept = mesh.vertices.copy(), np.zeros(len(mesh.vertices), bool)
+    normals = mesh.normals_at(mesh.vertices)
+    with progress_bar("finding the surface", "points", len(vertices)) as update:
+        for start in range(0, len(vertices), points_per_batch):
+            rows = slice(start, start + points_per_batch)
+            before, outward = (torch.from_numpy(a[rows]).float().to(model.device) for a in (mesh.vertices, normals))
+            after = move_to_silhouettes(model.field.density_fn, before, outward)
+            inwards = after[:, None] - outward[:, None] * torch.arange(0.0, OPAQUE_WITHIN, _STEP).to(after)[:, None]
+            opacity = 1.0 - torch.exp(-model.field.density_fn(inwards)[..., 0].sum(dim=1) * _STEP)
+            vertices[rows] = after.cpu().numpy()
+            # Further away is another part of the surface, which has its own vertices.
+            kept[rows] = (((after - before).norm(dim=-1) < MAX_SHIFT) & (opacity > MIN_OPACITY)).cpu().numpy()
+            update(min(start + points_per_batch, len(vertices)))
+    return SurfaceMesh(vertices, mesh.triangles[kept[mesh.triangles].all(axis=1)])
 
 
 class SurfaceMesh(Mesh):
