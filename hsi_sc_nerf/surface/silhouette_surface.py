@@ -1,9 +1,9 @@
 """Where the surface lies in a soft density: where the model's own silhouettes are.
 
 A trained density rises over a few millimetres, because a pixel at the outline sees the object in a part of its area.
-A mask ends where the object covers half of a pixel, and there the model has learned to render half of the object. So a
-ray that touches the true surface collects an opacity of one half. That names the surface without a threshold to tune:
-how opaque the density is there for a ray from the front depends on the curvature, the pixels and the training.
+A mask ends where the object covers half of a pixel, and there the model has learned to render half of the object. So
+a ray that touches the true surface collects an opacity of one half. That names the surface without a threshold to
+tune: how opaque the density is there from the front depends on the curvature, the pixels and the training.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Points spread evenly over the surface of a trained model (scene units).
 
-The depth maps of the training frames are fused into a mesh, whose vertices are moved to the model's silhouettes. Points
-are spread evenly over its area. Points that no frame sees are left out. The ray of the frame that sees a point most from
-the front gives its spectrum: seen from the front, as the white reference was.
+The depth maps of the training frames are fused into a mesh, whose vertices are moved to the model's silhouettes.
+Points are spread evenly over its area. Points that no frame sees are left out. The ray of the frame that sees a point
+most from the front gives its spectrum: seen from the front, as the white reference was.
 """
 
 from __future__ import annotations

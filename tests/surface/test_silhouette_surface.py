@@ -1,0 +1,75 @@
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from hsi_sc_nerf.surface.silhouette_surface import move_to_silhouettes
+
+FOLDING = 0.004
+
+
+def soft(distance_fn, surface_density):
+    """A density that grows by e over FOLDING into a body, of which distance_fn gives the signed distance."""
+    return lambda points: surface_density * torch.exp(-distance_fn(points) / FOLDING).clamp_max(1e4)[..., None]
+
+
+def touching_density(radius):
+    """Density at the surface of a round body at which a ray that touches it collects half an opacity.
+
+    Along the ray the distance to the body is t^2 / 2 R, so the optical depth is a Gaussian's integral.
+    """
+    return math.log(2.0) / math.sqrt(2.0 * math.pi * radius * FOLDING)
+
+
+def around(radius, count=200):
+    """Points up to 1 mm from a ball, and its normals."""
+    generator = torch.Generator().manual_seed(0)
+    normals = normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return normals * (radius + 0.02 * torch.rand(count, 1, generator=generator) - 0.01), normals
+
+
+@pytest.mark.parametrize("radius", [0.03, 0.1, 0.25])
+def test_a_ball_is_found_whatever_its_radius(radius):
+    points, normals = around(radius)
+    moved = move_to_silhouettes(soft(lambda p: p.norm(dim=-1) - radius, touching_density(radius)), points, normals)
+    torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), radius), atol=1e-3, rtol=0)
+
+
+def test_the_opacity_from_the_front_would_depend_on_the_radius():
+    """Why there is no such threshold: it would be three times as large on the small ball as on the large one."""
+    assert touching_density(0.03) / touching_density(0.25) == pytest.approx(2.9, abs=0.1)
+
+
+def test_a_stem_is_found_by_the_rays_across_it():
+    radius = 0.03
+    _, normals = around(1.0)
+    normals = normalize(normals * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
+    stem = soft(lambda p: p[..., :2].norm(dim=-1) - radius, touching_density(radius))
+    moved = move_to_silhouettes(stem, normals * (radius + 0.008), normals)
+    # None of the four directions is exactly across the stem: they are up to 22.5 degrees off.
+    torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(moved),), radius), atol=1.5e-3, rtol=0)
+
+
+def test_in_a_hollow_the_opacity_from_the_front_is_that_of_the_rest():
+    """A bowl that nothing touches, and a ball beside it that gives the opacity."""
+    radius, density = 0.25, touching_density(0.25)
+
+    def distance(points):
+        ball = (points - torch.tensor([2.0, 0.0, 0.0])).norm(dim=-1) - radius
+        bowl = radius - points.norm(dim=-1)
+        return torch.minimum(bowl, ball)
+
+    points, normals = around(radius)
+    in_bowl, on_ball = -normals * radius, points + torch.tensor([2.0, 0.0, 0.0])
+    both = torch.cat([in_bowl, on_ball]), torch.cat([normals, normals])
+    moved = move_to_silhouettes(soft(distance, density), *both)
+    torch.testing.assert_close(
+        moved[: len(points)].norm(dim=-1), torch.full((len(points),), radius), atol=2e-3, rtol=0
+    )
+
+
+def test_empty_space_moves_nothing_far_and_stays_finite():
+    points, normals = around(0.25)
+    moved = move_to_silhouettes(lambda p: torch.zeros_like(p[..., :1]), points, normals)
+    assert torch.isfinite(moved).all()
