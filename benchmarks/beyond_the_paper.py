@@ -60,6 +60,8 @@ class BeyondThePaper(PaperTable):
     """Scenes of `hsi-sc-nerf simulate`, also tomato; their own effects (gloss) are kept."""
     configurations: tuple[str, ...] = ("paper", "ours")
     """Configurations of `hsi-sc-nerf benchmark`."""
+    seeds: tuple[int, ...] = (0,)
+    """Of the networks and of the drawn pixels; each is a run. The table has means and standard deviations over them."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
@@ -69,13 +71,20 @@ class BeyondThePaper(PaperTable):
             self.simulated(name, folder / "noise-free", SHADING)
             mask_iou = score_processing(open_packed(data), load_truth(folder / "session")).mask_iou
             print(f"{name}: smallest intersection over union of a frame's mask with the object: {mask_iou:.3f}")
-            runs = self.trained([named_configuration(known) for known in self.configurations], data, folder / "runs")
-            rows = object_rows(name, runs, [self._judged(folder, run) for run in runs])
-            write_results("beyond_the_paper", TITLES, rows, keys=2, folder=self.results)
+            configurations = [named_configuration(known) for known in self.configurations]
+            trained: dict[str, list[tuple[BenchmarkRun, dict[str, float]]]] = {}
+            for seed in self.seeds:
+                runs = folder / (f"runs-{seed}" if seed else "runs")
+                for run in self.trained(configurations, data, runs, seed):
+                    trained.setdefault(run.name, []).append((run, self._judged(folder, runs, run)))
+            seeds = f"scene, runs {' '.join(map(str, self.seeds))}"
+            write_results(
+                "beyond_the_paper", TITLES, object_rows(name, trained), keys=2, seed=seeds, folder=self.results
+            )
 
-    def _judged(self, folder: Path, run: BenchmarkRun) -> dict[str, float]:
+    def _judged(self, folder: Path, runs: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
-        trained = folder / "runs" / run.name
+        trained = runs / run.name
         kept = trained / "judged.json"
         if not kept.is_file() or kept.stat().st_mtime < (trained / "result.json").stat().st_mtime:
             config = trained / "benchmark" / run.method / "run" / "config.yml"
@@ -137,28 +146,35 @@ TITLES = [
 ]
 
 
-def object_rows(name: str, runs: Sequence[BenchmarkRun], judged: Sequence[Mapping[str, float]]) -> list[list[str]]:
-    """The paper's row, one for each run, and what the noise and the views would allow."""
+def object_rows(
+    name: str, trained: Mapping[str, Sequence[tuple[BenchmarkRun, Mapping[str, float]]]]
+) -> list[list[str]]:
+    """The paper's row, one for each configuration over its seeds, and what the noise and the views would allow."""
     printed: Mapping[str, float] = PAPER.get(name, {})
     cells = [f"{printed[metric]:.{digits}f}" if metric in printed else "-" for metric, (_, digits) in METRICS.items()]
     f_score = f"{printed['f_score']:.1f}" if "f_score" in printed else "-"
     rows = [[name, "paper, its own fruit", "40000", *cells, f"{PAPER_FIRST_STAGE_PSNR}", "-", "-", f_score, "-"]]
-    for run, more in zip(runs, judged, strict=True):
-        first, last = run.stage_ends[0].metrics, run.checkpoints[-1].metrics
+    for configuration, seeds in trained.items():
+        last = [run.checkpoints[-1] for run, _ in seeds]
         rows.append(
             [
                 name,
-                run.name,
-                str(run.checkpoints[-1].iteration),
-                *(mean_and_deviation(last, metric, digits) for metric, (_, digits) in METRICS.items()),
-                f"{first['full_psnr']:.1f}",
-                *(f"{more[f'clean_{metric}']:.4f}" for metric in ("sam", "rmse")),
-                f"{more['whole_f_score']:.1f}",
-                f"{more['seen_f_score']:.1f}",
+                configuration,
+                f"{np.mean([checkpoint.iteration for checkpoint in last]):.0f}",
+                *(
+                    mean_and_deviation([checkpoint.metrics[metric] for checkpoint in last], digits)
+                    for metric, (_, digits) in METRICS.items()
+                ),
+                mean_and_deviation([run.stage_ends[0].metrics["full_psnr"] for run, _ in seeds], 1),
+                *(
+                    mean_and_deviation([more[f"clean_{metric}"] for _, more in seeds], 4)
+                    for metric in ("sam", "rmse")
+                ),
+                *(mean_and_deviation([more[f"{of}_f_score"] for _, more in seeds], 1) for of in ("whole", "seen")),
             ]
         )
-    best = judged[0]
-    noise = [f"{best[f'noise_{metric}']:.{digits}f}" for metric, (_, digits) in METRICS.items()]
+    views = next(iter(trained.values()))[0][1]
+    noise = [f"{views[f'noise_{metric}']:.{digits}f}" for metric, (_, digits) in METRICS.items()]
     return [*rows, [name, "what the noise allows", "", *noise, "-", "0", "0", "-", "-"]]
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from results_table import RESULTS
 
 from hsi_sc_nerf.benchmark.configurations import Configuration
@@ -56,12 +57,15 @@ class PaperTable:
             simulate_session(replace(scene, effects=tuple(both)), session)
         return process_session(session, session.with_name(f"{session.name}-data"))
 
-    def trained(self, configurations: Sequence[Configuration], data: Path, runs: Path) -> list[BenchmarkRun]:
+    def trained(
+        self, configurations: Sequence[Configuration], data: Path, runs: Path, seed: int = 0
+    ) -> list[BenchmarkRun]:
         """One run for each configuration, in processes of their own."""
+        seeds = f"--machine.seed {seed} --pipeline.datamanager.seed {seed}" if seed else ""
         command = BenchmarkCommand(
             data=data,
             output_dir=runs,
-            common=self.common,
+            common=f"{self.common} {seeds}".strip(),
             train_seconds=self.train_seconds,
             clock=self.clock,
             iterations=self.iterations,
@@ -72,6 +76,7 @@ class PaperTable:
         return train_all(configurations, command)
 
 
-def mean_and_deviation(metrics: Mapping[str, float], name: str, digits: int) -> str:
-    """A metric's mean over the held-out views, and its standard deviation."""
-    return f"{metrics[name]:.{digits}f} ± {metrics[f'{name}_std']:.{digits}f}"
+def mean_and_deviation(values: Sequence[float], digits: int) -> str:
+    """The mean over seeds and, of more than one, their standard deviation."""
+    mean = f"{np.mean(values):.{digits}f}"
+    return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
