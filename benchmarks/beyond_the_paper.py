@@ -49,6 +49,9 @@ PAPER = {
 }
 PAPER_FIRST_STAGE_PSNR = 22.2
 
+Judged = tuple[BenchmarkRun, dict[str, float]]
+"""A run, and what the benchmark of `hsi-sc-nerf` does not measure itself."""
+
 
 @dataclass(frozen=True)
 class BeyondThePaper(PaperTable):
@@ -61,7 +64,7 @@ class BeyondThePaper(PaperTable):
     configurations: tuple[str, ...] = ("paper", "ours")
     """Configurations of `hsi-sc-nerf benchmark`."""
     seeds: tuple[int, ...] = (0,)
-    """Of the networks and of the drawn pixels; each is a run. The table has means and standard deviations over them."""
+    """Of the networks and the drawn pixels, a run each. The table has means and standard deviations over them."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
@@ -72,7 +75,7 @@ class BeyondThePaper(PaperTable):
             mask_iou = score_processing(open_packed(data), load_truth(folder / "session")).mask_iou
             print(f"{name}: smallest intersection over union of a frame's mask with the object: {mask_iou:.3f}")
             configurations = [named_configuration(known) for known in self.configurations]
-            trained: dict[str, list[tuple[BenchmarkRun, dict[str, float]]]] = {}
+            trained: dict[str, list[Judged]] = {}
             for seed in self.seeds:
                 runs = folder / (f"runs-{seed}" if seed else "runs")
                 for run in self.trained(configurations, data, runs, seed):

@@ -46,7 +46,7 @@ class OccupancyGrid(nn.Module):
     Example:
         >>> shape, cell = grid_over(aabb)
         >>> grid = OccupancyGrid(aabb, matter, solid)
-        >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16, jitter=jitter)
+        >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16)
     """
 
     opacity: Tensor
@@ -71,12 +71,9 @@ class OccupancyGrid(nn.Module):
         nears: Float[Tensor, "rays"],
         fars: Float[Tensor, "rays"],
         num_samples: int,
-        jitter: Float[Tensor, "rays"],
     ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
         """Starts and ends of samples along rays; see `sample_occupied`."""
-        return sample_occupied(
-            origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples, jitter
-        )
+        return sample_occupied(origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples)
 
     def random_points(self, count: int) -> tuple[Float[Tensor, "count 3"], Bool[Tensor, "count"]]:
         """Points in cells that may hold matter, and whether they are in solid ones."""

@@ -29,11 +29,10 @@ def sample_occupied(
     lower: Float[Tensor, "3"],
     cell: float,
     num_samples: int,
-    jitter: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """Starts and ends of the samples along each ray, as distances from its origin.
 
-    Samples are in order and do not overlap; between them lies what holds no matter. A ray that meets no cell with
+    Samples are in order and cover all matter; between them lies what holds none. A ray that meets no cell with
     matter has samples of length 0. Gradients are not carried.
 
     Args:
@@ -45,17 +44,16 @@ def sample_occupied(
         lower: corner of the grid.
         cell: side of a cell.
         num_samples: samples a ray.
-        jitter: shift of a ray's samples, in [0, 1); 0.5 for none.
     """
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it
 
-        rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars, jitter)]
+        rays = [tensor.numpy(force=True) for tensor in (origins, directions, nears, fars)]
         grid = opacity.numpy(force=True), lower.numpy(force=True), cell
         starts, ends = ray_marching_cpu.sample_occupied(rays, grid, num_samples, EXPLORED, MAX_OPACITY)
         return torch.from_numpy(starts), torch.from_numpy(ends)
     with torch.no_grad():
-        return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples, jitter)
+        return sample_with_tensors(origins, directions, nears, fars, opacity, lower, cell, num_samples)
 
 
 def sample_with_tensors(
@@ -67,7 +65,6 @@ def sample_with_tensors(
     lower: Float[Tensor, "3"],
     cell: float,
     num_samples: int,
-    jitter: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """`sample_occupied` as tensor operations of fixed shapes, for a GPU."""
     steps = march_steps(opacity.shape)
@@ -93,19 +90,19 @@ def sample_with_tensors(
 
     cumulated = torch.cumsum(weights, dim=1)
     total = cumulated[:, -1:]
-    shifted = torch.arange(num_samples, device=origins.device) + jitter[:, None]
+    sample = torch.arange(num_samples, device=origins.device).expand(len(origins), -1)
 
     def at(quantile: Tensor) -> tuple[Tensor, Tensor]:
-        level = quantile / (num_samples + 1) * total
+        level = quantile / num_samples * total
         steps_there = torch.searchsorted(cumulated, level, right=True).clamp_max(steps - 1)
         weight = weights.gather(1, steps_there)
         passed = cumulated.gather(1, steps_there) - weight
         fraction = ((level - passed) / weight.clamp_min(1e-20)).clamp(0.0, 1.0)
         return nears[:, None] + (steps_there + fraction) * cell, steps_there
 
-    middle = at(shifted + 0.5)[1]
-    starts = torch.maximum(at(shifted)[0], nears[:, None] + first.gather(1, middle) * cell)
-    ends = torch.minimum(at(shifted + 1.0)[0], nears[:, None] + last.gather(1, middle) * cell)
+    middle = at(sample + 0.5)[1]
+    starts = torch.maximum(at(sample)[0], nears[:, None] + first.gather(1, middle) * cell)
+    ends = torch.minimum(at(sample + 1.0)[0], nears[:, None] + last.gather(1, middle) * cell)
     met = total > 0.0
     return torch.where(met, starts, nears[:, None]), torch.where(met, ends, nears[:, None])
 

@@ -22,7 +22,7 @@ def sample_occupied(
     """Starts and ends of the samples, as `ray_marching.sample_occupied` describes them.
 
     Args:
-        rays: origins, directions, nears, fars and jitter.
+        rays: origins, directions, nears and fars.
         grid: opacity, lower corner and cell.
         num_samples: samples a ray.
         explored: `ray_marching.EXPLORED`.
@@ -38,7 +38,7 @@ def sample_occupied(
 
 @compiled
 def _sample(rays, grid, explored, results, part, parts):
-    origins, directions, nears, fars, jitter = rays
+    origins, directions, nears, fars = rays
     starts, ends = results
     x, y, z = grid[0].shape
     weights = np.empty(int(math.sqrt(x * x + y * y + z * z)) + 2, np.float32)
@@ -47,7 +47,7 @@ def _sample(rays, grid, explored, results, part, parts):
         count = _march(origins[i], directions[i], nears[i], fars[i], grid, seen)
         total = _spread(seen, count, explored, weights)
         if total > 0.0:
-            _invert(weights, count, total, nears[i], grid[2], jitter[i], starts[i], ends[i])
+            _invert(weights, count, total, nears[i], grid[2], starts[i], ends[i])
         else:
             starts[i], ends[i] = nears[i], nears[i]
 
@@ -102,17 +102,17 @@ def _spread(seen, count, explored, weights):
 
 
 @compiled
-def _invert(weights, count, total, near, cell, jitter, starts, ends):
+def _invert(weights, count, total, near, cell, starts, ends):
     """Samples of equal weight, each within the stretch of matter that its middle is in."""
     samples = len(starts)
-    share = total / np.float32(samples + 1)
+    share = total / np.float32(samples)
     k, passed = 0, np.float32(0.0)
     while weights[k] == 0.0:
         k += 1
     first = k  # of the stretch of matter that step k is in
     # Quantiles in half steps: starts at even ones, ends two later, middles at odd ones.
     for half in range(2 * samples + 1):
-        level = (np.float32(half) * np.float32(0.5) + jitter) * share
+        level = np.float32(half) * np.float32(0.5) * share
         while passed + weights[k] <= level:
             following = k + 1
             while following < count and weights[following] == 0.0:

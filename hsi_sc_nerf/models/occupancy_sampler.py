@@ -46,19 +46,16 @@ class OccupancySampler(Sampler):
     ) -> tuple[RaySamples, list, list]:
         """Samples of the rays that meet matter, and nothing for the proposals that there are not.
 
-        On a GPU all rays are sampled, so that shapes do not depend on the data.
+        Samples are not jittered: what a soft outline renders would scatter with them (docs/notes/dead_ends.md). On a
+        GPU all rays are sampled, so that shapes do not depend on the data.
         """
         assert ray_bundle.nears is not None
         assert ray_bundle.fars is not None
         assert self.num_samples is not None
-        count = len(ray_bundle)
         device = ray_bundle.origins.device
-        jitter = torch.rand(count, device=device) if self.training else torch.full((count,), 0.5, device=device)
         with torch.no_grad():
             nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
-            starts, ends = self.grid.sample(
-                ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples, jitter
-            )
+            starts, ends = self.grid.sample(ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples)
         self.rays = None
         if device.type == "cpu" and not self.every_ray:
             met = (ends[:, -1] > nears).nonzero()[:, 0]

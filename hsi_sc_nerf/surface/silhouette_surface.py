@@ -26,6 +26,8 @@ RAY_SAMPLES = 12
 DIRECTIONS = 4
 """Touching rays a point, evenly around the normal. The one that collects least counts: along the strongest curvature
 the ray is the shortest time in the density, and other parts of the object are the least in its way."""
+HOLLOW = 2.0
+"""A point is in a hollow if every such ray collects more than this multiple of what one along a plane collects."""
 ITERATIONS = 2
 FOLDING = (1e-3, 1e-2)
 """Bounds of the depth over which the density grows by e (about 0.1 to 1 mm): outside of them it is no surface's."""
@@ -90,7 +92,7 @@ def _least_touching_depth(
 ) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
     """Optical depth of the ray through each point, across its normal, that collects least; whether that one touches.
 
-    A ray touches if it leaves the density to both sides.
+    A ray in a hollow does not touch: it goes deeper into the density to both sides.
     """
     first, second = _across(normals)
     step = 2.0 * REACH / RAY_SAMPLES
@@ -101,7 +103,7 @@ def _least_touching_depth(
         direction = math.cos(angle) * first + math.sin(angle) * second
         depths.append(_density(density_fn, points[:, None] + direction[:, None] * along[:, None]).sum(dim=1) * step)
     least = torch.stack(depths).amin(dim=0)
-    return least, least < 2.0 * REACH * _density(density_fn, points)
+    return least, least < HOLLOW * 2.0 * REACH * _density(density_fn, points)
 
 
 def _density(density_fn: Callable[[Tensor], Tensor], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:

@@ -21,9 +21,8 @@ from hsi_sc_nerf.numerics import safe_ratio
 MIN_OPACITY = 0.5
 """Rays that collect less opacity than this hit no surface (released settings of the paper)."""
 SURFACE_OPACITY = 0.07
-"""Opacity that a ray along the surface's normal has collected at the surface. Density begins at the true surface, for
-other views keep the space outside empty; how deep a ray gets before it is half absorbed depends on the length of the
-training (docs/validation/surface.md)."""
+"""Opacity that a ray along the surface's normal has collected about at the surface. The vertices of a cloud's mesh
+are then moved to the model's silhouettes (`silhouette_surface`)."""
 INTERIOR_OPACITY = 0.25
 """Opacity at which the density gradient is read. Further out the gradient is noise."""
 SEARCH_DEPTH = 0.1

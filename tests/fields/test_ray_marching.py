@@ -28,13 +28,11 @@ def rays(count, seed=0):
     origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1) * 3.0
     directions = torch.rand(count, 3, generator=generator) * 1.6 - 0.8 - origins
     nears = 1.2 + torch.rand(count, generator=generator) * 0.1
-    jitter = torch.rand(count, generator=generator)
-    return origins, torch.nn.functional.normalize(directions, dim=-1), nears, torch.full((count,), 4.8), jitter
+    return origins, torch.nn.functional.normalize(directions, dim=-1), nears, torch.full((count,), 4.8)
 
 
 def sampled(function, opacity, samples=16, count=500):
-    *bundle, jitter = rays(count)
-    return function(*bundle, opacity, LOWER, CELL, samples, jitter)
+    return function(*rays(count), opacity, LOWER, CELL, samples)
 
 
 @pytest.mark.parametrize("samples", [1, 5, 16])
@@ -64,9 +62,7 @@ def test_most_samples_are_where_an_opaque_wall_is_seen(function):
     opacity = torch.zeros(SHAPE)
     opacity[20:] = 0.95  # from x = 0 on
     origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
-    starts, ends = function(
-        origin, direction, torch.tensor([2.0]), torch.tensor([4.0]), opacity, LOWER, CELL, 20, torch.tensor([0.5])
-    )
+    starts, ends = function(origin, direction, torch.tensor([2.0]), torch.tensor([4.0]), opacity, LOWER, CELL, 20)
     middles = (starts + ends) / 2.0 - 3.0
     at_wall = ((middles > -CELL) & (middles < 2 * CELL)).sum().item()
     # Widened by a cell on each side, the wall weighs a little over 1.9, all that is explored `EXPLORED`.
@@ -84,9 +80,8 @@ def test_an_unknown_scene_is_sampled_evenly(function):
         LOWER,
         CELL,
         4,
-        torch.tensor([0.5]),
     )
-    torch.testing.assert_close(ends - starts, torch.full((1, 4), 2.0 / 5.0), rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(ends - starts, torch.full((1, 4), 2.0 / 4.0), rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("function", [sample_occupied, sample_with_tensors])
@@ -102,7 +97,7 @@ def test_rays_along_faces_and_from_inside_are_finite(function, direction):
     origins = torch.tensor([[-1.0, -1.0, -0.8], [0.0, 0.0, 0.0], [-1.0, 0.3, 0.1]])
     directions = torch.nn.functional.normalize(torch.tensor([direction] * 3), dim=-1)
     zeros = torch.zeros(3)
-    starts, ends = function(origins, directions, zeros, zeros + 3.0, torch.zeros(SHAPE), LOWER, CELL, 8, zeros + 0.5)
+    starts, ends = function(origins, directions, zeros, zeros + 3.0, torch.zeros(SHAPE), LOWER, CELL, 8)
     assert starts.isfinite().all()
     assert (ends >= starts).all()
 
