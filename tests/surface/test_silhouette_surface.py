@@ -53,20 +53,18 @@ def test_a_stem_is_found_by_the_rays_across_it():
 
 def test_in_a_hollow_the_opacity_from_the_front_is_that_of_the_rest():
     """A bowl that nothing touches, and a ball beside it that gives the opacity."""
-    radius, density = 0.25, touching_density(0.25)
+    radius, bowl_radius = 0.25, 0.1
 
     def distance(points):
         ball = (points - torch.tensor([2.0, 0.0, 0.0])).norm(dim=-1) - radius
-        bowl = radius - points.norm(dim=-1)
-        return torch.minimum(bowl, ball)
+        return torch.minimum(bowl_radius - points.norm(dim=-1), ball)
 
     points, normals = around(radius)
-    in_bowl, on_ball = -normals * radius, points + torch.tensor([2.0, 0.0, 0.0])
-    both = torch.cat([in_bowl, on_ball]), torch.cat([normals, normals])
-    moved = move_to_silhouettes(soft(distance, density), *both)
-    torch.testing.assert_close(
-        moved[: len(points)].norm(dim=-1), torch.full((len(points),), radius), atol=2e-3, rtol=0
-    )
+    on_ball = points + torch.tensor([2.0, 0.0, 0.0])
+    both = torch.cat([-normals * bowl_radius, on_ball]), torch.cat([normals, normals])
+    moved = move_to_silhouettes(soft(distance, touching_density(radius)), *both)
+    found = moved[: len(points)].norm(dim=-1)
+    torch.testing.assert_close(found, torch.full_like(found, bowl_radius), atol=2e-3, rtol=0)
 
 
 def test_empty_space_moves_nothing_far_and_stays_finite():
