@@ -81,7 +81,7 @@ def move_to_silhouettes(
         at_surface = ((points - moved) * normals).sum(dim=-1, keepdim=True)
         target = collected.gather(1, torch.searchsorted(depths, at_surface).clamp_max(SEARCH_STEPS))[touched].median()
     edges = depths.expand(len(points), -1)
-    in_hollow = opacity_crossing_depth(edges, densities, float(-torch.expm1(-target)))
+    in_hollow = opacity_crossing_depth(edges, densities, min(float(-torch.expm1(-target)), TOUCHING_OPACITY))
     return torch.where(touched[:, None], moved, points - in_hollow[:, None] * normals)
 
 

@@ -57,7 +57,9 @@ def test_in_a_hollow_the_opacity_from_the_front_is_that_of_the_rest():
 
     def distance(points):
         ball = (points - torch.tensor([2.0, 0.0, 0.0])).norm(dim=-1) - radius
-        return torch.minimum(bowl_radius - points.norm(dim=-1), ball)
+        from_centre = points.norm(dim=-1)
+        bowl = torch.maximum(bowl_radius - from_centre, from_centre - 0.5)
+        return torch.minimum(bowl, ball)
 
     points, normals = around(radius)
     on_ball = points + torch.tensor([2.0, 0.0, 0.0])
