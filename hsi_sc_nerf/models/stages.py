@@ -51,13 +51,14 @@ class StageConfig:
 def full_frame_stage() -> StageConfig:
     """The paper's first stage: whole frames, poses refined.
 
-    A turntable's object covers less than a tenth of the pixels, and the occupancy grid bounds it from the start. Most
-    rays are therefore drawn from the object; the others see its boundary, the container and the disc.
+    A turntable's object covers less than a tenth of the pixels, and the occupancy grid bounds it from the start. Half
+    of the rays are therefore drawn from the object. The others see its boundary, the container and the disc, without
+    which the object's base would swell (docs/notes/dead_ends.md).
     """
     return StageConfig(
         name="full-frame",
         fraction=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
-        foreground_ray_fraction=0.8,
+        foreground_ray_fraction=0.5,
         boundary_ray_fraction=0.2,
     )
 
