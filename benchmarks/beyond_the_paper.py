@@ -66,6 +66,9 @@ class BeyondThePaper(PaperTable):
     seeds: tuple[int, ...] = (0,)
     """Of the networks and the drawn pixels, a run each. The table has means and standard deviations over them."""
 
+    table: str = "beyond_the_paper"
+    """Name of the CSV file."""
+
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
         for name in self.objects:
@@ -81,9 +84,8 @@ class BeyondThePaper(PaperTable):
                 for run in self.trained(configurations, data, runs, seed):
                     trained.setdefault(run.name, []).append((run, self._judged(folder, runs, run)))
             seeds = f"scene, runs {' '.join(map(str, self.seeds))}"
-            write_results(
-                "beyond_the_paper", TITLES, object_rows(name, trained), keys=2, seed=seeds, folder=self.results
-            )
+            rows = object_rows(name, trained)
+            write_results(self.table, TITLES, rows, keys=2, seed=seeds, folder=self.results)
 
     def _judged(self, folder: Path, runs: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
