@@ -59,8 +59,10 @@ class ForkedSteps:
         child = os.fork()
         if child == 0:
             _become(list(map(str, words)), log)
-        for module in meanwhile:
-            importlib.import_module(module)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for module in meanwhile:
+                importlib.import_module(module)
         return finished_step(name, child, started, log)
 
 
