@@ -54,10 +54,16 @@ class BallModel:
     )
 
     background: object | None = object()
+    occupancy = None
 
     def background_spectrum(self, rays):
         """A chamber of one grey."""
         return torch.full((len(rays), len(WAVELENGTHS_NM)), 0.1)
+
+    def depth_and_opacity(self, rays):
+        """Of the rendered rays."""
+        outputs = self(rays)
+        return outputs["depth"], outputs["accumulation"]
 
     def __call__(self, rays):
         rays.origins = rays.origins + SHIFT

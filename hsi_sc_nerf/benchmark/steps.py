@@ -22,6 +22,15 @@ if TYPE_CHECKING:
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
+SCRIPTS = {
+    "hsi-sc-nerf": ("hsi_sc_nerf.cli.main", "main"),
+    "ns-train": ("nerfstudio.scripts.train", "entrypoint"),
+    "ns-eval": ("nerfstudio.scripts.eval", "entrypoint"),
+    "ns-export": ("nerfstudio.scripts.exporter", "entrypoint"),
+}
+"""Module and function of the commands that steps are made of."""
+WITHOUT_COMPILER = {"TORCHDYNAMO_DISABLE": "1"}
+"""Environment in which nerfstudio does not load PyTorch's compiler, which takes seconds and nothing here uses."""
 _RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
@@ -53,25 +62,39 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
     """
     started = time.perf_counter()
     # Warnings of libraries would hide the progress bars.
-    environment = os.environ | {"PYTHONWARNINGS": "ignore"}
+    environment = os.environ | {"PYTHONWARNINGS": "ignore"} | WITHOUT_COMPILER
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
     with log.open("wb") as output:
         # A step that outlives its run would write into the folder of the next one.
-        orphans = _end_with_parent if sys.platform == "linux" else None
+        orphans = end_with_parent if sys.platform == "linux" else None
         process = subprocess.Popen(list(argv), stdout=output, env=environment, preexec_fn=orphans)
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
-        raise InputError(
-            f"the step '{name}' failed with status {process.returncode}; its output is above and in {log}."
-        )
+    process.returncode = 0  # `finished_step` waits for it
+    return finished_step(name, process.pid, started, log)
+
+
+def finished_step(name: str, process: int, started: float, log: Path) -> StepCost:
+    """Wait for a process, which ends with this one's waiting, and return what it cost.
+
+    Args:
+        name: name of the step.
+        process: its number; a child of this process.
+        started: when it was (`time.perf_counter`).
+        log: file of its standard output.
+
+    Raises:
+        InputError: it failed.
+    """
+    try:
+        _, status, usage = os.wait4(process, 0)
+    except BaseException:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        raise
+    code = os.waitstatus_to_exitcode(status)
+    if code != 0:
+        raise InputError(f"the step '{name}' failed with status {code}; its output is above and in {log}.")
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
 
 
@@ -83,13 +106,13 @@ def own_cost(name: str, started: float) -> StepCost:
 def typed_command(words: Sequence[object]) -> list[str]:
     """Command that runs with this Python what a user would type, such as ``("ns-train", "hsi-sc-nerf", ...)``."""
     name, *rest = map(str, words)
+    module, function = SCRIPTS[name]
     if name == "hsi-sc-nerf":
-        return [sys.executable, "-m", "hsi_sc_nerf.cli.main", *rest]
-    script = {"ns-train": "train", "ns-eval": "eval", "ns-export": "exporter"}[name]
-    return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()", *rest]
+        return [sys.executable, "-m", module, *rest]
+    return [sys.executable, "-c", f"from {module} import {function}; {function}()", *rest]
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """In a new process: end when the process that started it is killed (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 

@@ -67,7 +67,7 @@ def estimate_static_background(
     count = min(len(frames), MAX_FRAMES)
     chosen = [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]
     height, width = dataset.intrinsics.h, dataset.intrinsics.w
-    cell_px = -(-max(width, height) // MAX_CELLS)
+    cell_px = background_cell_px(dataset)
     margin_px = 2 * max(1, round(MARGIN_FRACTION * min(width, height))) + 1
     pixels = [cell_pixels(height, width, cell_px, k) for k in range(count)]
     free = np.empty((count, len(pixels[0][0]), len(pixels[0][1])), bool)
@@ -84,6 +84,11 @@ def estimate_static_background(
             counts = reader.read(np.concatenate(indices)).reshape(count, len(image[0]), -1)
             image[line], variance[line] = median_over_frames(counts, free[:, line], min_frames)
     return inpaint(wiener_filter(image, variance, SMOOTHING_CELLS), dataset.background_reflectance), cell_px
+
+
+def background_cell_px(dataset: PackedDataset) -> int:
+    """Side of the cells of the camera's image that the chamber's picture has, pixels."""
+    return -(-max(dataset.intrinsics.w, dataset.intrinsics.h) // MAX_CELLS)
 
 
 def cell_pixels(

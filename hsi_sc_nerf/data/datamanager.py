@@ -21,6 +21,9 @@ from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 
+FROM_CHECKPOINT = "from_checkpoint"
+"""Metadata of the training frames: whether a checkpoint replaces what a model finds in them before training."""
+
 
 @dataclass
 class SpectralDataManagerConfig(VanillaDataManagerConfig):
@@ -90,6 +93,12 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     eval_pixel_sampler: PixelSampler  # type: ignore[assignment]
     foreground_ray_fraction: float | None = None
     boundary_ray_fraction: float = 0.0
+
+    def create_train_dataset(self) -> SpectralDataset:
+        """The training frames; their metadata tell whether the model's weights will be those of a checkpoint."""
+        dataset = super().create_train_dataset()
+        dataset.metadata[FROM_CHECKPOINT] = self.test_mode != "val"  # nerfstudio's name for training
+        return dataset
 
     def setup_train(self) -> None:
         """Open the training cubes."""

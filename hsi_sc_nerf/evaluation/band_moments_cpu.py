@@ -128,8 +128,9 @@ def _add_windows(images, masks, taps, stability, first, last, counts, sums):
     valid = images[2]
     _, width, bands = images[0].shape
     reach = len(taps) // 2
-    down = np.empty((6, width, _BANDS_AT_ONCE))
+    down = np.empty((width, 6, _BANDS_AT_ONCE))
     window = np.empty((6, _BANDS_AT_ONCE))
+    score = np.empty(_BANDS_AT_ONCE)
     for y in range(first, last):
         left, right = _extent(masks[:, y])
         if left == right:
@@ -137,19 +138,18 @@ def _add_windows(images, masks, taps, stability, first, last, counts, sums):
         for start in range(0, bands, _BANDS_AT_ONCE):
             some = min(_BANDS_AT_ONCE, bands - start)
             for x in range(max(left - reach, 0), min(right + reach, width)):
-                _sum_down(images, taps, y, x, start, some, down[:, x])
+                _sum_down(images, taps, y, x, start, some, down[x])
             for x in range(left, right):
                 if not masks[:, y, x].any():
                     continue
                 _sum_across(down, taps, x, some, window)
-                for k in range(some):
-                    if len(valid) > 0 and not valid[y, x, start + k]:
-                        continue
-                    score = _ssim(window[:, k] / window[5, k], stability)
-                    for m in range(len(masks)):
-                        if masks[m, y, x]:
-                            counts[m, start + k] += 1
-                            sums[0, m, start + k] += score
+                _score(window, some, stability, score)
+                for m in range(len(masks)):
+                    if masks[m, y, x]:
+                        for k in range(some):
+                            if len(valid) == 0 or valid[y, x, start + k]:
+                                counts[m, start + k] += 1
+                                sums[0, m, start + k] += score[k]
 
 
 @_compiled
@@ -169,37 +169,39 @@ def _sum_down(images, taps, y, x, start, some, sums):
     sums[:, :some] = 0.0
     for line in range(max(y - reach, 0), min(y + reach + 1, predicted.shape[0])):
         weight = taps[line - y + reach]
+        ps, ts = predicted[line, x, start : start + some], target[line, x, start : start + some]
         for k in range(some):
-            p, t = np.float64(predicted[line, x, start + k]), np.float64(target[line, x, start + k])
-            counted = weight
-            if len(valid) > 0 and not valid[line, x, start + k]:
-                # What stands there, NaN included, counts nowhere.
-                p, t, counted = 0.0, 0.0, 0.0
+            counts = len(valid) == 0 or valid[line, x, start + k]
+            # What stands where it is not valid, NaN included, counts nowhere.
+            p, t = np.float64(ps[k]) if counts else 0.0, np.float64(ts[k]) if counts else 0.0
             sums[0, k] += weight * p
             sums[1, k] += weight * t
             sums[2, k] += weight * p * p
             sums[3, k] += weight * t * t
             sums[4, k] += weight * p * t
-            sums[5, k] += counted
+            sums[5, k] += weight if counts else 0.0
 
 
 @_compiled
 def _sum_across(down, taps, x, some, window):
     reach = len(taps) // 2
     window[:, :some] = 0.0
-    for sample in range(max(x - reach, 0), min(x + reach + 1, down.shape[1])):
+    for sample in range(max(x - reach, 0), min(x + reach + 1, len(down))):
         weight = taps[sample - x + reach]
         for moment in range(6):
             for k in range(some):
-                window[moment, k] += weight * down[moment, sample, k]
+                window[moment, k] += weight * down[sample, moment, k]
 
 
 @_compiled
-def _ssim(window, stability):
+def _score(window, some, stability, score):
     """Wang et al. 2004, Eq. 13, in [-1, 1] even where rounding has bent the moments."""
-    mean_p, mean_t = window[0], window[1]
-    variance_p, variance_t = max(window[2] - mean_p * mean_p, 0.0), max(window[3] - mean_t * mean_t, 0.0)
-    bound = np.sqrt(variance_p * variance_t)
-    covariance = min(max(window[4] - mean_p * mean_t, -bound), bound)
-    luminance = (2.0 * mean_p * mean_t + stability[0]) / (mean_p * mean_p + mean_t * mean_t + stability[0])
-    return luminance * (2.0 * covariance + stability[1]) / (variance_p + variance_t + stability[1])
+    for k in range(some):
+        total = window[5, k]
+        mean_p, mean_t = window[0, k] / total, window[1, k] / total
+        variance_p = max(window[2, k] / total - mean_p * mean_p, 0.0)
+        variance_t = max(window[3, k] / total - mean_t * mean_t, 0.0)
+        bound = np.sqrt(variance_p * variance_t)
+        covariance = min(max(window[4, k] / total - mean_p * mean_t, -bound), bound)
+        luminance = (2.0 * mean_p * mean_t + stability[0]) / (mean_p * mean_p + mean_t * mean_t + stability[0])
+        score[k] = luminance * (2.0 * covariance + stability[1]) / (variance_p + variance_t + stability[1])

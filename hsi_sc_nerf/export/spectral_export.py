@@ -27,7 +27,7 @@ from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
-from hsi_sc_nerf.surface.depth_renders import STATISTICS, DepthRenders, render_depth_maps, view_statistics
+from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.regions import (
     EVERYWHERE,
     Region,
@@ -39,6 +39,7 @@ from hsi_sc_nerf.surface.regions import (
 )
 from hsi_sc_nerf.surface.surface_depth import camera_rays, render_object
 from hsi_sc_nerf.surface.surface_points import SurfacePoints, sample_surface_points
+from hsi_sc_nerf.surface.view_statistics import STATISTICS, view_statistics
 from hsi_sc_nerf.terminal import progress_bar
 
 EXTRA = ("opacity", INCIDENCE, *STATISTICS)

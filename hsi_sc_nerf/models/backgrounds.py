@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hsi_sc_nerf.data.background_image import estimate_static_background
+from hsi_sc_nerf.data.background_image import background_cell_px, estimate_static_background
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -22,18 +23,27 @@ from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 BackgroundKind = Literal["last-sample", "spectrum", "image"]
 
 
-def make_background(kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame]) -> Background | None:
+def make_background(
+    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame], from_checkpoint: bool = False
+) -> Background | None:
     """The background of a dataset; None for "last-sample", which has none.
 
     Args:
         kind: how the chamber is represented.
         dataset: camera, and the chamber's median spectrum.
         frames: training frames, from which the picture of the chamber is taken.
+        from_checkpoint: a checkpoint replaces the picture, which is not looked for; only its size is right.
     """
     if kind == "last-sample":
         return None
     spectrum = torch.from_numpy(dataset.background_reflectance).float()
-    image, cell_px = (None, 1) if kind == "spectrum" else estimate_static_background(dataset, frames)
+    image, cell_px = None, 1
+    if kind == "image" and from_checkpoint:
+        cell_px = background_cell_px(dataset)
+        cells = (-(-side_px // cell_px) for side_px in (dataset.intrinsics.h, dataset.intrinsics.w))
+        image = np.zeros((*cells, len(spectrum)), np.float32)
+    elif kind == "image":
+        image, cell_px = estimate_static_background(dataset, frames)
     k1, k2, p1, p2 = dataset.distortion.tolist()
     return Background(
         spectrum, None if image is None else torch.from_numpy(image), cell_px, dataset.intrinsics, (k1, k2, p1, p2)

@@ -72,7 +72,7 @@ class OccupancySampler(Sampler):
 
 
 def build_occupancy(
-    dataset: PackedDataset, frames: Sequence[PackedFrame], aabb: Float[Tensor, "2 3"]
+    dataset: PackedDataset, frames: Sequence[PackedFrame], aabb: Float[Tensor, "2 3"], from_checkpoint: bool = False
 ) -> OccupancyGrid:
     """The occupancy grid of a dataset.
 
@@ -80,6 +80,7 @@ def build_occupancy(
         dataset: camera, container, and the boxes of the scene and of the object.
         frames: whose masks bound the object.
         aabb: the scene box in scene units.
+        from_checkpoint: a checkpoint replaces the opacities; the masks are not looked at, and all may hold matter.
 
     Raises:
         InputError: the scene is not the dataset's box.
@@ -92,6 +93,8 @@ def build_occupancy(
             "--pipeline.model.num-proposal-iterations 2 and --pipeline.model.disable-scene-contraction False with it."
         )
     shape, _ = grid_over(aabb)
+    if from_checkpoint:
+        return OccupancyGrid(aabb, torch.ones(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool))
     matter, solid = bounds_from_masks(dataset, frames, shape, low_m, sides_m.max() / GRID_CELLS)
     return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.data.datamanager import FROM_CHECKPOINT
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
 from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
 from hsi_sc_nerf.evaluation.spectral_metrics import (
@@ -138,6 +139,7 @@ class SpectralModel(NerfactoModel):
         dataset: PackedDataset = metadata["dataset"]
         self.wavelengths_nm = dataset.wavelengths_nm
         self.rgb_bands: list[int] = metadata["rgb_bands"]
+        from_checkpoint: bool = metadata.get(FROM_CHECKPOINT, False)
         subspace, self.decoder = None, nn.Identity()
         if config.head == "basis":
             subspace = training_subspace(dataset, metadata["frames"])
@@ -150,7 +152,7 @@ class SpectralModel(NerfactoModel):
             self.proposal_networks.extend(networks)
             self.density_fns = [network.density_fn for network in networks]
         else:
-            grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb)
+            grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
         self.camera_optimizer = config.camera_optimizer.setup(
             pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
@@ -159,7 +161,7 @@ class SpectralModel(NerfactoModel):
             self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
-        self.background = make_background(config.background, dataset, metadata["frames"])
+        self.background = make_background(config.background, dataset, metadata["frames"], from_checkpoint)
 
         self.renderer_rgb = SpectralRenderer(last_sample_behind=self.background is None)
         self.renderer_accumulation = AccumulationRenderer()
@@ -243,9 +245,7 @@ class SpectralModel(NerfactoModel):
         background = None if self.background is None else self.background_spectrum(ray_bundle)
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
-        outputs = super().get_outputs(ray_bundle)
-        if isinstance(self.proposal_sampler, OccupancySampler):
-            outputs |= self._of_all_rays(outputs, ray_bundle, self.proposal_sampler)
+        outputs = self._of_all_rays(super().get_outputs(ray_bundle), ray_bundle)
         spectral = self.decoder(outputs["rgb"])
         if background is not None:
             spectral = spectral + background * (1.0 - outputs["accumulation"])
@@ -255,11 +255,24 @@ class SpectralModel(NerfactoModel):
         outputs["rgb"] = torch.stack([outputs["spectral"][..., band] for band in self.rgb_bands], dim=-1)
         return outputs
 
-    def _of_all_rays(self, outputs: dict, rays: RayBundle, sampler: OccupancySampler) -> dict[str, Tensor]:
+    @torch.no_grad()
+    def depth_and_opacity(self, ray_bundle: RayBundle) -> tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"]]:
+        """Outputs ``depth`` and ``accumulation`` of measured rays in evaluation, without rendering a spectrum."""
+        rays = self.collider(ray_bundle)  # type: ignore[misc]
+        self.camera_optimizer.apply_to_raybundle(rays)
+        samples = self.proposal_sampler(rays, density_fns=self.density_fns)[0]
+        weights = samples.get_weights(self.field.density_fn(samples.frustums.get_positions()))
+        depth, opacity = self.renderer_depth(weights, samples), self.renderer_accumulation(weights)
+        outputs = self._of_all_rays({"depth": depth, "accumulation": opacity}, rays)
+        return outputs["depth"], outputs["accumulation"]
+
+    def _of_all_rays(self, outputs: dict, rays: RayBundle) -> dict:
         """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
-        assert rays.fars is not None
-        fills = {"depth": rays.fars, "expected_depth": rays.fars}
-        return {
+        sampler = self.proposal_sampler
+        if not isinstance(sampler, OccupancySampler):
+            return outputs
+        fills: dict[str, Any] = {"depth": rays.fars, "expected_depth": rays.fars}
+        return outputs | {
             name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), value.shape[1])))
             for name, value in outputs.items()
             if isinstance(value, Tensor)
@@ -286,11 +299,9 @@ class SpectralModel(NerfactoModel):
             some = slice(None, None, METRIC_STRIDE)
             # The metrics take images: the batch is one of a single line.
             images = (outputs["spectral"][None, some], target[None, some])
-            flags = None if valid is None else valid[None, some]
-            metrics = {
-                "sam": spectral_angle_mapper(*images, valid=flags),
-                "rmse": spectral_rmse(*images, valid=flags),
-            }
+            some_valid = None if valid is None else valid[None, some]
+            metrics = {"sam": spectral_angle_mapper(*images, valid=some_valid)}
+            metrics["rmse"] = spectral_rmse(*images, valid=some_valid)
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
             metrics["distortion"] = self._distortion(outputs)

@@ -1,4 +1,4 @@
-"""Depth maps that a trained model renders for its training cameras, which frames see a point, and what they measured.
+"""Depth maps that a trained model renders for its training cameras, and which frames see a point.
 
 Lengths are in scene units.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
@@ -19,8 +19,6 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.packed.cube import PixelFlag, unpack
-from hsi_sc_nerf.packed.pixels import PixelReader
 from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, MIN_OPACITY, camera_rays, surface_depth
 from hsi_sc_nerf.terminal import progress_bar
 
@@ -33,11 +31,6 @@ _DEPTH_TOLERANCE = 0.02
 """A point this far behind the depth map is still visible: about 2 mm."""
 _SLOPE_TOLERANCE = 0.75
 """Within a cell the depth changes by half the cell's diagonal (0.71 of its side) times the surface's slope."""
-STATISTICS = ("views", "spectral_std", "saturated")
-"""Columns of `view_statistics`."""
-INVALID_FLAGS = PixelFlag.SATURATED | PixelFlag.NO_DATA
-"""Flags that make a view count as saturated or without data. A dead detector element does not: it affects the same
-column of every frame, whatever the point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +39,14 @@ class FrameView:
 
     Attributes:
         visible: whether the point is in the picture and the mask, faces the camera, and nothing is before it.
+        beside_mask: the same, but for being beside the mask.
         cosines: of the angle between the point's normal and the direction to the camera.
         xy_px: image coordinates (x, y) from the upper left corner; undefined behind the camera.
         pixels: (sample, line) that holds the point; (0, 0) outside the picture.
     """
 
     visible: Bool[Tensor, "n"]
+    beside_mask: Bool[Tensor, "n"]
     cosines: Float[Tensor, "n"]
     xy_px: Float[Tensor, "n 2"]
     pixels: Int[Tensor, "n 2"]
@@ -88,28 +83,34 @@ class DepthRenders:
         """What one frame sees of points with outward unit normals."""
         to_point, xy_px, inside, pixels = self._project(frame, points)
         distance = to_point.norm(dim=-1)
-        inside &= self.masks[frame, pixels[:, 1], pixels[:, 0]]
         cosines = -(normals * to_point).sum(dim=-1) / distance
         bounded = cosines.clamp_min(MIN_COSINE)
         slope = (1.0 - bounded.square()).clamp_min(0.0).sqrt() / bounded
         cell = distance * self.cell_px / min(self.intrinsics.fl_x, self.intrinsics.fl_y)
         tolerance = _DEPTH_TOLERANCE + _SLOPE_TOLERANCE * slope * cell
-        visible = inside & (cosines > MIN_COSINE) & (distance <= self._depth_of(frame, pixels) + tolerance)
-        return FrameView(visible, cosines, xy_px, pixels)
+        seen = inside & (cosines > MIN_COSINE) & (distance <= self._depth_of(frame, pixels) + tolerance)
+        in_mask = self.masks[frame, pixels[:, 1], pixels[:, 0]]
+        return FrameView(seen & in_mask, seen & ~in_mask, cosines, xy_px, pixels)
 
     def most_frontal(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-        """The frame that sees each point most from the front (-1 if none), its image coordinates, the cosine."""
+        """The frame that sees each point most from the front, its image coordinates, the cosine.
+
+        The frame is -1 for points that no frame sees, and for those that most frames see beside their masks: what
+        the object stands on, close to where it does.
+        """
         best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
         frames = torch.full((len(points),), -1, device=points.device)
         xy_px = points.new_zeros(len(points), 2)
+        balance = torch.zeros_like(frames)
         for index, view in enumerate(self.views(points, normals)):
             better = view.visible & (view.cosines > best)
             best = torch.where(better, view.cosines, best)
             frames = torch.where(better, index, frames)
             xy_px = torch.where(better[:, None], view.xy_px, xy_px)
-        return frames, xy_px, best
+            balance += view.visible.long() - view.beside_mask.long()
+        return torch.where(balance < 0, -1, frames), xy_px, best
 
     def depth_at(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Distances of points from a frame's camera, and the depth map at them; NaN where no ray was rendered."""
@@ -162,12 +163,15 @@ def render_depth_maps(
             frame, line, sample = cells[start : start + rays_per_batch].T
             xy_px = np.minimum((np.stack([sample, line], axis=1) + 0.5) * cell_px, (samples - 0.5, lines - 0.5))
             rays = camera_rays(cameras, frame, xy_px, model.device)
-            outputs = model(rays)
-            depth, _ = surface_depth(model, rays.origins, rays.directions, outputs["depth"])
-            hit = outputs["accumulation"][:, 0] > MIN_OPACITY
-            depths[frame, line, sample] = torch.where(hit, depth[:, 0], torch.inf)
-            hit &= torch.from_numpy(mask_cells[frame, line, sample]).to(hit.device)
-            points.append((rays.origins + rays.directions * depth)[hit].cpu().numpy())
+            median, opacity = model.depth_and_opacity(rays)
+            hit = (opacity > MIN_OPACITY)[:, 0]
+            origins, directions = rays.origins[hit], rays.directions[hit]
+            depth, _ = surface_depth(model, origins, directions, median[hit])
+            of_rays = torch.full_like(opacity[:, 0], torch.inf)
+            of_rays[hit] = depth[:, 0]
+            depths[frame, line, sample] = of_rays
+            in_mask = torch.from_numpy(mask_cells[frame, line, sample]).to(hit.device)[hit]
+            points.append((origins + directions * depth)[in_mask].cpu().numpy())
             update(start + rays_per_batch)
     fx, fy, cx, cy = (float(getattr(cameras, name)[0, 0]) for name in ("fx", "fy", "cx", "cy"))
     k1, k2, _, _, p1, p2 = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[0].tolist()
@@ -200,54 +204,3 @@ def _touched_cells(
     down, across = -(-lines // cell_px), -(-samples // cell_px)
     padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
     return padded.reshape(frames, down, cell_px, across, cell_px).max(axis=(2, 4))
-
-
-def view_statistics(
-    points: Float[torch.Tensor, "n 3"],
-    normals: Float[torch.Tensor, "n 3"],
-    near_mean: Float[np.ndarray, "n selected"],
-    bands: Int[np.ndarray, "selected"],
-    renders: DepthRenders,
-    reader: PixelReader,
-    flags: UInt8[np.ndarray, "frames lines samples"] | None,
-) -> dict[str, Float[np.ndarray, "n"]]:
-    """The columns `STATISTICS` of points.
-
-    - ``views``: number of frames that see the point.
-    - ``spectral_std``: standard deviation of the reflectance measured in the point's pixels over these frames,
-      averaged over the bands; NaN with fewer than two frames.
-    - ``saturated``: fraction of these pixels that are saturated or hold no data; 0 without a frame.
-
-    Args:
-        points: positions, in the unit of the depth maps.
-        normals: outward unit normals.
-        near_mean: a spectrum near each point's mean.
-        bands: indices of the bands in the cubes.
-        renders: poses and depth maps of the frames.
-        reader: reads the frames' packed cubes, in the order of the depth maps.
-        flags: `PixelFlag`s of the frames' pixels, in the same order; None if the dataset has none.
-    """
-    views, invalid = np.zeros((2, len(points)), np.float32)
-    # Deviations from a spectrum near the mean are summed, so that single precision is enough.
-    sums, squares = np.zeros((2, *near_mean.shape), np.float32)
-    counts = np.zeros(near_mean.shape, np.uint16)
-    for frame, view in enumerate(renders.views(points, normals)):
-        rows = view.visible.nonzero()[:, 0].cpu().numpy()
-        samples, lines = view.pixels[view.visible].cpu().numpy().T
-        views[rows] += 1
-        if flags is not None:
-            invalid[rows] += (flags[frame, lines, samples] & INVALID_FLAGS) != 0
-        # Neighbouring points share pixels: each pixel is read once.
-        pixels, pixel_of_row = np.unique(lines * renders.intrinsics.w + samples, return_inverse=True)
-        indices = np.stack([np.full(len(pixels), frame), *np.divmod(pixels, renders.intrinsics.w)], axis=1)
-        spectra, valid = (values[pixel_of_row] for values in unpack(reader.read(indices)[:, bands]))
-        deviations = (spectra - near_mean[rows]) * valid
-        sums[rows] += deviations
-        squares[rows] += deviations**2
-        counts[rows] += valid
-    enough = counts > 1
-    variance = (squares - sums**2 / np.maximum(counts, 1)) / np.maximum(counts - 1.0, 1.0).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        std = (np.sqrt(np.maximum(variance, 0.0)) * enough).sum(axis=1) / enough.sum(axis=1)
-    columns = (views, std.astype(np.float32), invalid / np.maximum(views, 1))
-    return dict(zip(STATISTICS, columns, strict=True))

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.numerics import safe_ratio
+from hsi_sc_nerf.surface.ray_densities import densities_along
 
 MIN_OPACITY = 0.5
 """Rays that collect less opacity than this hit no surface (released settings of the paper)."""
@@ -59,8 +60,7 @@ def surface_depth(
     """
     offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=initial_depth.device)
     edges = (initial_depth + offsets).clamp_min(0.0)
-    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
-    densities = model.field.density_fn(origins[:, None] + directions[:, None] * middles[..., None])[..., 0]
+    densities = densities_along(model, origins, directions, edges)
     opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
     if cosines is None:
         interior = origins + directions * opacity_crossing_depth(edges, densities, INTERIOR_OPACITY)[:, None]

@@ -115,6 +115,26 @@ def test_the_most_frontal_frame_is_selected(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_points_that_most_frames_see_beside_the_mask_are_not_the_objects(device: str) -> None:
+    points = on_unit_ball(4000, device)
+    renders = ball_renders(device, [(np.zeros(3), 1.0)])
+    seen = torch.stack([view.visible for view in renders.views(points, points)]).cpu().numpy()
+    renders.masks[1] = False
+    beside = torch.stack([view.beside_mask for view in renders.views(points, points)]).cpu().numpy()
+    np.testing.assert_array_equal(beside, seen & (np.arange(3) == 1)[:, None])
+    frames = renders.most_frontal(points, points)[0].cpu().numpy()
+    alone, shared = seen[1] & ~seen[0] & ~seen[2], seen[1] & (seen[0] ^ seen[2])
+    assert alone.any()
+    assert shared.any()
+    assert (frames[alone] == -1).all()
+    # As many see it on the mask as beside it: it is kept, and seen where it is on the mask.
+    assert np.isin(frames[shared], (0, 2)).all()
+    renders.masks[0] = False
+    frames = renders.most_frontal(points, points)[0].cpu().numpy()
+    assert (frames[seen[0] & seen[1]] == -1).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_points_beside_the_object_in_some_frames_are_outside_the_visual_hull(device: str) -> None:
     renders = ball_renders(device, [(np.zeros(3), 1.0)])
     renders.masks[:] = torch.isfinite(renders.depths)

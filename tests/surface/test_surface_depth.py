@@ -4,6 +4,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
+from hsi_sc_nerf.surface.ray_densities import densities_along
 from hsi_sc_nerf.surface.surface_depth import SURFACE_OPACITY, opacity_crossing_depth, surface_depth
 
 
@@ -32,10 +34,11 @@ def test_an_empty_ray_ends_at_its_last_edge():
 def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, normal_is_known):
     rise = 4000.0  # of the density with the depth below z = 0: a quarter of a unit is opaque
     soft_ground = SimpleNamespace(
+        occupancy=None,
         field=SimpleNamespace(
             density_fn=lambda p: -rise * p[..., 2:].clamp_max(0.0),
             density_gradient=lambda p: torch.tensor([0.0, 0.0, -rise]) * (p[..., 2:] < 0.0),
-        )
+        ),
     )
     angle = math.radians(angle_deg)
     directions = torch.tensor([[math.sin(angle), 0.0, -math.cos(angle)]])
@@ -48,3 +51,25 @@ def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, no
     expected = math.sqrt(-2.0 * math.log1p(-SURFACE_OPACITY) / rise)
     assert below == pytest.approx(expected, abs=1e-3)
     assert opacity.item() > 0.99
+
+
+def test_densities_are_asked_for_where_there_is_matter_and_light_is_left():
+    """A ray down through a grid whose uppermost half knows no matter, into ground of density 50."""
+    matter = torch.ones(128, 128, 128, dtype=torch.bool)
+    matter[..., 64:] = False
+    grid = OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), matter, matter)
+    asked = []
+
+    def density_fn(points):
+        asked.append(points.reshape(-1, 3))
+        return torch.full_like(points[..., :1], 50.0)
+
+    model = SimpleNamespace(occupancy=grid, field=SimpleNamespace(density_fn=density_fn))
+    origins, directions = torch.tensor([[0.1, 0.1, 0.95]]), torch.tensor([[0.0, 0.0, -1.0]])
+    edges = torch.linspace(0.0, 1.9, 96)[None]
+    densities = densities_along(model, origins, directions, edges)
+    middles = 0.95 - (edges[0, 1:] + edges[0, :-1]) / 2.0
+    assert (densities[0, middles > 0.0] == 0.0).all()
+    assert (densities[0, (middles < 0.0) & (middles > -0.1)] == 50.0).all()
+    assert torch.cat(asked)[:, 2].max() < 0.0
+    assert len(torch.cat(asked)) <= 15

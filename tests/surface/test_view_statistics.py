@@ -7,7 +7,8 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, write_packed_cube
 from hsi_sc_nerf.packed.pixels import PixelReader
-from hsi_sc_nerf.surface.depth_renders import DepthRenders, view_statistics
+from hsi_sc_nerf.surface.depth_renders import DepthRenders
+from hsi_sc_nerf.surface.view_statistics import view_statistics
 
 LENS = PinholeIntrinsics(8, 6, 20.0, 20.0, 4.0, 3.0)
 
