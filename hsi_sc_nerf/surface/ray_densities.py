@@ -1,9 +1,9 @@
-"""Densities along rays, from which the surface is found: asked of the field only where they decide something."""
+"""Densities from which the surface is found, as rendered: nothing where the occupancy grid knows no matter."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.fields.ray_marching import cell_of
@@ -12,6 +12,12 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 OPAQUE = 5.0
 """Optical depth behind which nothing is asked for: less than a hundredth of the light is left."""
 _STEPS_AT_ONCE = 5
+
+
+@torch.no_grad()
+def rendered_density(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
+    """Density at points as it is rendered: 0 where the occupancy grid knows no matter."""
+    return model.field.density_fn(points) * _may_hold_matter(model, points)[..., None]
 
 
 @torch.no_grad()
@@ -33,11 +39,7 @@ def densities_along(
     """
     middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
     points = origins[:, None] + directions[:, None] * middles[..., None]
-    grid = model.occupancy
-    known = torch.ones_like(middles, dtype=torch.bool)
-    if grid is not None:
-        cells, known = cell_of(points, grid.opacity.shape, grid.lower, grid.cell)
-        known = known & (grid.opacity.flatten()[cells] >= 0.0)
+    known = _may_hold_matter(model, points)
     if origins.device.type != "cpu":
         return model.field.density_fn(points)[..., 0] * known
     densities, lengths = torch.zeros_like(middles), edges.diff(dim=-1)
@@ -51,3 +53,12 @@ def densities_along(
         densities[:, some] = found
         depth += (found * lengths[:, some]).sum(dim=-1)
     return densities
+
+
+def _may_hold_matter(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
+    """Whether the occupancy grid knows matter at points; everywhere, where there is none."""
+    grid = model.occupancy
+    if grid is None:
+        return torch.ones_like(points[..., 0], dtype=torch.bool)
+    cells, inside = cell_of(points, grid.opacity.shape, grid.lower, grid.cell)
+    return inside & (grid.opacity.flatten()[cells] >= 0.0)

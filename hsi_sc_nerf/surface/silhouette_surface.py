@@ -28,11 +28,10 @@ DIRECTIONS = 4
 the ray is the shortest time in the density, and other parts of the object are the least in its way."""
 HOLLOW = 2.0
 """A point is in a hollow if every such ray collects more than this multiple of what one along a plane collects."""
-ITERATIONS = 2
 FOLDING = (1e-3, 1e-2)
 """Bounds of the depth over which the density grows by e (about 0.1 to 1 mm): outside of them it is no surface's."""
-MAX_STEP = 0.014
-"""Most that an iteration moves a point (about 1.5 mm)."""
+MAX_STEPS = (0.014, 0.007, 0.0035, 0.0018)
+"""Most that the iterations move a point (about 1.5 to 0.2 mm): a hard edge is found by halving, a soft one sooner."""
 SEARCH = (0.04, 0.06)
 """Where no ray touches, the surface is searched from so far before a point to so far behind it."""
 SEARCH_STEPS = 50
@@ -50,7 +49,7 @@ def move_to_silhouettes(
     """Points near the surface, moved along their normals to where a touching ray collects half an opacity.
 
     Into the object, the density near its surface grows exponentially, and so does the optical depth of a touching
-    ray: a step of Newton's method in its logarithm is nearly exact. Nothing touches a hollow. The surface there is
+    ray: steps of Newton's method in its logarithm are nearly exact. Nothing touches a hollow. The surface there is
     where a ray from the front has collected what such rays collect to the surface elsewhere, in the median.
 
     Args:
@@ -62,14 +61,14 @@ def move_to_silhouettes(
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
     """
     moved, touched = points, torch.ones_like(points[:, 0], dtype=torch.bool)
-    for _ in range(ITERATIONS):
+    for max_step in MAX_STEPS:
         depth, touches = _least_touching_depth(density_fn, moved, normals)
         touched &= touches
         step = _NORMAL_STEP * normals
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
         folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*FOLDING)
         inwards = folding * (-math.log1p(-TOUCHING_OPACITY) / depth).log()
-        moved = moved - inwards.clamp(-MAX_STEP, MAX_STEP)[:, None] * normals
+        moved = moved - inwards.clamp(-max_step, max_step)[:, None] * normals
     if touched.all():
         return moved
     depths = torch.linspace(-SEARCH[0], SEARCH[1], SEARCH_STEPS + 1, device=points.device)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
+from hsi_sc_nerf.surface.ray_densities import rendered_density
 from hsi_sc_nerf.surface.regions import EVERYWHERE, Region, in_box
 from hsi_sc_nerf.surface.silhouette_surface import move_to_silhouettes
 from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
@@ -176,13 +177,14 @@ def _at_silhouettes(model: SpectralModel, mesh: SurfaceMesh, points_per_batch: i
     """The mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it."""
     vertices, kept = mesh.vertices.copy(), np.zeros(len(mesh.vertices), bool)
     normals = mesh.normals_at(mesh.vertices)
+    density_fn = partial(rendered_density, model)
     with progress_bar("finding the surface", "points", len(vertices)) as update:
         for start in range(0, len(vertices), points_per_batch):
             rows = slice(start, start + points_per_batch)
             before, outward = (torch.from_numpy(a[rows]).float().to(model.device) for a in (mesh.vertices, normals))
-            after = move_to_silhouettes(model.field.density_fn, before, outward)
+            after = move_to_silhouettes(density_fn, before, outward)
             inwards = after[:, None] - outward[:, None] * torch.arange(0.0, OPAQUE_WITHIN, _STEP).to(after)[:, None]
-            opacity = 1.0 - torch.exp(-model.field.density_fn(inwards)[..., 0].sum(dim=1) * _STEP)
+            opacity = 1.0 - torch.exp(-density_fn(inwards)[..., 0].sum(dim=1) * _STEP)
             vertices[rows] = after.cpu().numpy()
             # Further away is another part of the surface, which has its own vertices.
             kept[rows] = (((after - before).norm(dim=-1) < MAX_SHIFT) & (opacity > MIN_OPACITY)).cpu().numpy()
