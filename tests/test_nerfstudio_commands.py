@@ -1,7 +1,5 @@
 """Which commands of nerfstudio are adapted, and what they say to runs that they cannot work with."""
 
-from __future__ import annotations
-
 import copy
 import sys
 import types

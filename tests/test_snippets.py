@@ -1,7 +1,5 @@
 """What pages and docstrings show works: Python blocks and examples run, command lines are parsed."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import doctest

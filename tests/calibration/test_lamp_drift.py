@@ -1,7 +1,5 @@
 """Drift of the lamps, against simulated sessions whose drift is known and against its closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

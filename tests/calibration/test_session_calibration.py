@@ -1,7 +1,5 @@
 """Whole sessions of known truth through the calibration: what is not saturated is right, and what is, is flagged."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

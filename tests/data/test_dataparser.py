@@ -1,7 +1,5 @@
 """How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """``process`` makes the checks before anything else, and ``inspect`` exits by them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every mode of pose refinement through both stages: what becomes of it, and that its checkpoints load."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup

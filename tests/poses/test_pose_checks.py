@@ -1,7 +1,5 @@
 """What the checks of poses find, by name and level."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pictures that poses are measured on: which of a frame's band groups is best, and what the others fill in."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial
