@@ -52,8 +52,9 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
         InputError: the command failed; the message names its log.
     """
     started = time.perf_counter()
-    # Warnings of libraries would hide the progress bars.
-    environment = os.environ | {"PYTHONWARNINGS": "ignore"}
+    # Warnings of libraries would hide the progress bars. Nothing here is compiled by PyTorch, but nerfstudio's import
+    # compiles two functions of a method that is not used, for which PyTorch loads its compiler for seconds.
+    environment = {"TORCHDYNAMO_DISABLE": "1"} | os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
