@@ -13,7 +13,7 @@ import pytest
 
 from hsi_sc_nerf.benchmark.steps import own_cost
 from hsi_sc_nerf.cli.main import main
-from hsi_sc_nerf.cli.workflows import STEPS_NAME, RunCommand, Step
+from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
@@ -135,3 +135,20 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
         with pytest.raises(InputError, match=told):
             RunCommand(session, out, max_num_iterations=5).main()
     assert [path.name for path in out.iterdir()] == ["thesis.txt"]
+
+
+def test_the_demo_leaves_somebody_elses_runs_alone(tmp_path):
+    """A folder of nerfstudio's looks like a demo's, but for the mark."""
+    for name in ("logs", "runs", "renders"):
+        (tmp_path / name).mkdir()
+    kept = tmp_path / "runs" / "config.yml"
+    kept.write_text("months of work")
+    with pytest.raises(InputError, match="other than a demo"):
+        DemoCommand(output_dir=tmp_path).main()
+    assert kept.read_text() == "months of work"
+
+
+def test_a_file_is_no_folder_for_the_demo(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="out: cannot be made a folder"):
+        DemoCommand(output_dir=tmp_path / "out").main()

@@ -18,7 +18,6 @@ from hsi_sc_nerf.poses.track_adjustment import (
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
-SIZE_PX = 256
 FOCAL_PX = 460.0
 
 
