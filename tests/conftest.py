@@ -22,7 +22,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")
 
 # A long file that comes last is waited for by all other processes.
-LONGEST = ["test_end_to_end.py", "test_run.py", "test_build.py", "test_viewer_in_browser.py", "test_mitsuba.py"]
+LONGEST = ["test_end_to_end.py", "test_workflows.py", "test_build.py", "test_viewer_in_browser.py", "test_mitsuba.py"]
 LONGEST += ["test_nerfstudio_commands.py", "test_pose_methods.py", "test_resume.py"]
 
 

@@ -1,4 +1,7 @@
-"""`hsi-sc-nerf run` through the real commands: nothing is done twice, and what was stopped or removed is made."""
+"""`hsi-sc-nerf run` through the real commands: nothing is done twice, and what was stopped or removed is made.
+
+The demo has tests of its own (test_end_to_end.py); here is what it does to folders that are not its own.
+"""
 
 import io
 import json
