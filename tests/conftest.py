@@ -1,4 +1,5 @@
 import fcntl
+import gc
 import os
 import sys
 from pathlib import Path
@@ -34,6 +35,12 @@ def pytest_collection_modifyitems(items):
         return longest, item.get_closest_marker("slow") is not None
 
     items.sort(key=place)
+
+
+def pytest_collection_finish():
+    """What was imported stays, so that the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
