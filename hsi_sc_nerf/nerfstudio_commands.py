@@ -39,7 +39,7 @@ def extend_nerfstudio_commands() -> None:
     """Extend the scripts of nerfstudio that are being imported or are imported."""
     # For each method that could be installed nerfstudio asks for the name of its caller. `inspect.stack` looks
     # through the sources of all modules for it, which takes longer than all else that a command does at its start.
-    external_methods.inspect = types.SimpleNamespace(stack=_callers)  # type: ignore[attr-defined]
+    external_methods.inspect = types.SimpleNamespace(stack=_callers)  # type: ignore[assignment]
     for name in _SCRIPTS:
         # ``python -m`` runs a script under another name.
         module = sys.modules.get(name)
