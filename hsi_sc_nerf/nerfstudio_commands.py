@@ -1,6 +1,7 @@
 """What nerfstudio's own commands do with runs of this package.
 
-``ns-export pointcloud`` writes the spectral cloud, and what a command cannot do ends in one sentence.
+``ns-export pointcloud`` writes the spectral cloud, what a command cannot do ends in one sentence, and commands start
+sooner.
 
 nerfstudio's scripts have no extension point, and import their plugins while they are being imported themselves. So
 the ``main`` of a script's commands is wrapped at the first use of the complete script. Runs of other methods pass as
@@ -14,6 +15,7 @@ import types
 from collections.abc import Callable
 from typing import Any
 
+from nerfstudio.configs import external_methods
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf.data.dataparser import split_frames
@@ -35,11 +37,23 @@ _REFUSED = {
 
 def extend_nerfstudio_commands() -> None:
     """Extend the scripts of nerfstudio that are being imported or are imported."""
+    # For each method that could be installed nerfstudio asks for the name of its caller. `inspect.stack` looks
+    # through the sources of all modules for it, which takes longer than all else that a command does at its start.
+    external_methods.inspect = types.SimpleNamespace(stack=_callers)  # type: ignore[assignment]
     for name in _SCRIPTS:
         # ``python -m`` runs a script under another name.
         module = sys.modules.get(name)
         if module is not None:
             _when_complete(module)
+
+
+def _callers() -> list[types.SimpleNamespace]:
+    """The functions that are being called, the caller of this one first, as `inspect.stack` lists them."""
+    found, frame = [], sys._getframe(1)
+    while frame is not None:
+        found.append(types.SimpleNamespace(function=frame.f_code.co_name))
+        frame = frame.f_back  # type: ignore[assignment]
+    return found
 
 
 def _when_complete(module: types.ModuleType) -> None:

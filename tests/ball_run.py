@@ -3,8 +3,6 @@
 The ball is `capture_factory`'s; everything but the field is the model that training would have.
 """
 
-from __future__ import annotations
-
 from copy import deepcopy
 from pathlib import Path
 

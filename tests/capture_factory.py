@@ -3,8 +3,6 @@
 A sphere with a plant's spectrum stands above a container's lid before a flat background; the counts are exact.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

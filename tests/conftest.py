@@ -1,8 +1,19 @@
 import fcntl
+import gc
 import os
+import sys
+from pathlib import Path
 
 import pytest
 from threadpoolctl import threadpool_limits
+
+if sys.dont_write_bytecode:
+    # Where no compiled modules may lie beside the sources (as in containers), each process of the tests would compile
+    # the tests, this package and often nerfstudio anew. They are kept with pytest's other files.
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).parents[1] / ".pytest_cache" / "pycache")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Processes side by side, each with all cores' threads, wait for one another.
@@ -11,17 +22,25 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # which PyTorch loads its compiler: half of the import's time, in each process of the tests.
 os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")
 
-LONGEST = ["test_end_to_end.py", "test_run.py"]
+# A long file that comes last is waited for by all other processes.
+LONGEST = ["test_end_to_end.py", "test_workflows.py", "test_build.py", "test_viewer_in_browser.py", "test_mitsuba.py"]
+LONGEST += ["test_nerfstudio_commands.py", "test_pose_methods.py", "test_resume.py"]
 
 
 def pytest_collection_modifyitems(items):
-    """The two longest files first, because all others fit beside them; then fast tests before slow ones."""
+    """The longest files first, then fast tests before slow ones."""
 
     def place(item):
         longest = LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST)
         return longest, item.get_closest_marker("slow") is not None
 
     items.sort(key=place)
+
+
+def pytest_collection_finish():
+    """What was imported stays, so that the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

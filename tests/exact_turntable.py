@@ -1,7 +1,5 @@
 """Turntables in the adjustment's terms, and exact or noisy sightings of their markers and points."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small session of a marker turntable with an object on it, for the checks of sessions."""
 
-from __future__ import annotations
-
 import json
 from functools import lru_cache
 from pathlib import Path

@@ -4,8 +4,6 @@ The scene is the object frame in units of 0.1 m, shifted by ``CENTRE_M``. The ba
 the spectrum of its height; the cameras, as measured, are wrong by a shift that the model's refinement takes back.
 """
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A frame of a packed dataset whose files lie where `process` puts them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

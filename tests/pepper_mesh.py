@@ -3,8 +3,6 @@
 A bell pepper of four uneven lobes that is turning red, with the shares of its three materials as vertex properties.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A spectral cloud of random numbers, with columns of every kind."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hsi_sc_nerf.export.cloud import SpectralCloud

@@ -1,7 +1,5 @@
 """Corners of ArUco markers as OpenCV finds them in small images."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,6 +1,5 @@
 """The pages agree with the code and with the files that their figures come from."""
 
-import csv
 import re
 import sys
 from pathlib import Path
@@ -15,14 +14,9 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = documentation.command_names()
 
 
-def test_tables_say_where_their_figures_come_from():
+def test_every_committed_table_is_shown_on_a_page():
     tables = {name for page in PAGES for name in documentation.TABLE.findall(page.read_text(encoding="utf-8"))}
     assert tables == {path.stem for path in documentation.RESULTS.glob("*.csv")}
-    for name in tables:
-        with (documentation.RESULTS / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-            columns, *rows = list(csv.reader(file))
-        assert tuple(columns[-3:]) == documentation.SOURCE_COLUMNS
-        assert all(len(row) == len(columns) and all(row[-3:]) for row in rows), name
 
 
 def test_a_table_without_sources_is_refused(tmp_path):
@@ -57,18 +51,8 @@ def test_every_option_in_a_page_exists():
 
 def test_every_setting_of_training_in_a_page_exists():
     settings = documentation.settings_page()
-    nerfstudio = {
-        "--data",
-        "--load-config",
-        "--load-dir",
-        "--max-num-iterations",
-        "--output-dir",
-        "--output-path",
-        "--help",
-    }
+    inherited = ("max-res", "train-num-rays-per-batch")
     for page in PAGES:
-        for option in re.findall(
-            r"--(?:pipeline|full-frame|masked)\.[a-z0-9.-]+[a-z0-9]", page.read_text(encoding="utf-8")
-        ):
-            inherited = option.endswith(("max-res", "train-num-rays-per-batch"))
-            assert f"`{option}`" in settings or option in nerfstudio or inherited, f"{page.name}: {option}"
+        text = page.read_text(encoding="utf-8")
+        for option in re.findall(r"--(?:pipeline|full-frame|masked)\.[a-z0-9.-]+[a-z0-9]", text):
+            assert f"`{option}`" in settings or option.endswith(inherited), f"{page.name}: {option}"

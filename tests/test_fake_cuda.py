@@ -4,8 +4,6 @@ They know their devices. What mixes these, or brings something from one to the o
 (Backward passes need a real GPU; our own autograd functions' are called by themselves.)
 """
 
-from __future__ import annotations
-
 import copy
 from types import SimpleNamespace
 

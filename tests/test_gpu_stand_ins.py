@@ -1,7 +1,5 @@
 """What benchmarks/gpu.py puts in the place of Open3D where that cannot be installed gives what Open3D gives."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

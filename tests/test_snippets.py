@@ -1,7 +1,5 @@
 """What pages and docstrings show works: Python blocks and examples run, command lines are parsed."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import doctest
@@ -136,6 +134,7 @@ def test_examples_of_docstrings_hold(name: str, folder: Path) -> None:
     assert results.failed == 0
 
 
+@pytest.mark.slow
 def test_every_function_that_an_example_calls_exists() -> None:
     """Examples that need a trained run or a session are not run; what they call must be there all the same."""
     modules = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hsi_sc_nerf").rglob("*.py")}

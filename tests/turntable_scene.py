@@ -1,7 +1,5 @@
 """A small renderer of marker turntables with known truth, for the tests of the poses alone (grey, no shadows)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

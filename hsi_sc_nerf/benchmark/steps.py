@@ -30,7 +30,8 @@ SCRIPTS = {
 }
 """Module and function of the commands that steps are made of."""
 WITHOUT_COMPILER = {"TORCHDYNAMO_DISABLE": "1"}
-"""Environment in which nerfstudio does not load PyTorch's compiler, which takes seconds and nothing here uses."""
+"""Environment in which PyTorch's compiler is not loaded, which takes seconds. Nothing here uses it, but nerfstudio's
+import compiles two functions of a method that is not used."""
 _RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
@@ -62,7 +63,7 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
     """
     started = time.perf_counter()
     # Warnings of libraries would hide the progress bars.
-    environment = os.environ | {"PYTHONWARNINGS": "ignore"} | WITHOUT_COMPILER
+    environment = WITHOUT_COMPILER | os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")

@@ -8,7 +8,7 @@ import math
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ ITERATIONS_ON_CPU = 4000
 ITERATIONS_ON_GPU = 40_000
 DEMO_MARK = ".hsi-sc-nerf-demo"
 """File that marks the folder of a demo, whose contents may be replaced."""
+StepRunner = Callable[[str, Sequence[str], Path], StepCost]
+"""Runs a command; gets the step's name, the command and the file for its output."""
 
 # Fewer rays a step than the default, for two cores.
 DEMO_TRAINING = {
@@ -91,8 +93,11 @@ class RunCommand:
     train: str = ""
     """More words for `ns-train hsi-sc-nerf`, likewise: --train="--pipeline.model.head direct"."""
 
-    def main(self) -> None:
+    def main(self, run_step: StepRunner = run_step) -> None:
         """Run the steps that are not up to date and print what was found.
+
+        Args:
+            run_step: runs a step's command.
 
         Raises:
             InputError: a step failed, there is no session, or the output folder holds something else.
@@ -109,7 +114,8 @@ class RunCommand:
         console = Console(highlight=False, soft_wrap=True)
         steps = self._steps()
         for number, step in enumerate(steps, start=1):
-            self._bring_up_to_date(step, console, f"[bold]{number}/{len(steps)} {step.name}[/bold]")
+            title = f"[bold]{number}/{len(steps)} {step.name}[/bold]"
+            self._bring_up_to_date(step, console, title, run_step)
         _show_results(out, console)
 
     def _steps(self) -> list[Step]:
@@ -157,7 +163,7 @@ class RunCommand:
 
         return ITERATIONS_ON_GPU if torch.cuda.is_available() else ITERATIONS_ON_CPU
 
-    def _bring_up_to_date(self, step: Step, console: Console, title: str) -> None:
+    def _bring_up_to_date(self, step: Step, console: Console, title: str, run_step: StepRunner) -> None:
         """Run a step unless its results are those of the same command and inputs."""
         steps_path = self.output_dir / STEPS_NAME
         done: dict[str, Any] = json.loads(steps_path.read_text(encoding="utf-8")) if steps_path.is_file() else {}

@@ -32,7 +32,9 @@ def sample_occupied(
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """Starts and ends of the samples along each ray, as distances from its origin.
 
-    Samples are in order and cover all matter; between them lies what holds none. A ray that meets no cell with
+    Samples are in order and do not overlap; between them lies what holds no matter. The first and the last half of a
+    sample's weight have none: what is first is empty, what is last is hidden, and long samples there would blur the
+    surface (docs/notes/dead_ends.md). A ray that meets no cell with
     matter has samples of length 0. Gradients are not carried.
 
     Args:
@@ -93,7 +95,7 @@ def sample_with_tensors(
     sample = torch.arange(num_samples, device=origins.device).expand(len(origins), -1)
 
     def at(quantile: Tensor) -> tuple[Tensor, Tensor]:
-        level = quantile / num_samples * total
+        level = (quantile + 0.5) / (num_samples + 1) * total
         steps_there = torch.searchsorted(cumulated, level, right=True).clamp_max(steps - 1)
         weight = weights.gather(1, steps_there)
         passed = cumulated.gather(1, steps_there) - weight

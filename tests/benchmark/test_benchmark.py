@@ -224,7 +224,7 @@ def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_pat
 
 
 @pytest.mark.slow
-def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path, in_this_process):
+def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_path):
     job = benchmark._job(named_configuration("ours"), command(tiny_dataset, tmp_path), tiny_dataset[0])
     ends = []
     for checkpoints in ((1.0,), (0.17, 0.67, 1.0)):

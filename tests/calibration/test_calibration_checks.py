@@ -1,7 +1,5 @@
 """Findings of the calibration, on a small session whose calibration is then spoilt in one way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -130,6 +130,7 @@ def test_hot_elements_alone_do_not_saturate_anything():
     assert find_defects(*readings(simulation)).saturation_counts is None
 
 
+@pytest.mark.slow
 def test_readings_that_pile_up_at_an_unusual_count():
     white, frames = readings(session(size_px=40, bands=40, saturation={}, **NOISE))
     cubes = [np.minimum(r.counts, 3800) for r in (white, *frames)]

@@ -1,8 +1,7 @@
 """Drift of the lamps, against simulated sessions whose drift is known and against its closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -99,6 +98,7 @@ def test_inter_reflection_makes_no_drift():
     assert not drift.significant
 
 
+@pytest.mark.slow
 def test_noise_free_drift_before_an_even_background():
     drift, true, _ = simulated(DRIFT)
     assert drift.significant
@@ -145,11 +145,12 @@ def measure(counts, dark=100.0, **masks):
 
 
 LARGE = (60, 128)
+slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("scatter", "fireflies", "moving"),
-    [(0.01, 0.0, 0.6), (0.05, 0.0, 0.0), (0.06, 0.0, 0.3), (0.05, 0.05, 0.3)],
+    [slow(0.01, 0.0, 0.6), slow(0.05, 0.0, 0.0), slow(0.06, 0.0, 0.3), (0.05, 0.05, 0.3)],
 )
 def test_scatter_of_the_pixels_averages_out(scatter, fireflies, moving):
     drift = measure(drawn(moving=moving, shape=LARGE, scatter=scatter, fireflies=fireflies))

@@ -1,7 +1,5 @@
 """The noise of a reading and of a reflectance, against exposures whose noise is known."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The kernel from counts to packed reflectance, held against one expression in float64."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whole sessions of known truth through the calibration: what is not saturated is right, and what is, is flagged."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -99,6 +97,7 @@ def test_drift_is_recovered(odd, noisy):
         assert np.sqrt(np.mean(error**2)) < 0.003
 
 
+@pytest.mark.slow
 def test_saturated_and_dead_values_are_flagged_and_no_others(odd, noisy):
     for session in (odd, noisy):
         maps = session.truth.detector_maps()
@@ -115,6 +114,7 @@ def test_saturated_and_dead_values_are_flagged_and_no_others(odd, noisy):
         assert saturated > 100
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_uncertainty_says(noisy):
     scores = []
     for number in range(len(noisy.session.frames)):
@@ -194,6 +194,7 @@ def own_white(session: Session, capture, lines=3):
     )
 
 
+@pytest.mark.slow
 def test_other_sources_of_white(tmp_path):
     scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=[])
     folder = simulate_session(scene, tmp_path / "session", progress=False)

@@ -1,7 +1,5 @@
 """Whites and what is none, before a wall with a striped, turning object."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

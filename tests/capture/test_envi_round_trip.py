@@ -1,7 +1,5 @@
 """Cubes written by hand, byte by byte, and read back through headers in every variation that ENVI allows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

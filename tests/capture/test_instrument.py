@@ -1,7 +1,5 @@
 """Whole SPECIM IQ captures: metadata, whites of their own, finished reflectance, images on their side."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

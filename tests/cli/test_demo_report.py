@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +55,7 @@ def test_marked_points_lie_where_their_pixels_are(tmp_path: Path) -> None:
         assert (row - top) / (bottom - top) * 20 == pytest.approx(y, abs=0.3)
 
 
+@pytest.mark.slow
 def test_the_nearer_side_hides_the_farther(tmp_path: Path) -> None:
     # Two squares before and behind the axis seen from the camera (+x), the nearer one first in the list.
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.03, 0.03, 60), np.linspace(0.0, 0.06, 60)))

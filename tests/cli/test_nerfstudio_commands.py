@@ -1,7 +1,5 @@
 """nerfstudio's own commands on a small run and a dataset of this package: the table of its how-to page."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -43,21 +41,14 @@ def held_out(data) -> SpectralDataset:
     return SpectralDataset(SpectralDataParserConfig(data=data).setup().get_dataparser_outputs("test"))
 
 
-def test_a_held_out_view_holds_its_reflectance(tiny_dataset):
-    dataset = held_out(tiny_dataset[0])
-    item = dataset[0]
-    assert not dataset.has_flagged
-    assert "valid" not in item
-    counts = dataset.frames[0].cube()
-    torch.testing.assert_close(item["spectral"], torch.from_numpy(counts / np.float32(REFLECTANCE_SCALE)))
-    np.testing.assert_array_equal(item["mask"][..., 0], dataset.frames[0].mask())
-
-
-def test_a_held_out_view_tells_what_was_not_measured(flagged_dataset):
-    dataset = held_out(flagged_dataset)
-    item = dataset[0]
-    counts = np.asarray(dataset.frames[0].cube())
-    np.testing.assert_array_equal(item["valid"], counts != FLAGGED)
-    assert not item["valid"].all()
+@pytest.mark.parametrize("flagged", [False, True])
+def test_a_held_out_view_holds_what_was_measured(tiny_dataset, flagged_dataset, flagged):
+    dataset = held_out(flagged_dataset if flagged else tiny_dataset[0])
+    item, counts = dataset[0], np.asarray(dataset.frames[0].cube())
+    assert dataset.has_flagged == ("valid" in item) == flagged
+    if flagged:
+        np.testing.assert_array_equal(item["valid"], counts != FLAGGED)
+        assert not item["valid"].all()
     expected = np.where(counts == FLAGGED, 0, counts) / np.float32(REFLECTANCE_SCALE)
     torch.testing.assert_close(item["spectral"], torch.from_numpy(expected))
+    np.testing.assert_array_equal(item["mask"][..., 0], dataset.frames[0].mask())

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -96,6 +94,7 @@ def test_recall_counts_what_is_seen_and_precision_the_whole(session: Path, tmp_p
     assert score_at(whole.to_reference_m, whole.to_cloud_m, 0.002).recall < 60
 
 
+@pytest.mark.slow
 def test_the_command_writes_figures_pictures_and_the_cloud(mesh: Path, tmp_path: Path) -> None:
     outliers = 1.5 * on_ball(1000, seed=2)
     cloud = write_cloud(tmp_path / "cloud.ply", np.concatenate([on_ball(9000, seed=1), outliers]))

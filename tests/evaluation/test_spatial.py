@@ -1,7 +1,5 @@
 """Precision, recall, F-score and distances of surfaces."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The surface of a ball that a model knows exactly: found, spread over evenly, seen by the right frames."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -81,7 +81,7 @@ def test_an_unknown_scene_is_sampled_evenly(function):
         CELL,
         4,
     )
-    torch.testing.assert_close(ends - starts, torch.full((1, 4), 2.0 / 4.0), rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(ends - starts, torch.full((1, 4), 2.0 / 5.0), rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("function", [sample_occupied, sample_with_tensors])

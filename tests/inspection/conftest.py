@@ -1,7 +1,5 @@
 """A good session, and a copy of it that a test may spoil."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

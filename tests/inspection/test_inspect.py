@@ -105,6 +105,7 @@ def test_a_blurred_frame_without_markers_is_amber(session):
     assert "fruit_10" in amber["markers"]
 
 
+@pytest.mark.slow
 def test_without_session_json_it_is_written_for_the_user(good, tmp_path):
     session = Path(shutil.copytree(good, tmp_path / "fruits"))
     (session / "session.json").unlink()

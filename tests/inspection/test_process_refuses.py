@@ -1,7 +1,5 @@
 """``process`` makes the checks before anything else, and ``inspect`` exits by them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -46,6 +44,7 @@ def test_all_damaged_captures_are_named_or_left_out(session, tmp_path):
         process(session, tmp_path / "data", skip_damaged=True)
 
 
+@pytest.mark.slow
 def test_inspect_prints_all_findings_and_a_session_json(session, tmp_path, capsys):
     InspectCommand(session, output_dir=tmp_path / "out").main()
     assert (tmp_path / "out" / "inspection.png").is_file()

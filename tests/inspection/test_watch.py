@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import signal
 
 import numpy as np
@@ -37,6 +35,7 @@ def test_a_capture_that_is_being_written_is_waited_for(tmp_path):
     assert len(watch.new_lines()) == 1
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_flagged_at_once(tmp_path):
     watch = Watch(tmp_path)
     for number in range(3):

@@ -56,7 +56,7 @@ def test_every_ray_is_sampled_where_that_is_wanted():
     sampler = OccupancySampler(ball_grid(), num_samples=8, every_ray=True)
     samples, *_ = sampler(rays_along_x(torch.tensor([0.9, 0.0])))
     assert samples.frustums.shape == (2, 8)
-    assert samples.deltas.sum(dim=1).flatten().tolist() == pytest.approx([0.0, 1.2], abs=0.05)
+    assert samples.deltas.sum(dim=1).flatten().tolist() == pytest.approx([0.0, 1.2 * 8 / 9], abs=0.05)
 
 
 def test_the_field_begins_solid_inside_the_hull():

@@ -1,7 +1,5 @@
 """The spread of the metrics over held-out views, and what becomes of values that are no measurements."""
 
-from __future__ import annotations
-
 import copy
 import math
 import shutil

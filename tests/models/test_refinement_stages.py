@@ -1,10 +1,7 @@
 """Every mode of pose refinement through both stages: what becomes of it, and that its checkpoints load."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
 from small_trainer import STEPS, trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
@@ -48,6 +45,8 @@ def test_a_mode_through_both_stages(tiny_dataset, tmp_path, monkeypatch, mode):
     assert resumed._start_step == STEPS // 2
     resumed.train()
     torch.testing.assert_close(state(resumed.pipeline.model), final, rtol=0, atol=0)
+
+    from nerfstudio.utils.eval_utils import eval_setup  # which takes seconds to import
 
     # What ns-eval does: held-out views are seen from where the frozen corrections put them.
     _, pipeline, checkpoint, _ = eval_setup(whole.base_dir / "config.yml")

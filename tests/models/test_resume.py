@@ -154,6 +154,12 @@ def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, t
 
 
 @pytest.mark.slow
+def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path, whole):
+    with pytest.raises(SystemExit, match="max-num-iterations"):
+        longer(tiny_dataset, tmp_path, load_dir=whole.checkpoint_dir).train()
+
+
+@pytest.mark.slow
 def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, whole):
     with pytest.raises(SystemExit, match="holds no checkpoint; --load-dir takes"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
-from small_trainer import STEPS, trainer
+from small_trainer import trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
@@ -102,22 +102,6 @@ def test_several_devices_are_refused(tiny_dataset, tmp_path):
     config = trainer(tiny_dataset, tmp_path).config
     with pytest.raises(SystemExit, match="trains on one device"):
         config.setup(local_rank=0, world_size=2).setup()
-
-
-@pytest.mark.slow
-def test_stage_one_alone_can_be_continued_and_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path):
-    first = trainer(tiny_dataset, tmp_path / "first")
-    first.train()
-    kept = first.base_dir / "stage-full-frame"
-    assert [path.name for path in kept.iterdir()] == ["step-000000002.ckpt"]
-    second = trainer(tiny_dataset, tmp_path / "second", load_dir=kept)
-    assert second._start_step == 3
-    second.train()
-    assert second.step == STEPS - 1
-    assert second._stage.config.name == "masked"
-    again = trainer(tiny_dataset, tmp_path / "again", load_dir=first.checkpoint_dir)
-    with pytest.raises(SystemExit, match="max-num-iterations"):
-        again.train()
 
 
 def poison(made, bad_steps):

@@ -100,6 +100,7 @@ def test_lens_distortion_is_found(radial):
     assert (found.radial[1] == 0.0) == (radial[1] == 0.0)
 
 
+@pytest.mark.slow
 def test_lens_and_table_are_told_apart():
     machine = replace(wobbling(0.5, frames=12), radial=(-0.15, 0.0))
     found = solved(machine, marker_observations(machine)).turntable
@@ -243,6 +244,7 @@ def test_a_frame_whose_angle_is_hardly_known_is_left_out():
         without_uncertain_frames(adjusted, vague)
 
 
+@pytest.mark.slow
 def test_uncertainties_are_those_of_the_errors():
     machine = marker_turntable(MarkerScene(size_px=256, frames=12))
     errors, angles = [], []

@@ -1,8 +1,7 @@
 """Which way to poses a session supports, and that all ways end in the same form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +9,12 @@ import pytest
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.poses.feature_poses import poses_from_features
 from hsi_sc_nerf.poses.known_camera import KnownCamera
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
+from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.spectra import bands_within, to_8_bit
@@ -34,6 +35,13 @@ def pear():
     return images, list(simulation.captures), simulation.camera_to_world, simulation.intrinsics
 
 
+@pytest.fixture(scope="module")
+def from_features(pear):
+    """`poses_from_features` of the pear, whose features are matched once for all tests."""
+    images, names, *_ = pear
+    return partial(poses_from_features, free=structure_from_motion(images, names))
+
+
 def pear_info(**values):
     side_m = load_scene("pear").markers.side_m
     return replace(SessionInfo(marker_side_m=side_m, nominal_step_deg=360.0 / FRAMES, direction="ccw"), **values)
@@ -47,9 +55,9 @@ def largest_errors(poses, truth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "largest_deg", "largest_m"), [("auto", 0.1, 0.5e-3), ("colmap", 0.2, 1e-3)])
-def test_markers_give_the_poses_and_help_features(pear, method, largest_deg, largest_m):
+def test_markers_give_the_poses_and_help_features(pear, from_features, method, largest_deg, largest_m):
     images, names, truth, intrinsics = pear
-    poses = find_poses(images, names, pear_info(), method, progress=False)
+    poses = find_poses(images, names, pear_info(), method, progress=False, from_features=from_features)
     assert poses.method == {"auto": "markers"}.get(method, method)
     assert poses.metric
     assert poses.used.all()
@@ -63,7 +71,7 @@ def test_markers_give_the_poses_and_help_features(pear, method, largest_deg, lar
 
 
 @pytest.mark.slow
-def test_without_markers_and_a_known_distance_there_is_no_scale(pear):
+def test_without_markers_and_a_known_distance_there_is_no_scale(pear, from_features):
     images, names, truth, _ = pear
     # The session's markers are of another dictionary.
     by_hand = pear_info(
@@ -72,7 +80,8 @@ def test_without_markers_and_a_known_distance_there_is_no_scale(pear):
         camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])),
     )
     unknown = replace(by_hand, camera_distance_m=None)
-    metric, free = (find_poses(images, names, info, "angles", progress=False) for info in (by_hand, unknown))
+    options = {"method": "angles", "progress": False, "from_features": from_features}
+    metric, free = (find_poses(images, names, info, **options) for info in (by_hand, unknown))
     assert metric.method == "angles"
     np.testing.assert_allclose(metric.angles_deg, np.arange(FRAMES) * 360.0 / FRAMES, atol=1e-6)
     assert metric.metric

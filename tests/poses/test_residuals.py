@@ -1,7 +1,5 @@
 """The chain of steps between neighbouring frames: what it adds up to on made-up tracks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pictures that poses are measured on: which of a frame's band groups is best, and what the others fill in."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial
@@ -323,6 +321,7 @@ def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
         np.testing.assert_allclose(frame.picture("near infrared"), expected, atol=1.5)
 
 
+@pytest.mark.slow
 def test_pictures_are_not_read_where_nothing_is_measured(tmp_path):
     session = open_session(write_session(tmp_path / "session", ANGLES_DEG))
     blank = [np.zeros((48, 48), np.uint8)] * 4

@@ -18,7 +18,6 @@ from hsi_sc_nerf.poses.track_adjustment import (
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
-SIZE_PX = 256
 FOCAL_PX = 460.0
 
 
@@ -75,6 +74,7 @@ def narrow_machine(narrower=4.0):
     return replace(true, focal_px=narrower * true.focal_px, points_3d=points_3d)
 
 
+@pytest.mark.slow
 def test_a_turn_that_was_found_reversed_in_depth_is_set_right():
     """An adjustment does not lead from one to the other."""
     true = narrow_machine()

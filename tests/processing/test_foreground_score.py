@@ -1,7 +1,5 @@
 """The foreground score: what the background's spectra leave of a spectrum."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

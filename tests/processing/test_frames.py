@@ -1,7 +1,5 @@
 """The files of one frame in a packed dataset, and when it counts as finished."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import cv2

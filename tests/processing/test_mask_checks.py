@@ -1,7 +1,5 @@
 """Checks of masks on silhouettes of a sphere and of walls, whose findings are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_pose

@@ -1,7 +1,5 @@
 """The edge of masks, on drawn pictures of half-covered and shaded pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """Median spectrum along a frame's border, and the median it rests on."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube

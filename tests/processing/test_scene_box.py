@@ -1,7 +1,5 @@
 """Boxes of the object and of everything that turns, from masks and poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from capture_factory import INTRINSICS, SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_pose

@@ -1,7 +1,5 @@
 """What the cameras see of the visual hull, and masks trimmed to it."""
 
-from __future__ import annotations
-
 import numpy as np
 from capture_factory import sphere_mask, true_pose
 

@@ -157,24 +157,30 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     assert not (tmp_path / "report.html").exists()
 
 
-@contextmanager
-def opened(report, **window):
-    """The report in a browser, and what its console said."""
+@pytest.fixture(scope="module")
+def browser():
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     with sync_api.sync_playwright() as playwright:
         browser = launch(playwright)
-        page = browser.new_page(reduced_motion="reduce", **window)
-        page.set_default_timeout(120_000)
-        messages, requests = [], []
-        page.on("console", lambda message: messages.append(message.text))
-        page.on("pageerror", lambda error: messages.append(str(error)))
-        page.on("request", lambda request: requests.append(request.url))
-        page.goto(report.as_uri())
-        assert page.locator("#cloud").get_attribute("data-state") == "ready"
-        yield page
-        assert messages == []
-        assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
+        yield browser
         browser.close()
+
+
+@contextmanager
+def opened(browser, report, **window):
+    """The report in a window of its own, and what its console said."""
+    page = browser.new_page(reduced_motion="reduce", **window)
+    page.set_default_timeout(120_000)
+    messages, requests = [], []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(report.as_uri())
+    assert page.locator("#cloud").get_attribute("data-state") == "ready"
+    yield page
+    assert messages == []
+    assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
+    page.close()
 
 
 def picked_mm(page):
@@ -184,9 +190,9 @@ def picked_mm(page):
 
 @pytest.mark.slow
 @needs_browser
-def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
+def test_the_object_turns_and_tells_its_spectra_in_a_browser(browser, report):
     """Colours that follow from the numbers, the spectrum of the point under a click."""
-    with opened(report, viewport={"width": 700, "height": 900}) as page:
+    with opened(browser, report, viewport={"width": 700, "height": 900}) as page:
         canvas = page.locator("#cloud canvas")
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")
@@ -225,9 +231,9 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(report):
 
 @pytest.mark.slow
 @needs_browser
-def test_a_spectrum_is_picked_by_keyboard(report):
+def test_a_spectrum_is_picked_by_keyboard(browser, report):
     """The page is entered by tabulator; the cross shows where; arrows move what is under it."""
-    with opened(report, viewport={"width": 1280, "height": 900}) as page:
+    with opened(browser, report, viewport={"width": 1280, "height": 900}) as page:
         for _ in range(40):
             page.keyboard.press("Tab")
             if page.evaluate("document.activeElement.tagName") == "CANVAS":
@@ -249,8 +255,8 @@ def test_a_spectrum_is_picked_by_keyboard(report):
 
 @pytest.mark.slow
 @needs_browser
-def test_a_phone_shows_all_of_it_without_scrolling_sideways(report):
-    with opened(report, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(browser, report):
+    with opened(browser, report, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
         size = "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
         assert page.locator("section > .card[open]").count() == 1
         width, height = page.evaluate(size)

@@ -1,7 +1,5 @@
 """Held-out views: scores, points and rendering; training curves and settings of a run."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Effects of the turntable, the chamber, the lamps and of time: closed forms, and what they leave alone."""
 
-from __future__ import annotations
-
 import functools
 import json
 

@@ -108,6 +108,7 @@ def test_few_electrons_are_poisson_numbers():
     assert (poisson(np.zeros((4, 4), np.float32), np.random.default_rng(0)) == 0.0).all()
 
 
+@pytest.mark.slow
 def test_calibration_of_a_noisy_white_sphere_is_unbiased(tmp_path):
     quiet_scene = scene(size_px=96, bands=8)
     noisy = dataclasses.replace(quiet_scene, effects=read_effects(["photon_noise", "read_noise", "dark_pattern"], ""))
@@ -156,6 +157,7 @@ def test_bad_pixels_are_where_the_maps_say_and_nothing_else_changes():
             np.testing.assert_array_equal(cube[:, ~dead & ~hot], kept[:, ~dead & ~hot])
 
 
+@pytest.mark.slow
 def test_saturation_clips_exactly_where_truth_says(tmp_path):
     changed = scene(size_px=40, bands=12, saturation={"exposure_factor": 1.6})
     simulate_session(changed, tmp_path / "s", False)
@@ -365,6 +367,7 @@ def by_definition(changed, renderer, exposure):
     return np.clip(np.rint(counts), 0, LARGEST)
 
 
+@pytest.mark.slow
 def test_effects_together_are_what_their_definitions_say():
     renderer = assemble.build_renderer(scene(), assemble.object_part(scene()))
     for pair in [*itertools.pairwise(STRENGTHS), tuple(STRENGTHS)]:

@@ -275,6 +275,7 @@ def test_an_earlier_simulated_session_is_replaced(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
 
 
+@pytest.mark.slow
 def test_a_run_without_space_leaves_nothing(tmp_path, monkeypatch):
     def stop(*_):
         raise OSError(28, "No space left")

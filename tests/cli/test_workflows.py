@@ -1,16 +1,24 @@
-"""`hsi-sc-nerf run` through the real commands: nothing is done twice, and what was stopped or removed is made."""
+"""`hsi-sc-nerf run` through the real commands: nothing is done twice, and what was stopped or removed is made.
 
+The demo has tests of its own (test_end_to_end.py); here is what it does to folders that are not its own.
+"""
+
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
 
 import pytest
 
-from hsi_sc_nerf.cli.workflows import STEPS_NAME, RunCommand, Step
+from hsi_sc_nerf.benchmark.steps import own_cost
+from hsi_sc_nerf.cli.main import main
+from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
 ALL = ["process", "train", "evaluate", "export", "traits", "report"]
 TRAIN = " ".join(
@@ -22,15 +30,35 @@ TRAIN = " ".join(
 )
 
 
-def words(session, out):
-    options = ["--max-num-iterations", "150", "--num-points", "3000", f"--train={TRAIN}"]
-    return [sys.executable, "-m", "hsi_sc_nerf.cli.main", "run", str(session), "--output-dir", str(out), *options]
+OPTIONS = {"max_num_iterations": 150, "num_points": 3000, "train": TRAIN}
 
 
-def run(session, out):
-    made = subprocess.run(words(session, out), capture_output=True, text=True)
-    assert made.returncode == 0, made.stdout + made.stderr
-    return made.stdout
+@pytest.fixture(scope="module")
+def run():
+    """The rest of a run in this process, which has nerfstudio imported; gives what it prints."""
+    from nerfstudio.scripts import eval, exporter, train  # noqa: F401
+    from nerfstudio.utils import writer
+
+    extend_nerfstudio_commands()  # as at the end of their import by a console script
+    with pytest.MonkeyPatch.context() as monkeypatch:
+
+        def run_step(name, argv, log):
+            """A process has a program after ``-c``, or our module after ``-m``."""
+            _, kind, program, *words = argv
+            monkeypatch.setattr(sys, "argv", [program, *words])
+            monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
+            started = time.perf_counter()
+            with log.open("w") as output, redirect_stdout(output):
+                main() if kind == "-m" else exec(program, {})
+            return own_cost(name, started)
+
+        def run(session, out):
+            printed = io.StringIO()
+            with redirect_stdout(printed):
+                RunCommand(session, out, **OPTIONS).main(run_step)
+            return printed.getvalue()
+
+        yield run
 
 
 def done(printed):
@@ -42,7 +70,9 @@ def done(printed):
 def killed(tiny_dataset, tmp_path_factory):
     """A run that was killed in its training, after the first checkpoint."""
     out = tmp_path_factory.mktemp("run") / "out"
-    process = subprocess.Popen(words(tiny_dataset[1], out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "run", tiny_dataset[1], "--output-dir", out]
+    words += [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     weights = out / "training" / "hsi-sc-nerf" / "run" / "nerfstudio_models"
     started = time.monotonic()
     while not any(weights.glob("*.ckpt")):
@@ -56,7 +86,7 @@ def killed(tiny_dataset, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(tiny_dataset, killed):
+def whole(tiny_dataset, killed, run):
     """The run brought to its end by a second call."""
     return tiny_dataset[1], killed, run(tiny_dataset[1], killed)
 
@@ -76,7 +106,7 @@ def test_a_killed_run_goes_on_and_shows_its_commands(whole):
 
 
 @pytest.mark.slow
-def test_a_second_call_does_nothing_and_a_removed_result_is_made_again(whole):
+def test_a_second_call_does_nothing_and_a_removed_result_is_made_again(whole, run):
     session, out, _ = whole
     files = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert done(run(session, out)) == []
@@ -108,3 +138,20 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
         with pytest.raises(InputError, match=told):
             RunCommand(session, out, max_num_iterations=5).main()
     assert [path.name for path in out.iterdir()] == ["thesis.txt"]
+
+
+def test_the_demo_leaves_somebody_elses_runs_alone(tmp_path):
+    """A folder of nerfstudio's looks like a demo's, but for the mark."""
+    for name in ("logs", "runs", "renders"):
+        (tmp_path / name).mkdir()
+    kept = tmp_path / "runs" / "config.yml"
+    kept.write_text("months of work")
+    with pytest.raises(InputError, match="other than a demo"):
+        DemoCommand(output_dir=tmp_path).main()
+    assert kept.read_text() == "months of work"
+
+
+def test_a_file_is_no_folder_for_the_demo(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="out: cannot be made a folder"):
+        DemoCommand(output_dir=tmp_path / "out").main()
