@@ -79,7 +79,11 @@ def _become(words: list[str], log: Path) -> None:
         warnings.simplefilter("ignore")
         name, *rest = words
         sys.argv = [name, *rest]
+        plugins_are_there = "hsi_sc_nerf.config" in sys.modules
         module = importlib.import_module(SCRIPTS[name][0])
+        if plugins_are_there:
+            # A script imports the plugins, which then extend it; these were imported before it.
+            importlib.import_module("hsi_sc_nerf.nerfstudio_commands").extend_nerfstudio_commands()
         getattr(module, SCRIPTS[name][1])()
         status = 0
     except SystemExit as end:

@@ -269,8 +269,8 @@ class DemoCommand:
         steps = ForkedSteps()
         for number, (name, words) in enumerate(commands.items(), start=1):
             console.print(f"[bold]{number}/{len(commands) + 1} {name}")
-            # While the simulator runs, what the later steps need is imported.
-            meanwhile = [module for module, _ in SCRIPTS.values()] if name == "simulate" else []
+            # While the simulator runs, what most steps need is imported; the export's Open3D would fill their memory.
+            meanwhile = [SCRIPTS[word][0] for word in ("hsi-sc-nerf", "ns-train", "ns-eval")] if number == 1 else []
             costs.append(steps.run(name, words, logs / f"{name}.log", meanwhile))
         console.print(f"[bold]{len(costs) + 1}/{len(commands) + 1} compare")
         started = time.perf_counter()

@@ -59,3 +59,13 @@ def test_a_command_that_fails_is_named_with_its_log_and_told_on_the_terminal(tmp
         ForkedSteps().run("simulate", words, tmp_path / "simulate.log")
     assert "banana" in capfd.readouterr().err
     assert not (tmp_path / "session").exists()
+
+
+@pytest.mark.slow
+def test_nerfstudios_commands_are_extended_though_the_plugins_were_there_before(tmp_path, capfd):
+    import nerfstudio.scripts.train  # noqa: F401  imports the plugins
+
+    words = ["ns-export", "pointcloud", "--load-config", tmp_path / "no.yml", "--output-dir", tmp_path]
+    with pytest.raises(InputError, match="'export' failed with status 1"):
+        ForkedSteps().run("export", words, tmp_path / "export.log")
+    assert "no.yml: there is no such file" in capfd.readouterr().err

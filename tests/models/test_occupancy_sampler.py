@@ -9,6 +9,7 @@ from nerfstudio.cameras.rays import RayBundle
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over
 from hsi_sc_nerf.fields.spectral_field import START_DENSITIES, SpectralField
+from hsi_sc_nerf.models.backgrounds import make_background
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.packed.dataset import open_packed
 
@@ -80,3 +81,21 @@ def test_a_scene_that_is_not_the_datasets_box_is_refused(tmp_path):
     dataset = open_packed(write_ball_dataset(tmp_path))
     with pytest.raises(InputError, match="num-proposal-iterations"):
         build_occupancy(dataset, dataset.frames, BOX)
+
+
+def test_what_a_checkpoint_replaces_has_its_shape_and_is_not_looked_for(tmp_path):
+    dataset = open_packed(write_ball_dataset(tmp_path))
+    sides = torch.from_numpy(np.ptp(dataset.scene_box_m, axis=0)).float()
+    aabb = torch.stack([-sides, sides]) / sides.max()
+    found = build_occupancy(dataset, dataset.frames, aabb), make_background("image", dataset, dataset.frames)
+    for frame in dataset.frames:
+        frame.mask_path.unlink()
+        frame.cube_path.unlink()
+    empty = (
+        build_occupancy(dataset, dataset.frames, aabb, True),
+        make_background("image", dataset, dataset.frames, True),
+    )
+    for module, replaced in zip(found, empty, strict=True):
+        replaced.load_state_dict(module.state_dict())
+        assert all(torch.equal(v, replaced.state_dict()[k]) for k, v in module.state_dict().items())
+    assert found[1].cell_px == empty[1].cell_px
