@@ -2,7 +2,8 @@
 
 Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
 spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
-counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue.
+counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. So is the course
+over the frames, unless a frame contradicts it: lamps that warm up change slowly, lamps that are switched do not.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
 Statistics 13, 1985.
@@ -18,6 +19,8 @@ MAX_TERMS = 24
 """Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
 RANK_MARGIN = 1.5
 """Singular values of the drift count from this many times the largest of pure noise."""
+LARGEST_RESIDUAL = 4.0
+"""Standard deviations by which no frame may be off a smooth course; else the course is taken as it was measured."""
 LOG_STRENGTHS = np.linspace(-12.0, 12.0, 97)
 """Tried logarithms of the penalised terms' variance, relative to the noise in the term of median roughness."""
 
@@ -28,44 +31,52 @@ def common_courses(
     basis: Float[np.ndarray, "bands terms"],
     roughness: Float[np.ndarray, "terms"] | None = None,
 ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The curves of all frames as few courses over the session, each with one smooth spectrum; and their variance.
+    """The curves of all frames less the first frame's, from few courses with one spectrum each; and their variance.
 
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
     the first. The variance is to first order that of a truncated singular value decomposition, with the posterior
-    variance of the spectra.
+    variances of spectra and courses.
 
     Args:
-        coefficients: of each frame, its deviation from the mean frame.
+        coefficients: of each frame, in its order in time.
         covariance: of one frame's coefficients; terms with a roughness have an error of their own.
         basis: terms over the bands.
         roughness: of each term, 0 for those that are not penalised; all 0 if not given.
     """
     roughness = np.zeros(len(covariance)) if roughness is None else roughness
     root = np.linalg.cholesky(covariance)
-    left, singular, right = np.linalg.svd(np.linalg.solve(root, coefficients.T).T, full_matrices=False)
+    whitened = np.linalg.solve(root, (coefficients - coefficients.mean(axis=0)).T).T
+    left, singular, right = np.linalg.svd(whitened, full_matrices=False)
     of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
     rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
-    left, spectra = left[:, :rank], singular[:rank, None] * right[:rank]
+    spectra = singular[:rank, None] * right[:rank]
     kept = np.stack([_kept_fraction(spectrum, roughness) for spectrum in spectra])
+    smooth = [_smoother(course) for course in (left * singular).T[:rank]]
+    courses = np.stack([matrix @ course for matrix, course in zip(smooth, left.T, strict=False)], axis=1)
+    courses -= courses[0]
     of_band = basis @ root
-    curves = left @ (kept * spectra) @ of_band.T
-    leverage = np.square(left).sum(axis=1)[:, None]
-    of_spectra = np.square(left) @ kept @ np.square(of_band).T
-    of_amplitudes = np.square(of_band @ (kept * right[:rank]).T).sum(axis=1)
-    return curves, of_spectra + (1.0 - leverage) * of_amplitudes
+    curves = courses @ (kept * spectra) @ of_band.T
+    of_spectra = np.square(courses) @ kept @ np.square(of_band).T
+    # Variance of each course's values less its first one, without what the spectra's variance holds.
+    matrices = np.stack(smooth, axis=1)
+    own = np.diagonal(matrices, axis1=0, axis2=2).T
+    of_courses = own + own[0] - matrices[:, :, 0] - matrices[0].T - np.square(courses)
+    of_amplitudes = of_courses.clip(min=0.0) @ np.square(of_band @ (kept * right[:rank]).T).T
+    return curves, of_spectra + of_amplitudes
 
 
 def smoothing_basis(
-    positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"]
+    positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"], max_terms: int = MAX_TERMS
 ) -> tuple[Float[np.ndarray, "bands terms"], Float[np.ndarray, "terms"]]:
     """The smoothest functions that the data can tell apart, orthonormal under ``precision`` (Demmler-Reinsch basis).
 
     Args:
         positions: of the bands, all different.
         precision: 1 / variance of each band, 0 in bands without a measurement, which are interpolated.
+        max_terms: largest number of functions.
 
     Returns:
-        At most `MAX_TERMS` functions, and the roughness of each, the integral of its squared second derivative.
+        At most ``max_terms`` functions, and the roughness of each, the integral of its squared second derivative.
         The first two, constant and linear, have none.
     """
     order = np.argsort(positions)
@@ -74,7 +85,7 @@ def smoothing_basis(
     weight = np.diag(precision[order])
     penalty *= np.trace(weight) / max(float(np.trace(penalty)), 1e-300)
     told, functions = linalg.eigh(weight, weight + penalty)
-    terms = min(MAX_TERMS, int(np.count_nonzero(precision)))
+    terms = min(max_terms, int(np.count_nonzero(precision)))
     told, functions = told[::-1][:terms], functions[:, ::-1][:, :terms]
     roughness = np.maximum(1.0 / told - 1.0, 0.0)
     roughness[:2] = 0.0
@@ -93,6 +104,16 @@ def _roughness_of_splines(positions: Float[np.ndarray, "bands"]) -> Float[np.nda
     second[inner + 2, inner] = 1.0 / step[1:]
     gram = np.diag((step[:-1] + step[1:]) / 3.0) + np.diag(step[1:-1] / 6.0, 1) + np.diag(step[1:-1] / 6.0, -1)
     return second @ np.linalg.solve(gram, second.T)
+
+
+def _smoother(course: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames frames"]:
+    """Matrix that makes a course with errors of variance 1 smooth; the identity where a frame contradicts that."""
+    identity = np.eye(len(course))
+    basis, roughness = smoothing_basis(np.arange(len(course), dtype=float), np.ones(len(course)), len(course))
+    matrix = (basis * _kept_fraction(basis.T @ course, roughness)) @ basis.T
+    residual = np.abs(course - matrix @ course)
+    freedom = (1.0 - np.diagonal(matrix)).clip(min=1e-9)
+    return matrix if (residual <= LARGEST_RESIDUAL * np.sqrt(freedom)).all() else identity
 
 
 def _kept_fraction(

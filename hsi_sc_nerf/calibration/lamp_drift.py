@@ -125,10 +125,8 @@ def measure_lamp_drift(
     measured[:, lit] = total[:, lit] / total[0, lit]
     log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)
     curve, variance_of_curve = _common_curves(log_light, variance, grey_error, wavelengths_nm, lit)
-    factor = np.exp(curve - curve[0])
-    # The first frame's error is part of all the others.
-    standard_error = SHARED_ERROR * factor * np.sqrt(variance_of_curve + variance_of_curve[0])
-    standard_error[0] = 0.0
+    factor = np.exp(curve)
+    standard_error = SHARED_ERROR * factor * np.sqrt(variance_of_curve)
     polynomials = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
     p_value = drift_p_value(*_fit_with_grey_error(log_light, variance, polynomials[lit], grey_error))
     return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
@@ -211,7 +209,7 @@ def _common_curves(
     wavelengths_nm: Float[np.ndarray, "bands"],
     lit: Bool[np.ndarray, "bands"],
 ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The frames' deviations from their mean as smooth curves over all bands, and the curves' variance."""
+    """The frames' logarithmic light relative to the first frame's as smooth curves over all bands; their variance."""
     precision = np.zeros(len(wavelengths_nm))
     precision[lit] = 1.0 / variance
     basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)
