@@ -61,7 +61,6 @@ SESSIONS: dict[str, tuple[tuple[str, ...], CalibrationConfig]] = {
 WARM_UP = "{lamp_drift: {percent: -5, temperature_change_k: -30}}"
 SCATTERS: dict[str, tuple[float, float]] = {
     "none": (0.0, 0.0),
-    "2 %": (0.02, 0.0),
     "5 %": (0.05, 0.0),
     "10 %": (0.10, 0.0),
     "5 %, and a tenfold value in 2 % of the pixels": (0.05, 0.02),

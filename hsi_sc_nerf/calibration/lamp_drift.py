@@ -40,8 +40,6 @@ change of output and of colour temperature is linear in it, but lamps may lose m
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
-SHARED_ERROR = 1.5
-"""Factor on the standard errors: pixels share errors, such as reflections, that their scatter does not show."""
 SIGNIFICANCE = 0.001
 """p-value below which a drift is significant."""
 
@@ -126,7 +124,7 @@ def measure_lamp_drift(
     log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)
     curve, variance_of_curve = _common_curves(log_light, variance, grey_error, wavelengths_nm, lit)
     factor = np.exp(curve)
-    standard_error = SHARED_ERROR * factor * np.sqrt(variance_of_curve)
+    standard_error = factor * np.sqrt(variance_of_curve)
     polynomials = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
     p_value = drift_p_value(*_fit_with_grey_error(log_light, variance, polynomials[lit], grey_error))
     return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
