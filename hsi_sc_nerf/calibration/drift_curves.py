@@ -2,8 +2,8 @@
 
 Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
 spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
-counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. So is the course
-over the frames, unless a frame contradicts it: lamps that warm up change slowly, lamps that are switched do not.
+counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. The course over the
+frames is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
 Statistics 13, 1985.
@@ -19,6 +19,11 @@ MAX_TERMS = 24
 """Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
 RANK_MARGIN = 1.5
 """Singular values of the drift count from this many times the largest of pure noise."""
+SMOOTH_DIFFERENCES = 3
+"""Order of the differences between frames that are small in a smooth course: the drift of a warm-up is fastest, and
+bends most, in the first frame, which all others are relative to."""
+UNLIKELINESS_MARGIN = 3.84
+"""A course is made no smoother than the roughest one that a likelihood-ratio test (95 %) allows."""
 LARGEST_RESIDUAL = 4.0
 """Standard deviations by which no frame may be off a smooth course; else the course is taken as it was measured."""
 LOG_STRENGTHS = np.linspace(-12.0, 12.0, 97)
@@ -66,17 +71,16 @@ def common_courses(
 
 
 def smoothing_basis(
-    positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"], max_terms: int = MAX_TERMS
+    positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"]
 ) -> tuple[Float[np.ndarray, "bands terms"], Float[np.ndarray, "terms"]]:
     """The smoothest functions that the data can tell apart, orthonormal under ``precision`` (Demmler-Reinsch basis).
 
     Args:
         positions: of the bands, all different.
         precision: 1 / variance of each band, 0 in bands without a measurement, which are interpolated.
-        max_terms: largest number of functions.
 
     Returns:
-        At most ``max_terms`` functions, and the roughness of each, the integral of its squared second derivative.
+        At most `MAX_TERMS` functions, and the roughness of each, the integral of its squared second derivative.
         The first two, constant and linear, have none.
     """
     order = np.argsort(positions)
@@ -85,7 +89,7 @@ def smoothing_basis(
     weight = np.diag(precision[order])
     penalty *= np.trace(weight) / max(float(np.trace(penalty)), 1e-300)
     told, functions = linalg.eigh(weight, weight + penalty)
-    terms = min(max_terms, int(np.count_nonzero(precision)))
+    terms = min(MAX_TERMS, int(np.count_nonzero(precision)))
     told, functions = told[::-1][:terms], functions[:, ::-1][:, :terms]
     roughness = np.maximum(1.0 / told - 1.0, 0.0)
     roughness[:2] = 0.0
@@ -109,27 +113,30 @@ def _roughness_of_splines(positions: Float[np.ndarray, "bands"]) -> Float[np.nda
 def _smoother(course: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames frames"]:
     """Matrix that makes a course with errors of variance 1 smooth; the identity where a frame contradicts that."""
     identity = np.eye(len(course))
-    basis, roughness = smoothing_basis(np.arange(len(course), dtype=float), np.ones(len(course)), len(course))
-    matrix = (basis * _kept_fraction(basis.T @ course, roughness)) @ basis.T
+    differences = np.diff(identity, SMOOTH_DIFFERENCES, axis=0)
+    roughness, basis = np.linalg.eigh(differences.T @ differences)
+    roughness[:SMOOTH_DIFFERENCES] = 0.0
+    matrix = (basis * _kept_fraction(basis.T @ course, roughness, UNLIKELINESS_MARGIN)) @ basis.T
     residual = np.abs(course - matrix @ course)
     freedom = (1.0 - np.diagonal(matrix)).clip(min=1e-9)
     return matrix if (residual <= LARGEST_RESIDUAL * np.sqrt(freedom)).all() else identity
 
 
 def _kept_fraction(
-    spectrum: Float[np.ndarray, "terms"], roughness: Float[np.ndarray, "terms"]
+    coefficients: Float[np.ndarray, "terms"], roughness: Float[np.ndarray, "terms"], margin: float = 0.0
 ) -> Float[np.ndarray, "terms"]:
     """Fraction of each coefficient that is signal and not noise of variance 1.
 
     The coefficients of penalised terms are taken to be normal with a variance that falls with their roughness. Its
-    scale is the most likely one.
+    scale is the largest whose -2 log likelihood is by at most ``margin`` above that of the most likely one.
     """
     penalised = roughness > 0.0
     if not penalised.any():
-        return np.ones_like(spectrum)
+        return np.ones_like(coefficients)
     relative = roughness[penalised] / np.median(roughness[penalised])
     total = 1.0 + np.exp(LOG_STRENGTHS)[:, None] / relative
-    unlikeliness = (np.log(total) + spectrum[penalised] ** 2 / total).sum(axis=1)
-    kept = np.ones_like(spectrum)
-    kept[penalised] = 1.0 - 1.0 / total[int(np.argmin(unlikeliness))]
+    unlikeliness = (np.log(total) + coefficients[penalised] ** 2 / total).sum(axis=1)
+    kept = np.ones_like(coefficients)
+    likely = np.flatnonzero(unlikeliness <= unlikeliness.min() + margin)
+    kept[penalised] = 1.0 - 1.0 / total[likely[-1]]
     return kept
