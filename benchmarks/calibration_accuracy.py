@@ -66,7 +66,6 @@ SCATTERS: dict[str, tuple[float, float]] = {
     "5 %, and a tenfold value in 2 % of the pixels": (0.05, 0.02),
 }
 """Scatter of a pixel's light (standard deviation), and fraction of the pixels that are fireflies."""
-DRIFT_SEEDS = (0, 1, 2)
 DRIFT_COLUMNS = [
     "session",
     "scatter of a pixel",
@@ -106,8 +105,10 @@ class CalibrationAccuracy:
     """Frames of a session."""
     tables: tuple[Literal["accuracy", "drift"], ...] = ("accuracy", "drift")
     """Which tables."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the second table's simulated sessions."""
     path_traced: tuple[Path, ...] = ()
-    """Path-traced sessions for a row of the second table."""
+    """Path-traced sessions for a row of the second table, in the order of their seeds."""
     results: Path = RESULTS
     """Folder of the CSV files."""
 
@@ -122,7 +123,7 @@ class CalibrationAccuracy:
     def measure_drift(self) -> None:
         """Measure drift on noisy sessions whose light scatters more and more, and on path-traced ones."""
         measured: dict[tuple[str, str], list[Drift]] = {}
-        for seed in track(DRIFT_SEEDS, "scattering"):
+        for seed in track(self.seeds, "scattering"):
             for name, drift in self._scattered(seed).items():
                 measured.setdefault((self.scene, name), []).append(drift)
         for session in track(self.path_traced, "path-traced"):
@@ -130,9 +131,9 @@ class CalibrationAccuracy:
             opened = open_session(session)
             light = np.stack([truth.drift[capture.name] for capture in opened.frames])
             drift = calibrate_session(opened, PLAIN).drift
-            measured.setdefault(("path-traced", "5 %, of colours 1 %"), []).append((drift, light / light[0]))
+            measured.setdefault(("path-traced", "5 %"), []).append((drift, light / light[0]))
         for names, drifts in measured.items():
-            seeds = ", ".join(map(str, DRIFT_SEEDS[: len(drifts)]))
+            seeds = ", ".join(map(str, self.seeds if names[0] == self.scene else range(len(drifts))))
             row = [*names, *_drift_cells(drifts)]
             write_results("drift_accuracy", DRIFT_COLUMNS, [row], keys=2, seed=seeds, folder=self.results)
 
