@@ -19,6 +19,8 @@ MAX_TERMS = 24
 """Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
 RANK_MARGIN = 1.5
 """Singular values of the drift count from this many times the largest of pure noise."""
+FREE_TERMS = 2
+"""The first terms, constant and linear over 1 / wavelength: a lamp's output and its temperature."""
 SMOOTH_DIFFERENCES = 3
 """Order of the differences between frames that are small in a smooth course: the drift of a warm-up is fastest, and
 bends most, in the first frame, which all others are relative to."""
@@ -40,7 +42,8 @@ def common_courses(
 
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
     the first. The variance is to first order that of a truncated singular value decomposition, with the posterior
-    variances of spectra and courses.
+    variance of the spectra, and with that of the courses before they are made smooth: the data do not tell well how
+    much that gains. It has the variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
         coefficients: of each frame, in its order in time.
@@ -56,18 +59,16 @@ def common_courses(
     rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
     spectra = singular[:rank, None] * right[:rank]
     kept = np.stack([_kept_fraction(spectrum, roughness) for spectrum in spectra])
-    smooth = [_smoother(course) for course in (left * singular).T[:rank]]
-    courses = np.stack([matrix @ course for matrix, course in zip(smooth, left.T, strict=False)], axis=1)
+    courses = np.stack([_smoother(s * u) @ u for s, u in zip(singular[:rank], left.T, strict=False)], axis=1)
     courses -= courses[0]
     of_band = basis @ root
     curves = courses @ (kept * spectra) @ of_band.T
     of_spectra = np.square(courses) @ kept @ np.square(of_band).T
-    # Variance of each course's values less its first one, without what the spectra's variance holds.
-    matrices = np.stack(smooth, axis=1)
-    own = np.diagonal(matrices, axis1=0, axis2=2).T
-    of_courses = own + own[0] - matrices[:, :, 0] - matrices[0].T - np.square(courses)
-    of_amplitudes = of_courses.clip(min=0.0) @ np.square(of_band @ (kept * right[:rank]).T).T
-    return curves, of_spectra + of_amplitudes
+    # Of a value less the first one, without what the spectra's variance holds.
+    of_courses = 2.0 - np.square(left[:, :rank] - left[0, :rank]).sum(axis=1)
+    of_courses[0] = 0.0
+    directions = np.linalg.qr(np.concatenate([kept * right[:rank], np.eye(len(root))[:FREE_TERMS]]).T)[0]
+    return curves, of_spectra + np.outer(of_courses, np.square(of_band @ directions).sum(axis=1))
 
 
 def smoothing_basis(
