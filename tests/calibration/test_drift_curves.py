@@ -25,7 +25,7 @@ COURSES = {
     ("name", "of_one_frame"), [("ramp", 0.2), ("warm-up", 0.35), ("flicker", 0.45), ("switched", 0.45)]
 )
 def test_frames_tell_course_and_spectrum_of_the_drift_together(name, of_one_frame):
-    """Errors are far smaller than that of each frame by itself, more so where the course is smooth, and not above what is stated."""
+    """Errors are far smaller than that of each frame by itself, and not above what is stated."""
     rng = np.random.default_rng(6)
     basis = smooth_basis(WAVELENGTHS_NM, np.ones(BANDS, bool), 3)
     covariance = np.diag([1.0, 2.0, 4.0, 8.0]) * 1e-6
