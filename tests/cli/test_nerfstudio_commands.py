@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
-import subprocess
 import sys
-import time
-from pathlib import Path
-from urllib.error import URLError
-from urllib.request import urlopen
 
 import ball_run
 import pytest
-import small_trainer
 import torch
 import tyro
 
@@ -143,54 +136,6 @@ def ns_train(tmp_path, monkeypatch):
 
     monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
     return called
-
-
-def answer(address, told):
-    """What a server says once it is up and says ``told``."""
-    for _ in range(240):
-        try:
-            text = urlopen(address, timeout=60).read().decode()
-        except URLError:
-            text = ""
-        if told in text:
-            return text
-        time.sleep(1)
-    pytest.fail(f"{address} does not say {told!r}: {text[:500]!r}")
-
-
-def test_viewer_opens_a_run(config_path):
-    with socket.socket() as free:
-        free.bind(("", 0))
-        port = str(free.getsockname()[1])
-    program = Path(sys.executable).with_name("ns-viewer")
-    viewer = subprocess.Popen([program, "--load-config", config_path, "--viewer.websocket-port", port])
-    try:
-        assert "<title>" in answer(f"http://localhost:{port}", "<html")
-        assert viewer.poll() is None
-    finally:
-        viewer.terminate()
-        viewer.wait()
-
-
-def test_viewer_of_no_run_is_one_sentence(tmp_path):
-    from nerfstudio.scripts.viewer import run_viewer
-
-    extend_nerfstudio_commands()
-    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*nowhere[^\n]*\.$"):
-        tyro.cli(run_viewer.RunViewer, args=["--load-config", str(tmp_path / "nowhere.yml")]).main()
-
-
-def test_tensorboard_shows_what_a_run_wrote(tiny_dataset, tmp_path, monkeypatch):
-    from tensorboard.program import TensorBoard
-
-    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
-    made = small_trainer.trainer(tiny_dataset, tmp_path)
-    made.config.logging.steps_per_log = 1
-    made.train()
-    board = TensorBoard()
-    board.configure(argv=["tensorboard", "--logdir", str(tmp_path), "--port", "0"])
-    (tags,) = json.loads(answer(f"{board.launch()}data/plugin/scalars/tags", "Train Loss")).values()
-    assert {"Train Loss", "Train Metrics Dict/sam", "learning_rate/fields"} <= set(tags)
 
 
 def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path, ns_train, monkeypatch):
