@@ -1,23 +1,29 @@
 """Accuracy of calibrated reflectance on simulated sessions, as a table.
 
     uv run python benchmarks/calibration_accuracy.py --pictures docs/images
+    uv run python benchmarks/calibration_accuracy.py --tables drift --path-traced SESSION_0 SESSION_1 SESSION_2
 
 Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them. A
-second table has the error of the lamps' drift if the light of each pixel scatters from frame to frame.
+second table has the error of the lamps' drift, and how well its stated error tells it, if the light of each pixel
+scatters from frame to frame. Its path-traced sessions are made by benchmarks/independent_session.py, each with a
+--seed of its own.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
 from jaxtyping import Float, UInt16
 from results_table import RESULTS, write_results
 from rich.progress import track
+from session_mistakes import SessionTruth
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
@@ -55,20 +61,21 @@ SESSIONS: dict[str, tuple[tuple[str, ...], CalibrationConfig]] = {
 WARM_UP = "{lamp_drift: {percent: -5, temperature_change_k: -30}}"
 SCATTERS: dict[str, tuple[float, float]] = {
     "none": (0.0, 0.0),
-    "2 %": (0.02, 0.0),
     "5 %": (0.05, 0.0),
-    "6 %": (0.06, 0.0),
-    "10 %": (0.1, 0.0),
+    "10 %": (0.10, 0.0),
     "5 %, and a tenfold value in 2 % of the pixels": (0.05, 0.02),
 }
-"""Scatter of a pixel's light in a frame, common to all bands (standard deviation), and fraction of fireflies."""
-SCATTER_COLUMNS = [
+"""Scatter of a pixel's light (standard deviation), and fraction of the pixels that are fireflies."""
+DRIFT_COLUMNS = [
+    "session",
     "scatter of a pixel",
     "static pixels",
     "drift, RMS %",
     "worst band, RMS %",
     "largest error, %",
     "error / stated error",
+    "within one, %",
+    "within two, %",
 ]
 COLUMNS = [
     "session",
@@ -78,6 +85,10 @@ COLUMNS = [
     "lamps' drift, RMS %",
     "flagged, %",
 ]
+
+
+Drift = tuple[LampDriftEstimate | NotMeasurable, Float[np.ndarray, "frames bands"]]
+"""Measured and true light relative to the first frame."""
 
 
 @dataclass(frozen=True)
@@ -92,33 +103,58 @@ class CalibrationAccuracy:
     """Width and height of the frames, pixels."""
     frames: int = 12
     """Frames of a session."""
+    tables: tuple[Literal["accuracy", "drift"], ...] = ("accuracy", "drift")
+    """Which tables."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the second table's simulated sessions."""
+    path_traced: tuple[Path, ...] = ()
+    """Path-traced sessions for a row of the second table, in the order of their seeds."""
     results: Path = RESULTS
-    """Folder of the CSV file."""
+    """Folder of the CSV files."""
 
     def main(self) -> None:
-        """Measure, print the table, write it."""
-        rows = [[name, *_cells(self._score(*case))] for name, case in track(SESSIONS.items(), "calibrating")]
-        write_results("calibration_accuracy", COLUMNS, rows, folder=self.results)
-        self.measure_scatter()
+        """Measure, print the tables, write them."""
+        if "accuracy" in self.tables:
+            rows = [[name, *_cells(self._score(*case))] for name, case in track(SESSIONS.items(), "calibrating")]
+            write_results("calibration_accuracy", COLUMNS, rows, folder=self.results)
+        if "drift" in self.tables:
+            self.measure_drift()
 
-    def measure_scatter(self) -> None:
-        """Measure drift on one noisy session whose light scatters more and more, and write that table."""
-        scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=(WARM_UP, *NOISE))
+    def measure_drift(self) -> None:
+        """Measure drift on noisy sessions whose light scatters more and more, and on path-traced ones."""
+        measured: dict[tuple[str, str], list[Drift]] = {}
+        for seed in track(self.seeds, "scattering"):
+            for name, drift in self._scattered(seed).items():
+                measured.setdefault((self.scene, name), []).append(drift)
+        for session in track(self.path_traced, "path-traced"):
+            truth = SessionTruth.of(session)
+            opened = open_session(session)
+            light = np.stack([truth.drift[capture.name] for capture in opened.frames])
+            drift = calibrate_session(opened, PLAIN).drift
+            measured.setdefault(("path-traced", "5 %"), []).append((drift, light / light[0]))
+        for names, drifts in measured.items():
+            seeds = ", ".join(map(str, self.seeds if names[0] == self.scene else range(len(drifts))))
+            row = [*names, *_drift_cells(drifts)]
+            write_results("drift_accuracy", DRIFT_COLUMNS, [row], keys=2, seed=seeds, folder=self.results)
+
+    def _scattered(self, seed: int) -> dict[str, Drift]:
+        """Measured and true drift of one session, by the scatter that is added to it."""
+        effects = (WARM_UP, *NOISE)
+        scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects, seed=seed)
         folder = Path(tempfile.mkdtemp())
         try:
             session = open_session(simulate_session(scene, folder / "session", progress=False))
             truth = load_truth(session.path)
             light = np.stack([lamp_output(truth, capture.name) for capture in session.frames])
             original = [capture.cube.read() for capture in session.frames]
-            rows = []
-            for name, strength in track(SCATTERS.items(), "scattering"):
+            drifts = {}
+            for name, strength in SCATTERS.items():
                 for number, capture in enumerate(session.frames):
-                    _scatter(capture, original[number], *strength, seed=number)
-                drift = calibrate_session(session, PLAIN).drift
-                rows.append([name, *_drift_cells(drift, light / light[0])])
+                    _scatter(capture, original[number], *strength, seed=1000 * seed + number)
+                drifts[name] = calibrate_session(session, PLAIN).drift, light / light[0]
         finally:
             shutil.rmtree(folder)
-        write_results("drift_with_scatter", SCATTER_COLUMNS, rows, folder=self.results)
+        return drifts
 
     def _score(self, effects: tuple[str, ...], config: CalibrationConfig) -> CalibrationScore:
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects)
@@ -164,13 +200,18 @@ def _scatter(
     )
 
 
-def _drift_cells(drift: LampDriftEstimate | NotMeasurable, true: Float[np.ndarray, "frames bands"]) -> list[str]:
-    if isinstance(drift, NotMeasurable):
-        return ["0", "-", "-", "-", "-"]
-    error = drift.factor / true - 1.0
-    ratio = (error / np.maximum(drift.standard_error, 1e-9))[1:]
-    percent = (_rms(error), np.sqrt(np.square(error).mean(axis=0)).max(), np.abs(error).max())
-    return [str(int(drift.static.sum())), *(f"{100.0 * value:.3f}" for value in percent), f"{_rms(ratio):.2f}"]
+def _drift_cells(drifts: Sequence[Drift]) -> list[str]:
+    """Cells after the names, over all sessions of a row; stated errors are judged in all frames but the first."""
+    found = [(drift, true) for drift, true in drifts if isinstance(drift, LampDriftEstimate)]
+    if len(found) < len(drifts):
+        return ["0", *["not measured"] * (len(DRIFT_COLUMNS) - 3)]
+    error = np.stack([drift.factor / true - 1.0 for drift, true in found])
+    stated = np.stack([drift.standard_error / true for drift, true in found])
+    ratio = np.abs(error[:, 1:] / stated[:, 1:])
+    percent = (_rms(error), np.sqrt(np.square(error).mean(axis=(0, 1))).max(), np.abs(error).max())
+    within = [f"{100.0 * (ratio <= sigmas).mean():.0f}" for sigmas in (1.0, 2.0)]
+    pixels = np.mean([drift.static.sum() for drift, _ in found])
+    return [f"{pixels:.0f}", *(f"{100.0 * value:.3f}" for value in percent), f"{_rms(ratio):.2f}", *within]
 
 
 def _rms(values: Float[np.ndarray, "*shape"]) -> float:

@@ -162,10 +162,11 @@ def dark_columns(
 def pooled_darks(
     darks: Sequence[Float[np.ndarray, "columns bands"]], readings: int, read_noise: Float[np.ndarray, "bands"]
 ) -> list[Float[np.ndarray, "columns bands"]]:
-    """The frames' dark counts with the pattern of the columns that all frames share, and each frame's own level.
+    """The frames' dark counts with the pattern of columns and bands that all share, and each frame's own level.
 
-    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame. The frames' darks are
-    kept as they are if their patterns differ by more than noise.
+    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame, and that of a band's
+    level is in all its pixels. A frame's level is one offset of all bands, or has a value in each band where the
+    frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
 
     Args:
         darks: `dark_columns` of each frame.
@@ -175,13 +176,17 @@ def pooled_darks(
     if len(darks) < 2 or len({dark.shape for dark in darks}) > 1 or len(darks[0]) < 2:
         return list(darks)
     stacked = np.stack(darks)
+    frames, columns, bands = stacked.shape
     level = stacked.mean(axis=1, keepdims=True)
     pattern = (stacked - level).mean(axis=0)
-    free = (1.0 - 1.0 / stacked.shape[0]) * (1.0 - 1.0 / stacked.shape[1])
-    expected = free * read_noise**2 / readings
-    variance = np.median(np.square(stacked - level - pattern).mean(axis=0), axis=0)
-    if np.median(variance / np.maximum(expected, 1e-12)) > SAME_PATTERN:
+    expected = np.maximum((1.0 - 1.0 / frames) * read_noise**2 / readings, 1e-12)
+    of_columns = np.median(np.square(stacked - level - pattern).mean(axis=0), axis=0) / (1.0 - 1.0 / columns)
+    if np.median(of_columns / expected) > SAME_PATTERN:
         return list(darks)
+    offset = level.mean(axis=2, keepdims=True)
+    of_bands = np.square(level - offset - (level - offset).mean(axis=0)).mean(axis=0)[0]
+    if bands > 1 and np.mean(of_bands * columns / expected) / (1.0 - 1.0 / bands) <= SAME_PATTERN:
+        pattern, level = (stacked - offset).mean(axis=0), offset
     return list(level + pattern)
 
 

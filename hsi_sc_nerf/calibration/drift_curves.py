@@ -2,7 +2,8 @@
 
 Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
 spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
-counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue.
+counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. The course over the
+frames is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
 Statistics 13, 1985.
@@ -18,6 +19,15 @@ MAX_TERMS = 24
 """Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
 RANK_MARGIN = 1.5
 """Singular values of the drift count from this many times the largest of pure noise."""
+FREE_TERMS = 2
+"""The first terms, constant and linear over 1 / wavelength: a lamp's output and its temperature."""
+SMOOTH_DIFFERENCES = 3
+"""Order of the differences between frames that are small in a smooth course: the drift of a warm-up is fastest, and
+bends most, in the first frame, which all others are relative to."""
+UNLIKELINESS_MARGIN = 3.84
+"""A course is made no smoother than the roughest one that a likelihood-ratio test (95 %) allows."""
+LARGEST_RESIDUAL = 4.0
+"""Standard deviations by which no frame may be off a smooth course; else the course is taken as it was measured."""
 LOG_STRENGTHS = np.linspace(-12.0, 12.0, 97)
 """Tried logarithms of the penalised terms' variance, relative to the noise in the term of median roughness."""
 
@@ -28,31 +38,37 @@ def common_courses(
     basis: Float[np.ndarray, "bands terms"],
     roughness: Float[np.ndarray, "terms"] | None = None,
 ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The curves of all frames as few courses over the session, each with one smooth spectrum; and their variance.
+    """The curves of all frames less the first frame's, from few courses with one spectrum each; and their variance.
 
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
     the first. The variance is to first order that of a truncated singular value decomposition, with the posterior
-    variance of the spectra.
+    variance of the spectra, and with that of the courses before they are made smooth: the data do not tell well how
+    much that gains. It has the variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
-        coefficients: of each frame, its deviation from the mean frame.
+        coefficients: of each frame, in its order in time.
         covariance: of one frame's coefficients; terms with a roughness have an error of their own.
         basis: terms over the bands.
         roughness: of each term, 0 for those that are not penalised; all 0 if not given.
     """
     roughness = np.zeros(len(covariance)) if roughness is None else roughness
     root = np.linalg.cholesky(covariance)
-    left, singular, right = np.linalg.svd(np.linalg.solve(root, coefficients.T).T, full_matrices=False)
+    whitened = np.linalg.solve(root, (coefficients - coefficients.mean(axis=0)).T).T
+    left, singular, right = np.linalg.svd(whitened, full_matrices=False)
     of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
     rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
-    left, spectra = left[:, :rank], singular[:rank, None] * right[:rank]
+    spectra = singular[:rank, None] * right[:rank]
     kept = np.stack([_kept_fraction(spectrum, roughness) for spectrum in spectra])
+    courses = np.stack([_smoother(s * u) @ u for s, u in zip(singular[:rank], left.T, strict=False)], axis=1)
+    courses -= courses[0]
     of_band = basis @ root
-    curves = left @ (kept * spectra) @ of_band.T
-    leverage = np.square(left).sum(axis=1)[:, None]
-    of_spectra = np.square(left) @ kept @ np.square(of_band).T
-    of_amplitudes = np.square(of_band @ (kept * right[:rank]).T).sum(axis=1)
-    return curves, of_spectra + (1.0 - leverage) * of_amplitudes
+    curves = courses @ (kept * spectra) @ of_band.T
+    of_spectra = np.square(courses) @ kept @ np.square(of_band).T
+    # Of a value less the first one, without what the spectra's variance holds.
+    of_courses = 2.0 - np.square(left[:, :rank] - left[0, :rank]).sum(axis=1)
+    of_courses[0] = 0.0
+    directions = np.linalg.qr(np.concatenate([kept * right[:rank], np.eye(len(root))[:FREE_TERMS]]).T)[0]
+    return curves, of_spectra + np.outer(of_courses, np.square(of_band @ directions).sum(axis=1))
 
 
 def smoothing_basis(
@@ -95,20 +111,33 @@ def _roughness_of_splines(positions: Float[np.ndarray, "bands"]) -> Float[np.nda
     return second @ np.linalg.solve(gram, second.T)
 
 
+def _smoother(course: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames frames"]:
+    """Matrix that makes a course with errors of variance 1 smooth; the identity where a frame contradicts that."""
+    identity = np.eye(len(course))
+    differences = np.diff(identity, SMOOTH_DIFFERENCES, axis=0)
+    roughness, basis = np.linalg.eigh(differences.T @ differences)
+    roughness[:SMOOTH_DIFFERENCES] = 0.0
+    matrix = (basis * _kept_fraction(basis.T @ course, roughness, UNLIKELINESS_MARGIN)) @ basis.T
+    residual = np.abs(course - matrix @ course)
+    freedom = (1.0 - np.diagonal(matrix)).clip(min=1e-9)
+    return matrix if (residual <= LARGEST_RESIDUAL * np.sqrt(freedom)).all() else identity
+
+
 def _kept_fraction(
-    spectrum: Float[np.ndarray, "terms"], roughness: Float[np.ndarray, "terms"]
+    coefficients: Float[np.ndarray, "terms"], roughness: Float[np.ndarray, "terms"], margin: float = 0.0
 ) -> Float[np.ndarray, "terms"]:
     """Fraction of each coefficient that is signal and not noise of variance 1.
 
     The coefficients of penalised terms are taken to be normal with a variance that falls with their roughness. Its
-    scale is the most likely one.
+    scale is the largest whose -2 log likelihood is by at most ``margin`` above that of the most likely one.
     """
     penalised = roughness > 0.0
     if not penalised.any():
-        return np.ones_like(spectrum)
+        return np.ones_like(coefficients)
     relative = roughness[penalised] / np.median(roughness[penalised])
     total = 1.0 + np.exp(LOG_STRENGTHS)[:, None] / relative
-    unlikeliness = (np.log(total) + spectrum[penalised] ** 2 / total).sum(axis=1)
-    kept = np.ones_like(spectrum)
-    kept[penalised] = 1.0 - 1.0 / total[int(np.argmin(unlikeliness))]
+    unlikeliness = (np.log(total) + coefficients[penalised] ** 2 / total).sum(axis=1)
+    kept = np.ones_like(coefficients)
+    likely = np.flatnonzero(unlikeliness <= unlikeliness.min() + margin)
+    kept[penalised] = 1.0 - 1.0 / total[likely[-1]]
     return kept

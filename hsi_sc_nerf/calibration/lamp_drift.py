@@ -40,8 +40,8 @@ change of output and of colour temperature is linear in it, but lamps may lose m
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
-SHARED_ERROR = 1.5
-"""Factor on the standard errors: pixels share errors, such as reflections, that their scatter does not show."""
+SMALLEST_ERROR = 5e-5
+"""Relative standard error that is stated at least: rounding of counts, and wavelengths that a smooth curve misses."""
 SIGNIFICANCE = 0.001
 """p-value below which a drift is significant."""
 
@@ -125,9 +125,8 @@ def measure_lamp_drift(
     measured[:, lit] = total[:, lit] / total[0, lit]
     log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)
     curve, variance_of_curve = _common_curves(log_light, variance, grey_error, wavelengths_nm, lit)
-    factor = np.exp(curve - curve[0])
-    # The first frame's error is part of all the others.
-    standard_error = SHARED_ERROR * factor * np.sqrt(variance_of_curve + variance_of_curve[0])
+    factor = np.exp(curve)
+    standard_error = factor * np.sqrt(variance_of_curve + SMALLEST_ERROR**2)
     standard_error[0] = 0.0
     polynomials = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
     p_value = drift_p_value(*_fit_with_grey_error(log_light, variance, polynomials[lit], grey_error))
@@ -149,6 +148,8 @@ def survey_lines(lines: int, samples: int) -> Int[np.ndarray, "survey"]:
     They are twice as dense towards the edges of the image, where the chamber is most likely to be visible.
     """
     count = min(lines, max(MIN_LINES, round(SURVEY_FRACTION * lines), -(-SURVEY_PIXELS // samples)))
+    if count == lines:
+        return np.arange(lines)
     even = np.linspace(0.0, 1.0, count)
     denser = even - np.sin(2.0 * np.pi * even) / (4.0 * np.pi)
     return np.unique((denser * (lines - 1)).round().astype(int))
@@ -211,7 +212,7 @@ def _common_curves(
     wavelengths_nm: Float[np.ndarray, "bands"],
     lit: Bool[np.ndarray, "bands"],
 ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The frames' deviations from their mean as smooth curves over all bands, and the curves' variance."""
+    """The frames' logarithmic light relative to the first frame's as smooth curves over all bands; their variance."""
     precision = np.zeros(len(wavelengths_nm))
     precision[lit] = 1.0 / variance
     basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)

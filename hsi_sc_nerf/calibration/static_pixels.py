@@ -43,8 +43,8 @@ AVERAGED_PX, AVERAGED_TOLERANCE = 32, 0.005
 """Neighbouring pixels over which scatter must average out, and what may be left (relative): the object's reflections
 on to the wall."""
 REGIONS = 4
-"""Rows and columns of regions of the image whose means tell the error of the common course: what changes the light on
-many neighbours does not average out."""
+"""Rows and columns of regions, with equally many static pixels each, whose means tell the error of the common course:
+what changes the light on many neighbours does not average out."""
 MAX_BLOCKS, MAX_VOTERS = 64, 1024
 """Largest numbers of candidates, and of pixels that vote for them."""
 ROUNDS = 5
@@ -153,8 +153,7 @@ def grey_deviation(
         The deviations (natural logarithm); their scatter (standard deviation); and the standard error of a frame's
         mean, from the means of regions of the image.
     """
-    line, sample = np.nonzero(static)
-    region = line * REGIONS // static.shape[0] * REGIONS + sample * REGIONS // static.shape[1]
+    region = _equal_regions(static)
     chosen, frames = courses.select(static.ravel()), len(common)
     for _ in range(ROUNDS):
         deviation, _ = chosen.relative_to(common)
@@ -165,14 +164,20 @@ def grey_deviation(
     deviation, _ = chosen.relative_to(common)
     limit = HUBER * np.sqrt(variance)[:, None]
     limited = deviation.clip(-limit, limit)
-    members = np.bincount(region)
-    occupied = members > 0
-    means = np.stack([np.bincount(region, of_frame)[occupied] for of_frame in limited.T]) / members[occupied]
-    share = members[occupied] / members.sum()
-    free_regions, free_frames = max(1.0 / np.square(share).sum() - 1.0, 0.5), (frames - 1) / frames
+    means = np.stack([np.bincount(region, of_frame) for of_frame in limited.T]) / np.bincount(region)
+    free = max(means.shape[1] - 1.0, 0.5) * (frames - 1) / frames
     inside = float((np.abs(deviation) < limit).mean())
-    error = np.sqrt((means**2 @ share).mean() / free_regions / free_frames) / inside
+    error = np.sqrt(np.square(means).mean() / free) / inside
     return deviation, scatter, float(error)
+
+
+def _equal_regions(static: Bool[np.ndarray, "lines samples"]) -> Int[np.ndarray, "static"]:
+    """Number of the region of each static pixel, in reading order: rows of equally many, cut into as many parts."""
+    sample = np.nonzero(static)[1]
+    row = np.arange(len(sample)) * REGIONS // len(sample)
+    region = np.empty_like(row)
+    region[np.lexsort((sample, row))] = np.arange(len(sample)) * REGIONS**2 // len(sample)
+    return region
 
 
 def _static_with_scatter(

@@ -33,11 +33,16 @@ DIFFERENT_AMBER, DIFFERENT_RED = 1.5, 2.7
 stay below 1.3; a camera moved by 2 of 128 pixels gives 2.3; another kind of fruit 3.5 to 8."""
 
 
-def check_files(session: Session) -> list[Finding]:
-    """The findings ``frames``, ``damaged``, ``dates``, ``integration-times`` and ``binning``."""
+def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
+    """The findings ``frames``, ``damaged``, ``dates``, ``integration-times`` and ``binning``.
+
+    Args:
+        session: the session.
+        skip_damaged: whether the user has chosen to do without damaged captures.
+    """
     return [
         _frames(session),
-        *_damaged(session),
+        *_damaged(session, skip_damaged),
         _same(
             session,
             "dates",
@@ -101,9 +106,12 @@ def _frames(session: Session) -> Finding:
     return Finding("frames", level, "; ".join(parts) + ".", values)
 
 
-def _damaged(session: Session) -> list[Finding]:
+def _damaged(session: Session, skip_damaged: bool) -> list[Finding]:
     if not session.damaged:
         return []
+    if skip_damaged:
+        sentence = f"Damaged, and left out by --skip-damaged: {in_short(session.damaged)}."
+        return [Finding("damaged", "amber", sentence, dict(session.damaged))]
     sentence = (
         f"{session.path}: {in_short(session.damaged)} cannot be used; copy the captures again, or leave them out "
         "with --skip-damaged."

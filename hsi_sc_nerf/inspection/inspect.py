@@ -68,6 +68,7 @@ def inspect_session(
     poses: PoseMethod = "auto",
     scale_known: bool = False,
     white_source: Literal["auto"] | WhiteSource = "auto",
+    skip_damaged: bool = False,
 ) -> Inspection:
     """Check a session before anything is computed from it; a few lines and bands of each cube are read.
 
@@ -76,6 +77,7 @@ def inspect_session(
         poses: how poses will be found; without a scale, "auto" and "markers" are red.
         scale_known: whether something beside ``session.json`` gives the scale.
         white_source: where the white is.
+        skip_damaged: whether the user has chosen to do without damaged captures.
 
     Raises:
         InputError: the session does not have that source of white, a cube cannot be read, or ``session.json`` names
@@ -90,7 +92,7 @@ def inspect_session(
     session, upright = _upright(session, markers)
     suggested = filled_in(session, markers)
     findings = [
-        *check_files(session),
+        *check_files(session, skip_damaged),
         *check_white(session, white_source),
         *check_frames(session, looks, markers.detections),
         *check_markers(session, markers),

@@ -135,8 +135,7 @@ def process_session(
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
     inspection = _inspect(session, config, console)
     session = inspection.session
-    # Damaged captures are refused as the session is opened, unless the user leaves them out.
-    checks = SessionChecks(inspection, ("damaged", *config.accept), output_dir)
+    checks = SessionChecks(inspection, config.accept, output_dir)
     _remove_transforms(output_dir)
     checks.write()
 
@@ -207,7 +206,9 @@ def _inspect(session: Session, config: ProcessConfig, console: Console) -> Inspe
     """The findings of `inspect_session`, with the session upright; print a ``session.json`` where one is missing."""
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
-        inspection = inspect_session(session, config.poses, scale_known, config.calibration.white_source)
+        inspection = inspect_session(
+            session, config.poses, scale_known, config.calibration.white_source, config.skip_damaged
+        )
     no_scale = any(finding.name == "scale" and finding.level == "red" for finding in inspection.findings)
     if no_scale and not session.info_path.is_file():
         console.print(suggestion(session, inspection.session_json), highlight=False)

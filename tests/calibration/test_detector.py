@@ -244,6 +244,17 @@ def test_pooled_darks_have_less_noise_and_each_frames_level():
     np.testing.assert_allclose((pooled - true).mean(axis=1), 0.0, atol=0.6)
 
 
+@pytest.mark.parametrize(("change_of_bands", "remaining"), [(0.0, 0.3), (1.0, 1.0)])
+def test_an_offset_is_pooled_over_the_bands_and_levels_of_bands_are_kept(change_of_bands, remaining):
+    rng, shape = np.random.default_rng(4), (12, 40, 60)
+    true = np.linspace(90.0, 92.0, 12)[:, None, None] + rng.normal(0.0, 5.0, (1, *shape[1:]))
+    true = true + change_of_bands * rng.standard_normal((12, 1, 60))
+    darks = list(true + rng.normal(0.0, 4.0 / np.sqrt(16), shape))
+    pooled = np.stack(pooled_darks(darks, 16, np.full(60, 4.0)))
+    of_one_level = 4.0 / np.sqrt(16 * 40)
+    assert np.std((pooled - true).mean(axis=1)) == pytest.approx(remaining * of_one_level, rel=0.15)
+
+
 def test_darks_whose_pattern_changes_are_kept():
     darks, _ = darks_of_frames(2.0)
     np.testing.assert_array_equal(pooled_darks(darks, 16, np.full(6, 4.0)), darks)

@@ -44,9 +44,15 @@ def test_what_moves_with_its_neighbours_is_not_static():
     assert static[320:].mean() < 0.1
 
 
-@pytest.mark.parametrize("common", [0.0, 0.01], ids=["independent", "alike in a region"])
-def test_error_of_the_common_grey_level(common):
-    """It covers errors that neighbours share."""
+@pytest.mark.parametrize(
+    ("common", "beside_an_object"),
+    [(0.0, False), (0.0, True), (0.01, False)],
+    ids=["independent", "independent beside an object", "alike in a region"],
+)
+def test_error_of_the_common_grey_level(common, beside_an_object):
+    """It covers errors that neighbours share, wherever the static pixels are."""
+    static = np.ones((32, 40), bool)
+    static[8:, 10:30] = not beside_an_object
     rng = np.random.default_rng(3)
     errors, stated = [], []
     for _ in range(40):
@@ -54,8 +60,8 @@ def test_error_of_the_common_grey_level(common):
         grey = 0.05 * rng.standard_normal((32, 40, 5)) + of_region
         counts = 1000.0 * np.exp(grey).reshape(1280, 5, 1) * np.ones(4)
         courses = Courses.of(counts.astype(np.float32), np.full((1280, 4), 1.0))
-        deviation, scatter, error = grey_deviation(courses, np.ones((32, 40), bool), np.zeros((5, 4)))
-        course = np.log(counts[..., 0]) - deviation
+        deviation, scatter, error = grey_deviation(courses, static, np.zeros((5, 4)))
+        course = np.log(counts[static.ravel(), :, 0]) - deviation
         course = (course - course.mean(axis=1, keepdims=True)).mean(axis=0)
         errors.append(course)
         stated.append(error)

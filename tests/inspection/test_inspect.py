@@ -75,6 +75,10 @@ def test_damaged_captures_are_named(session, damage):
     inspection, findings = inspect(session)
     assert findings["damaged"].level == "red"
     assert list(findings["damaged"].values) == ["fruit_04"]
+    left_out = inspect_session(open_session(session, skip_damaged=True), skip_damaged=True).findings
+    (told,) = [finding for finding in left_out if finding.name == "damaged"]
+    assert told.level == "amber"
+    assert "fruit_04" in told.sentence
     assert len(inspection.looks) == 11
 
 
