@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
@@ -38,10 +37,10 @@ _OUTLIER_ROUNDS = 4
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
-# Errors of one feature in neighbouring frames are alike, and so are those of neighbouring features: residuals count
-# as if they were so many times larger (docs/validation/poses.md).
-_CORRELATION = 10.0
-_LEAST_SIGMA_PX = 0.3
+# Beside markers features weigh as if their residuals were so many times larger: what displaces them all smoothly over
+# the image does not average out.
+_BESIDE_MARKERS = 10.0
+_LEAST_SIGMA_PX = 0.03
 # A marker whose rays are nearly parallel is not placed.
 _LEAST_EIGENVALUE = 1e-3
 # Points seen in fewer frames, and frames that show fewer points, are left out.
@@ -155,15 +154,16 @@ def adjust_together(
         The turntable, with markers if they determine their places; and the markers that it was adjusted to.
     """
     start = found.turntable
-    sigma_px = _CORRELATION * float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
-    sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
-    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    sigma_px = max(float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
     if markers is not None:
         start = with_markers(start, markers)
         markers = markers.select(start.knows(markers))
-    if markers is None or not len(markers):
+    alone = markers is None or not len(markers)
+    sigma_px *= 1.0 if alone else _BESIDE_MARKERS
+    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    if markers is None or alone:
         problem = Problem(start, points(start), free=replace(free, distance=False))
-        return Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem), None
+        return with_hidden_errors(Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem)), None
     for last in (False, True):
         problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
@@ -173,28 +173,7 @@ def adjust_together(
             break
         markers = markers.select(fits)
         start = start.restricted(found.tracks, markers)
-    return with_hidden_errors(Adjusted(start, problem), markers), markers
-
-
-def halves_differ(found: AdjustedTracks, free: FreeParameters) -> tuple[float, float] | None:
-    """Half the difference between the upper and the lower half of the points: of the log of the focal length, and the
-    largest rotation (rad).
-
-    Features that creep over a bumpy or shiny object err together, which their residuals do not show. None where half
-    of the points cannot determine the turntable.
-    """
-    turntable, halves = found.turntable, []
-    height = turntable.points_3d[np.searchsorted(turntable.points, found.tracks.point), 2]
-    for upper in (False, True):
-        try:
-            tracks = found.tracks.select((height > np.median(height)) == upper)
-            halves.append(adjust_tracks(turntable, tracks, free=free).turntable)
-        except InputError:
-            return None
-    both = np.intersect1d(halves[0].frames, halves[1].frames)
-    one, other = (h.camera_to_world()[np.isin(h.frames, both), :3, :3] for h in halves)
-    rotation = Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()
-    return abs(float(np.log(halves[0].focal_px / halves[1].focal_px))) / 2.0, float(rotation) / 2.0
+    return with_hidden_errors(Adjusted(start, problem)), markers
 
 
 def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:
