@@ -34,6 +34,8 @@ _SMALLEST_GAIN = 1e-6
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
 _OUTLIER_ROUNDS = 4
+# Of a turntable and its reversal in depth one is wrong if it fits so many times worse before outliers are rejected.
+_CLEARLY_WORSE = 2.0
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
@@ -101,18 +103,44 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | No
     Raises:
         InputError: too few tracks fit to determine an axis.
     """
+    return _refined(_roughly_adjusted(start, tracks, free), tracks, free)
 
-    def adjusted(turntable: Turntable, kept: Tracks, loss_px: float) -> Turntable:
-        turntable = turntable.restricted(kept)
-        parameters = FreeParameters(distance=False, angles=free is None or free.angles)
-        problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
-        return problem.minimise(turntable, _SMALLEST_GAIN)
 
+def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
+    """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
+
+    Raises:
+        InputError: too few tracks fit either.
+    """
+    rough, found, refused = [], [], None
+    for way in (start, reversed_in_depth(start)):
+        try:
+            rough.append(_roughly_adjusted(way, tracks))
+        except InputError as error:
+            refused = refused or error
+    best_px = min((way.misfit_px for way in rough), default=0.0)
+    for way in rough:
+        try:
+            if way.misfit_px < _CLEARLY_WORSE * best_px:
+                found.append(_refined(way, tracks))
+        except InputError as error:
+            refused = refused or error
+    if refused is not None and not found:
+        raise refused
+    return min(found, key=lambda adjusted: adjusted.misfit_px)
+
+
+def _roughly_adjusted(start: Turntable, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
     good = _enough(tracks, start.knows(tracks))
-    turntable = adjusted(start, tracks.select(good), _FIRST_LOSS_PX)
+    kept = tracks.select(good)
+    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free), kept, ~good)
+
+
+def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+    turntable, good = rough.turntable, ~rough.outliers
     for last in [False] * _OUTLIER_ROUNDS + [True]:
         kept = tracks.select(good)
-        turntable = adjusted(turntable, kept, _LOSS_PX)
+        turntable = _adjusted(turntable, kept, _LOSS_PX, free)
         size_px = np.linalg.norm(turntable.reproject(kept) - kept.pixels, axis=-1)
         outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
         if last or not outlier.any():
@@ -123,21 +151,11 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | No
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
-    """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
-
-    Raises:
-        InputError: too few tracks fit either.
-    """
-    found, refused = [], None
-    for way in (start, reversed_in_depth(start)):
-        try:
-            found.append(adjust_tracks(way, tracks))
-        except InputError as error:
-            refused = refused or error
-    if refused is not None and not found:
-        raise refused
-    return min(found, key=lambda adjusted: adjusted.misfit_px)
+def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free: FreeParameters | None) -> Turntable:
+    turntable = turntable.restricted(kept)
+    parameters = FreeParameters(distance=False, angles=free is None or free.angles)
+    problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
+    return problem.minimise(turntable, _SMALLEST_GAIN)
 
 
 def adjust_together(
