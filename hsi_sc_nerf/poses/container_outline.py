@@ -71,17 +71,17 @@ def container_outline(
     pictures = np.stack([images[frame] for frame in turntable.frames]).astype(np.float32)
     mean, step = pictures.mean(axis=0), _STEP_PX * turntable.distance / turntable.focal_px
     radii = np.arange(_RADII[0] * reach, _RADII[1] * reach, step)
-    foot = None
+    heights = 2.0 * radii * height_over_diameter
+    # Until the foot is found, the lid is where the points end.
+    feet_of_radii = lowest - heights
     for _ in range(_ROUNDS):
-        # Until the foot is found, the lid is where the points end.
-        heights = 2.0 * radii * height_over_diameter
-        feet_of_radii = lowest - heights if foot is None else np.full(len(radii), foot)
         sides = _slopes(mean, turntable, _edges(radii, feet_of_radii, heights, turntable.distance)).min(axis=0)
         radius = float(radii[np.argmax(sides)])
         height = 2.0 * radius * height_over_diameter
         feet = np.arange(lowest + (_LIDS[0] - 1.0) * height, lowest + (_LIDS[1] - 1.0) * height, step)
         arc = _slopes(mean, turntable, _arcs(radius, feet))[0]
         foot = float(feet[np.argmax(arc)])
+        feet_of_radii = np.full(len(radii), foot)
         if min(sides.max(), arc.max()) < _LEAST_SLOPE:
             return None
     radii, feet = (tried[np.abs(tried - at) < _REACH * radius] for tried, at in ((radii, radius), (feet, foot)))
