@@ -20,12 +20,15 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.residuals import Residuals
+from hsi_sc_nerf.poses.residuals import PointResiduals, Residuals
 from hsi_sc_nerf.poses.turntable import Jacobian, Turntable
 
 _MOST_STEPS = 100
 _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
 _DAMPING_RANGE = (1e-12, 1e8)
+# A known focal length weighs as if its standard deviation were this fraction of what it is, for that of the landmarks
+# may be wrong by more than they tell (``Adjusted.covariance`` counts what it is).
+_HELD = 0.03
 
 
 @dataclass(frozen=True)
@@ -60,9 +63,9 @@ class ParameterLayout:
     angle: Int[np.ndarray, "f"]
     """Held angles have the column p, which is dropped."""
     motion: Int[np.ndarray, "f 5"]
-    hidden: Int[np.ndarray, "k"]
+    hidden: tuple[Int[np.ndarray, "k"], ...]
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
-    """Of each kind of residuals."""
+    """Of each kind of residuals, and so are the hidden errors."""
 
     @property
     def size(self) -> int:
@@ -77,7 +80,8 @@ class ParameterLayout:
         held = frames if not free.angles else int(free.camera)
         angle = radial + frames - held
         motion = angle + (5 * frames if free.motion_sigmas else 0)
-        size = end = motion + sum(part.hidden.shape[-1] for part in residuals if part.hidden is not None)
+        hidden_sizes = [0 if part.hidden is None else part.hidden.shape[-1] for part in residuals]
+        size = end = motion + sum(hidden_sizes)
         landmarks = []
         for part in residuals:
             landmarks.append(end + np.arange(part.size * part.d).reshape(part.size, part.d))
@@ -88,7 +92,7 @@ class ParameterLayout:
             radial=np.arange(camera, radial),
             angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
             motion=np.arange(angle, motion).reshape(-1, 5),
-            hidden=np.arange(motion, size),
+            hidden=tuple(np.split(np.arange(motion, size), np.cumsum(hidden_sizes)[:-1])),
             landmarks=tuple(landmarks),
         )
 
@@ -100,6 +104,9 @@ class LandmarkEquations:
     normal: Float[np.ndarray, "l d d"]
     gradient: Float[np.ndarray, "l d"]
     coupling: Float[np.ndarray, "l d p"]
+    motion: Float[np.ndarray, "p p"]
+    """The equations of camera and motion by these landmarks' sightings; of the gradient, each landmark's part."""
+    motion_gradient: Float[np.ndarray, "l p"]
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,17 @@ class NormalEquations:
     def information(self) -> Float[np.ndarray, "p p"]:
         """The inverse covariance of camera and motion for residuals of unit variance, the landmarks being unknown."""
         return self._eliminated(0.0)[0]
+
+    def reduced(self) -> list[tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]]:
+        """Of each kind of landmarks, these being unknown: its part of ``information``, and of the gradient of camera
+        and motion what each landmark contributes. The latter add to zero where the turntable is adjusted."""
+        return [
+            (
+                part.motion - np.einsum("ldp,ldq->pq", part.coupling, through),
+                part.motion_gradient - np.einsum("ldp,ld->lp", through, part.gradient),
+            )
+            for part, (_, through) in zip(self.landmarks, self._eliminated(0.0)[2], strict=True)
+        ]
 
     def landmark_responses(self) -> list[Float[np.ndarray, "l d p"]]:
         """Derivatives of the landmarks that fit best by camera and motion, of each kind."""
@@ -163,26 +181,35 @@ class Problem:
 
     def cost(self, turntable: Turntable) -> float:
         """Sum of the losses of the residuals, and of the squares of what contradicts prior knowledge."""
-        _, away, _ = self.priors(turntable)
+        away, _ = self.priors(turntable)
         return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(away @ away)
 
-    def priors(
-        self, turntable: Turntable
-    ) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-        """What is known before: columns, distances from it in standard deviations, and these standard deviations."""
+    def priors(self, turntable: Turntable) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k p+1"]]:
+        """Distances from what is known before in standard deviations, and their derivatives.
+
+        The angle of no frame is known better than another's, that of the first one neither: known angles count
+        relative to the mean of all.
+        """
         free, c = self.free, self.layout
-        known = [(np.zeros(0, int), np.zeros(0), np.ones(0))]
+        away, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
+
+        def add(distances: np.ndarray, columns: np.ndarray, jacobian: np.ndarray) -> None:
+            away.append(distances)
+            by.append(np.zeros((len(distances), c.motion_size + 1)))
+            np.add.at(by[-1], (np.arange(len(distances))[:, None], columns), jacobian)
+
         if free.motion_sigmas is not None:
-            known.append((c.motion, turntable.tilts_and_shifts(), np.repeat(free.motion_sigmas, (2, 3))))
+            sigmas = np.tile(np.repeat(free.motion_sigmas, (2, 3)), len(c.motion))
+            add(turntable.tilts_and_shifts().ravel() / sigmas, c.motion.reshape(-1, 1), 1.0 / sigmas[:, None])
         if free.known_focal is not None:
             focal_px, sigma = free.known_focal
-            known.append((c.camera[:1], np.log([turntable.focal_px / focal_px]), np.array(sigma)))
+            sigma *= _HELD
+            add(np.log([turntable.focal_px / focal_px]) / sigma, c.camera[:1], np.array([[1.0 / sigma]]))
         if free.known_angles is not None:
             angles_rad, sigma = free.known_angles
-            known.append((c.angle[1:], (turntable.angles_rad - angles_rad)[1:], np.array(sigma)))
-        columns = np.concatenate([part.ravel() for part, _, _ in known])
-        sigmas = np.concatenate([np.broadcast_to(sigma, part.shape).ravel() for part, _, sigma in known])
-        return columns, np.concatenate([away.ravel() for _, away, _ in known]) / sigmas, sigmas
+            about_mean = np.eye(len(angles_rad)) - 1.0 / len(angles_rad)
+            add(about_mean @ (turntable.angles_rad - angles_rad) / sigma, c.angle, about_mean / sigma)
+        return np.concatenate(away), np.concatenate(by)
 
     def motion_jacobian(
         self, part: Residuals, jacobian: Jacobian
@@ -199,7 +226,8 @@ class Problem:
             columns.append(c.motion[part.frame])
             values.append(jacobian.motion)
         if jacobian.hidden is not None:
-            columns.append(np.broadcast_to(c.hidden, (n, len(c.hidden))))
+            hidden = c.hidden[self.residuals.index(part)]
+            columns.append(np.broadcast_to(hidden, (n, len(hidden))))
             values.append(jacobian.hidden)
         return np.concatenate(columns, axis=1), np.concatenate(values, axis=2)
 
@@ -214,22 +242,26 @@ class Problem:
             weight, residual = (a.reshape(len(values), -1, 1) for a in (part.weights(residual), residual))
             weighted = np.swapaxes(weight * values, 1, 2)
             cell = columns[:, :, None] * width + columns[:, None, :]
-            motion += np.bincount(cell.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
-            gradient += np.bincount(columns.ravel(), (weighted @ residual).ravel(), width)
+            own = np.bincount(cell.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
             weighted_landmark = np.swapaxes(weight * by_landmark, 1, 2)
             pair = (part.landmark[:, None] * width + columns).ravel()
             products = weighted_landmark @ values
             coupling = [np.bincount(pair, products[:, k].ravel(), part.size * width) for k in range(part.d)]
+            scores = np.bincount(pair, (weighted @ residual).ravel(), part.size * width).reshape(part.size, width)
+            motion += own
+            gradient += scores.sum(axis=0)
             landmarks.append(
                 LandmarkEquations(
                     normal=_summed(weighted_landmark @ by_landmark, part.landmark, part.size),
                     gradient=_summed((weighted_landmark @ residual)[..., 0], part.landmark, part.size),
                     coupling=np.array(coupling).reshape(part.d, part.size, width).swapaxes(0, 1)[..., :-1],
+                    motion=own[:-1, :-1],
+                    motion_gradient=scores[:, :-1],
                 )
             )
-        known, away, sigmas = self.priors(turntable)
-        motion[known, known] += 1.0 / sigmas**2
-        gradient[known] += away / sigmas
+        away, by = self.priors(turntable)
+        motion += by.T @ by
+        gradient += by.T @ away
         return NormalEquations(motion[:-1, :-1], gradient[:-1], tuple(landmarks))
 
     def moved(
@@ -304,9 +336,6 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
 
-    inflation: float = 1.0
-    """The standard deviations are known to be so many times larger than the residuals say."""
-
     @cached_property
     def cost(self) -> float:
         """Of the problem at the turntable."""
@@ -325,15 +354,26 @@ class Adjusted:
     def covariance(self) -> Float[np.ndarray, "p p"]:
         """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
 
-        Hidden errors, of unit variance, were not adjusted: they add what they do to the parameters.
+        Errors of one point in neighbouring frames are alike. Its sightings count together, by how much the points
+        contradict each other (the cluster-robust estimate of K.-Y. Liang and S. L. Zeger, 1986; A. C. Cameron and
+        D. L. Miller, "A practitioner's guide to cluster-robust inference", 2015). Hidden errors, of unit variance,
+        were not adjusted: they add what they do to the parameters.
         """
-        information = self.problem.normal_equations(self.turntable).information()
-        hidden = self.problem.layout.hidden
+        equations = self.problem.normal_equations(self.turntable)
+        information, hidden = equations.information(), np.concatenate(self.problem.layout.hidden)
+        scatter = self.variance * information
+        for part, (own, scores) in zip(self.problem.residuals, equations.reduced(), strict=True):
+            if isinstance(part, PointResiduals):
+                scatter += scores.T @ scores - self.variance * own
+                information += (part.curvature(self.turntable) - 1.0) * own
+        if self.problem.free.known_focal is not None:
+            sigma = self.problem.free.known_focal[1]
+            scatter[0, 0] += 1.0 / (_HELD**2 * sigma) ** 2 - self.variance / (_HELD * sigma) ** 2
         shown = np.setdiff1d(np.arange(len(information)), hidden)
         inverse = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True)
         response = inverse @ information[np.ix_(shown, hidden)]
         covariance = np.zeros_like(information)
-        covariance[np.ix_(shown, shown)] = self.inflation**2 * self.variance * inverse + response @ response.T
+        covariance[np.ix_(shown, shown)] = inverse @ scatter[np.ix_(shown, shown)] @ inverse + response @ response.T
         return covariance
 
     def angle_sigmas_deg(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "f"]:

@@ -1,11 +1,13 @@
-"""The container's radius by its outline: the two upright edges that it shows in every frame.
+"""The container by its outline: the two upright edges that it shows in every frame, and the arc of its foot.
 
-Its diameter is known in metres, so that its radius in the poses' unit of length gives the scale without any marker.
+Its diameter is known in metres, so that its radius in the poses' unit of length gives the scale without any marker;
+its foot stands on the disc.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,77 +17,128 @@ from scipy.ndimage import gaussian_filter1d
 from hsi_sc_nerf.poses.turntable import Turntable
 
 # Radii that are tried, over that of most points; and how far the edges of one frame may lie from those of all.
-_RADII = np.geomspace(0.4, 1.6, 400)
-_MOST_POINTS_PERCENTILE = 90.0
+_RADII = (0.4, 1.6)
+_MOST_POINTS_PERCENTILE, _LOWEST_POINTS_PERCENTILE = 90.0, 1.0
 _REACH = 0.08
-# Edges are sought along this part of the container's height, from below; above, the object may overhang.
+# Heights of the lid that are tried, over the lowest points, in heights of the container: an object curves under, so
+# that its features end above the lid.
+_LIDS = (-1.0, 0.1)
+# Edges are sought along this part of the container's height, from below; above, the object may overhang. The foot is
+# sought along this part of its circle, from the camera's side.
 _HEIGHTS = np.linspace(0.15, 0.7, 24)
-_SMOOTHING = 3.0
-"""Standard deviation of the Gaussian over the radii."""
-# Both edges change the brightness by this from one radius to the next, gray levels, but for so many places in a
-# hundred; frames agree to this fraction of the radius.
-_LEAST_SLOPE, _WEAKEST_PERCENTILE = 0.5, 20.0
+_AZIMUTHS = np.deg2rad(np.linspace(-60.0, 60.0, 24))
+# From one place that is tried to the next, and standard deviation of the Gaussian over them.
+_STEP_PX, _SMOOTHING_PX = 0.2, 0.7
+# An edge changes the brightness by this from one pixel to the next, gray levels, but for so many places in a hundred;
+# frames agree to this fraction of the radius.
+_LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
-# Blur, wear and the lid's rim, as a fraction of the radius.
-_EDGE_SIGMA = 0.005
+_ROUNDS = 3
+# Standard deviation of an edge's place, alike in all frames: it lies somewhere in the pixel of the steepest change.
+_EDGE_PX = 1.0 / np.sqrt(12.0)
 
 
-def container_radius(
-    images: Sequence[UInt8[np.ndarray, "h w"]], turntable: Turntable, top: float, height_over_diameter: float
-) -> tuple[float, float] | None:
-    """Radius of the upright container about the axis in the turntable's unit, and its relative standard deviation.
+@dataclass(frozen=True)
+class ContainerOutline:
+    """The container in the turntable's unit of length, with standard deviations."""
+
+    radius: float
+    radius_sigma: float
+    """As a fraction of the radius."""
+    foot: float
+    """Its height in the turntable frame, which is that of the disc."""
+    foot_sigma: float
+
+
+def container_outline(
+    images: Sequence[UInt8[np.ndarray, "h w"]], turntable: Turntable, height_over_diameter: float
+) -> ContainerOutline | None:
+    """Radius and foot of the upright container about the axis.
 
     A container off the axis moves both edges to one side; the mean of both tells its radius.
 
     Args:
         images: gray, one per frame of the session.
-        turntable: adjusted.
-        top: height of the container's lid in the turntable frame.
+        turntable: adjusted, with points of the object that stands on the container.
         height_over_diameter: of the container.
 
     Returns:
-        None where no two edges stand out in most frames, or they do not agree.
+        None where two edges and a foot do not stand out in most frames, or do not agree.
     """
-    object_radius = np.percentile(np.linalg.norm(turntable.points_3d[:, :2], axis=1), _MOST_POINTS_PERCENTILE)
-    radii = float(object_radius) * _RADII
-    place = _edges_px(turntable, radii, top, height_over_diameter)
+    points = turntable.points_3d
+    reach = float(np.percentile(np.linalg.norm(points[:, :2], axis=1), _MOST_POINTS_PERCENTILE))
+    lowest = float(np.percentile(points[:, 2], _LOWEST_POINTS_PERCENTILE))
     pictures = np.stack([images[frame] for frame in turntable.frames]).astype(np.float32)
-    together = _strengths(pictures.mean(axis=0), place).min(axis=0)
-    best = int(np.argmax(together))
-    if together[best] < _LEAST_SLOPE:
+    mean, step = pictures.mean(axis=0), _STEP_PX * turntable.distance / turntable.focal_px
+    radii = np.arange(_RADII[0] * reach, _RADII[1] * reach, step)
+    heights = 2.0 * radii * height_over_diameter
+    # Until the foot is found, the lid is where the points end.
+    feet_of_radii = lowest - heights
+    for _ in range(_ROUNDS):
+        sides = _slopes(mean, turntable, _edges(radii, feet_of_radii, heights, turntable.distance)).min(axis=0)
+        radius = float(radii[np.argmax(sides)])
+        height = 2.0 * radius * height_over_diameter
+        feet = np.arange(lowest + (_LIDS[0] - 1.0) * height, lowest + (_LIDS[1] - 1.0) * height, step)
+        arc = _slopes(mean, turntable, _arcs(radius, feet))[0]
+        foot = float(feet[np.argmax(arc)])
+        feet_of_radii = np.full(len(radii), foot)
+        if min(sides.max(), arc.max()) < _LEAST_SLOPE:
+            return None
+    radii, feet = (tried[np.abs(tried - at) < _REACH * radius] for tried, at in ((radii, radius), (feet, foot)))
+    edges, arcs = _edges(radii, np.full(len(radii), foot), height, turntable.distance), _arcs(radius, feet)
+    found = np.empty((len(pictures), 2))
+    for row, picture in zip(found, pictures, strict=True):
+        sides, (arc,) = _slopes(picture, turntable, edges), _slopes(picture, turntable, arcs)
+        row[:] = np.mean([_peak(radii, side) for side in sides]), _peak(feet, arc)
+    radius, foot = np.median(found, axis=0).tolist()
+    scatter = 1.5 * np.median(np.abs(found - [radius, foot]), axis=0)
+    if scatter[0] > _LARGEST_SPREAD * radius:
         return None
-    strengths = np.stack([_strengths(picture, place) for picture in pictures])
-    near = np.abs(np.log(radii / radii[best])) < _REACH
-    peaks = np.argmax(strengths[..., near], axis=-1)
-    found = radii[near][peaks].mean(axis=1)
-    spread = float(np.median(np.abs(found / np.median(found) - 1.0)))
-    if spread > _LARGEST_SPREAD:
-        return None
-    return float(np.median(found)), float(np.hypot(1.5 * spread / np.sqrt(len(found)), _EDGE_SIGMA))
+    # What a pixel is, in the turntable's unit, across the line of sight; the foot is seen from above.
+    looks = turntable.camera_rotation[2]
+    depth = float(looks @ [-turntable.distance, 0.0, foot])
+    edge = _EDGE_PX * depth / turntable.focal_px
+    errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / abs(turntable.camera_rotation[1, 2])])
+    # What stands higher is nearer to a camera that looks down, and seems wider.
+    nearer = looks[2] / depth * errors[1]
+    return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))
 
 
-def _edges_px(
-    turntable: Turntable, radii: Float[np.ndarray, "r"], top: float, height_over_diameter: float
-) -> Float[np.ndarray, "2 heights r 2"]:
-    """Pixels of the left and the right edge of cylinders about the axis."""
+def _edges(radii, feet, heights, distance) -> Float[np.ndarray, "2 heights r 3"]:
+    """Points of the left and the right edge of cylinders about the axis, each with its foot and height."""
     # Rays touch a cylinder where its radius is perpendicular to them.
-    fraction = radii / turntable.distance
+    fraction = radii / distance
     x, y = radii * fraction, radii * np.sqrt(1.0 - fraction**2)
-    z = top - np.outer(1.0 - _HEIGHTS, 2.0 * radii * height_over_diameter)
-    edges = [np.stack(np.broadcast_arrays(x, side * y, z), axis=-1) for side in (-1.0, 1.0)]
-    in_camera = (np.stack(edges) - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
-    return turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px
+    z = feet + _HEIGHTS[:, None] * heights
+    return np.stack([np.stack(np.broadcast_arrays(x, side * y, z), axis=-1) for side in (-1.0, 1.0)])
 
 
-def _strengths(
-    image: Float[np.ndarray, "h w"], place: Float[np.ndarray, "2 heights r 2"]
-) -> Float[np.ndarray, "2 r"]:
-    """How much the brightness changes from one radius to the next, at least in most places along each edge.
+def _arcs(radius: float, feet: Float[np.ndarray, "z"]) -> Float[np.ndarray, "1 azimuths z 3"]:
+    """Points of circles about the axis on the camera's side."""
+    x, y = (radius * part(_AZIMUTHS)[:, None] for part in (np.cos, np.sin))
+    return np.stack(np.broadcast_arrays(x, y, feet), axis=-1)[None]
+
+
+def _slopes(
+    image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k places n 3"]
+) -> Float[np.ndarray, "k n"]:
+    """How much the brightness changes from pixel to pixel across each of n lines, at least in most of its places.
 
     An edge of the container goes all along its height, before the disc and before the wall; patterns of the wall do
     not. 0 outside of the image.
     """
-    x, y = (place[..., k].astype(np.float32).reshape(-1, place.shape[2]) - np.float32(0.5) for k in (0, 1))
+    in_camera = (points - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
+    pixels = turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px
+    x, y = (pixels[..., k].astype(np.float32).reshape(-1, points.shape[2]) - np.float32(0.5) for k in (0, 1))
     shown = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    slopes = gaussian_filter1d(shown.reshape(place.shape[:3]), _SMOOTHING, axis=-1, order=1)
-    return np.percentile(np.abs(np.nan_to_num(slopes)), _WEAKEST_PERCENTILE, axis=1)
+    step_px = np.linalg.norm(np.diff(pixels, axis=2), axis=-1).mean()
+    change = gaussian_filter1d(shown.reshape(points.shape[:3]), _SMOOTHING_PX / step_px, axis=-1, order=1) / step_px
+    return np.percentile(np.abs(np.nan_to_num(change)), _WEAKEST_PERCENTILE, axis=1)
+
+
+def _peak(tried: Float[np.ndarray, "n"], slopes: Float[np.ndarray, "n"]) -> float:
+    """The place of the largest slope, between those that were tried, by a parabola."""
+    k = int(np.clip(np.argmax(slopes), 1, len(slopes) - 2))
+    before, at, after = slopes[k - 1 : k + 2]
+    bend = before - 2.0 * at + after
+    return float(tried[k] + (tried[1] - tried[0]) * (0.5 * (before - after) / bend if bend < 0.0 else 0.0))

@@ -12,12 +12,12 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
-from hsi_sc_nerf.poses.container_outline import container_radius
+from hsi_sc_nerf.poses.container_outline import ContainerOutline, container_outline
 from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_outliers import usable
-from hsi_sc_nerf.poses.object_frame import disc_height, lie_on_disc, scale_of
+from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
 from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
@@ -27,7 +27,6 @@ from hsi_sc_nerf.poses.track_adjustment import (
     adjust_either_way,
     adjust_together,
     adjust_tracks,
-    halves_differ,
     with_lost_frames,
 )
 from hsi_sc_nerf.poses.turntable import Turntable
@@ -38,8 +37,9 @@ _FOCAL_SIGMA = 0.002
 """Of an earlier session's focal length, as a fraction."""
 _LEAST_ANGLE_SIGMA_RAD = 1e-3
 """Of a turntable's known angles."""
-_SIGMAS, _LEAST_TILT_DEG = 3.0, 0.3
-"""An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis."""
+_SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
+"""An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis or this fraction of
+the focal length."""
 MOST_CONTRADICTING = 1 / 3
 """Of COLMAP's poses; where a larger fraction contradicts one turntable, it is not known which are right."""
 
@@ -66,7 +66,7 @@ def poses_from_features(
         info: what gives the scale, the markers' dictionary, and the angles.
         camera: of an earlier session, whose focal length and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.
-        free: what ``structure_from_motion`` finds, where it is known already.
+        free: what ``structure_from_motion`` finds with the camera's focal length, where it is known already.
 
     Raises:
         InputError: too little texture, poses that do not turn about one axis, unknown angles that should be held, or
@@ -79,7 +79,8 @@ def poses_from_features(
     if hold_angles and angles_deg is None:
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
     grays = SessionPictures.of(images).named(GRAY)
-    free = structure_from_motion(grays, names) if free is None else free
+    if free is None:
+        free = structure_from_motion(grays, names, focal_px=None if camera is None else camera.intrinsics.fl_x)
     start, contradicts = turntable_from_poses(free.world_to_camera, free.points_3d, free.focal_px, free.centre_px)
     if contradicts.sum() > MOST_CONTRADICTING * free.used.sum():
         raise InputError(
@@ -131,19 +132,17 @@ def _posed(
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
     adjusted, markers = adjust_together(found, markers, parameters)
     findings: list[Finding] = []
-    if markers is None and camera is None:
-        adjusted, findings = _with_halves(adjusted, found, parameters)
     if camera is not None:
         findings = check_camera(adjusted, found, camera)
     height, width = images[0].shape
     outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
-    if scale_of(adjusted.turntable, info, None if outline is None else outline[0])[0] is None:
+    if scale_of(adjusted.turntable, info, outline)[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
             "give marker_side_m, or give camera_distance_m or the container's size in session.json."
         )
         findings.append(Finding("poses-no-scale", "amber", sentence))
-    if not lie_on_disc(adjusted.turntable.corners()).any():
+    if outline is None and not lie_on_disc(adjusted.turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker or feature."
         findings.append(Finding("poses-origin", "amber", sentence))
     return in_object_frame(
@@ -167,39 +166,23 @@ def _posed(
     )
 
 
-def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> tuple[float, float] | None:
-    """The container's radius; its lid is where the features end."""
+def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> ContainerOutline | None:
     if info.container_diameter_m is None or info.container_height_m is None:
         return None
     grays = SessionPictures.of(images).named(GRAY)
-    return container_radius(
-        grays, turntable, disc_height(turntable), info.container_height_m / info.container_diameter_m
-    )
-
-
-def _with_halves(
-    adjusted: Adjusted, found: AdjustedTracks, parameters: FreeParameters
-) -> tuple[Adjusted, list[Finding]]:
-    """As uncertain as two halves of the features differ, if they do so by more than the residuals tell."""
-    halves = halves_differ(found, parameters)
-    if halves is None:
-        sentence = "Too few features are seen to tell how far the poses can be trusted."
-        return adjusted, [Finding("poses-halves", "amber", sentence)]
-    stated = pose_uncertainty(adjusted, adjusted.covariance())
-    inflation = max(1.0, halves[0] / stated.focal, np.rad2deg(halves[1]) / stated.rotation_deg)
-    return replace(adjusted, inflation=float(inflation)), []
+    return container_outline(grays, turntable, info.container_height_m / info.container_diameter_m)
 
 
 def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:
     """Whether the features contradict the camera of the earlier session."""
+    alone, _ = adjust_together(found, None, replace(adjusted.problem.free, known_focal=None))
+    focal = float(np.log(alone.turntable.focal_px / camera.intrinsics.fl_x))
+    focal_sigma = float(np.hypot(np.sqrt(alone.covariance()[0, 0]), _FOCAL_SIGMA))
     stated = pose_uncertainty(adjusted, adjusted.covariance())
-    # What the images alone would state, without the known focal length.
-    alone = 1.0 / np.sqrt(max(stated.focal**-2 - _FOCAL_SIGMA**-2, 1e-12))
-    focal = float(np.log(found.turntable.focal_px / camera.intrinsics.fl_x))
     axis, earlier = adjusted.turntable.camera_rotation[:, 2], camera.camera_to_world[2, :3] * [1.0, -1.0, -1.0]
     tilt_deg = float(np.rad2deg(np.arccos(np.clip(axis @ earlier, -1.0, 1.0))))
     moved = tilt_deg > _SIGMAS * stated.rotation_deg + _LEAST_TILT_DEG
-    if not moved and abs(focal) <= _SIGMAS * np.hypot(alone, _FOCAL_SIGMA):
+    if not moved and abs(focal) <= max(_SIGMAS * focal_sigma, _LEAST_ZOOM):
         return []
     sentence = (
         f"The camera is not as in the earlier session: its focal length differs by {100.0 * focal:+.1f} % and the "

@@ -103,7 +103,7 @@ def poses_from_markers(
     with np.errstate(invalid="ignore"):
         errors_px = np.sqrt(np.bincount(kept.frame, squared_px2, len(names)) / seen)
     return in_object_frame(
-        with_hidden_errors(adjusted, kept),
+        with_hidden_errors(adjusted),
         kept,
         names,
         (width, height),

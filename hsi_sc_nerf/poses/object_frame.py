@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, Problem
+from hsi_sc_nerf.poses.container_outline import ContainerOutline
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.result import ScaleSource
@@ -134,14 +135,14 @@ def apparent_sides(
 
 
 def scale_of(
-    turntable: Turntable, info: SessionInfo, container_radius: float | None = None
+    turntable: Turntable, info: SessionInfo, outline: ContainerOutline | None = None
 ) -> tuple[ScaleSource | None, float]:
     """What gives the scale, None if nothing does; and the length of the turntable's unit in metres, 1 if unknown.
 
     Args:
         turntable: adjusted.
         info: the markers' side, the container's diameter, the camera's distance.
-        container_radius: by its outline, in the turntable's unit.
+        outline: of the container, without markers.
     """
     if len(turntable.markers):
         if info.marker_side_m is not None:
@@ -149,8 +150,8 @@ def scale_of(
         diameter = container_diameter(turntable, None)
         if info.container_diameter_m is not None and diameter is not None:
             return "container", info.container_diameter_m / diameter
-    if info.container_diameter_m is not None and container_radius is not None:
-        return "outline", info.container_diameter_m / (2.0 * container_radius)
+    if info.container_diameter_m is not None and outline is not None:
+        return "outline", info.container_diameter_m / (2.0 * outline.radius)
     if info.camera_distance_m is not None:
         return "distance", info.camera_distance_m / turntable.distance
     return None, 1.0

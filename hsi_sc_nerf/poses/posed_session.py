@@ -11,6 +11,7 @@ import numpy as np
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted
+from hsi_sc_nerf.poses.container_outline import ContainerOutline
 from hsi_sc_nerf.poses.object_frame import (
     apparent_sides,
     container_diameter,
@@ -31,7 +32,7 @@ def in_object_frame(
     names: Sequence[str],
     size_px: tuple[int, int],
     info: SessionInfo,
-    outline: tuple[float, float] | None = None,
+    outline: ContainerOutline | None = None,
     **specific: Any,
 ) -> TurntablePoses:
     """The adjusted turntable in the object frame and in metres, frame by frame.
@@ -42,20 +43,21 @@ def in_object_frame(
         names: of the session's frames.
         size_px: width and height of the images.
         info: what is known of the session.
-        outline: the container's radius in the turntable's unit, and its standard deviation as a fraction.
+        outline: of the container in the same unit, which gives the disc's height.
         specific: what the method itself knows for ``TurntablePoses``.
     """
-    source, metres = scale_of(adjusted.turntable, info, None if outline is None else outline[0])
+    source, metres = scale_of(adjusted.turntable, info, outline)
     turntable, n = adjusted.turntable.resized(metres), len(names)
-    to_object = to_object_frame(turntable, disc_height(turntable))
+    to_object = to_object_frame(turntable, disc_height(turntable) if outline is None else metres * outline.foot)
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
-    uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres)
+    uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, outline)
     if source == "outline" and outline is not None:
         # What the focal length leaves open in the object's size is now open in the camera's distance.
-        away = float(np.hypot(uncertainty.size, outline[1]))
-        position_m = float(np.hypot(uncertainty.position_m, away * turntable.distance))
-        uncertainty = replace(uncertainty, size=outline[1], distance=away, position_m=position_m)
+        away = float(np.hypot(uncertainty.size, outline.radius_sigma))
+        reach_m = float(np.linalg.norm([turntable.distance, metres * outline.foot]))
+        position_m = float(np.hypot(uncertainty.position_m, away * reach_m))
+        uncertainty = replace(uncertainty, size=outline.radius_sigma, distance=away, position_m=position_m)
     return TurntablePoses(
         names=tuple(names),
         intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),
@@ -65,6 +67,7 @@ def in_object_frame(
         used=np.isin(np.arange(n), turntable.frames),
         marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},
         disc_markers=tuple(turntable.markers[on_disc].tolist()),
+        disc_by_container=outline is not None,
         disc_tilt_deg=disc_tilt_deg(turntable),
         model="turntable" if tilts is None else "free poses",
         wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),

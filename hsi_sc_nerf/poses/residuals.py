@@ -6,11 +6,13 @@ Symbols: n sightings with g residuals of r numbers each, of l landmarks with d p
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from typing_extensions import Self
 
 from hsi_sc_nerf.geometry.camera import cross_matrix
 from hsi_sc_nerf.poses.turntable import (
@@ -35,8 +37,10 @@ class Residuals(ABC):
 
     numbers: int
     """Of all residuals: n g r."""
-    hidden: np.ndarray | None = None
-    """Displacements (rows, 2, k) that count in the covariance alone."""
+    pixels: Float[np.ndarray, "m 2"]
+    """All that was seen: corners or points."""
+    hidden: Float[np.ndarray, "m 2 k"] | None = None
+    """Displacements of these, px, that count in the covariance alone."""
 
     def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
         """Args:
@@ -61,6 +65,12 @@ class Residuals(ABC):
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "l d"]) -> Turntable:
         """The turntable with its landmarks moved."""
 
+    def with_hidden(self, hidden: Float[np.ndarray, "m 2 k"]) -> Self:
+        """The same residuals with displacements that are not adjusted but count in the covariance."""
+        other = copy(self)
+        other.hidden = hidden
+        return other
+
     def losses(self, turntable: Turntable) -> Float[np.ndarray, "n"]:
         """The loss of each sighting."""
         r = np.linalg.norm(self.values(turntable), axis=-1)
@@ -84,7 +94,6 @@ class MarkerResiduals(Residuals):
         *,
         free: bool = True,
         free_sides: bool = False,
-        hidden: Float[np.ndarray, "4*n 2 k"] | None = None,
     ) -> None:
         """Args:
         turntable: as ``Residuals``.
@@ -96,8 +105,8 @@ class MarkerResiduals(Residuals):
         hidden: displacements of the corners, px, that are not adjusted but count in the covariance.
         """
         super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
-        self.free, self.free_sides, self.hidden = free, free_sides, hidden
-        self.numbers = 8 * len(observations)
+        self.free, self.free_sides = free, free_sides
+        self.numbers, self.pixels = 8 * len(observations), observations.corners_px.reshape(-1, 2)
         self.corners_px = observations.corners_px.reshape(-1, 8, 1)
         self.whitening = whitening(observations.covariance_px2) if weights is None else weights
 
@@ -154,9 +163,18 @@ class PointResiduals(Residuals):
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
         """By the point's coordinates."""
         projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        pixel = projection_jacobian(turntable, self.frame, projection)
+        pixel = replace(projection_jacobian(turntable, self.frame, projection), hidden=self.hidden)
         scaled = pixel.mapped(lambda by: by / self.sigma_px)
         return scaled, scaled.point
+
+    def curvature(self, turntable: Turntable) -> float:
+        """Second derivatives of the losses over what ``weights`` takes for them, in the mean of all directions.
+
+        The second derivative is 1 / (1 + r^2 / s^2) of the weight along the residual, and the weight across it.
+        """
+        values = self.values(turntable)
+        weight = self.weights(values)[..., 0]
+        return float(np.average((1.0 + weight**2) / 2.0, weights=weight))
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:
         """The turntable with its points shifted."""

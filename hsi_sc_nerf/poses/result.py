@@ -58,7 +58,10 @@ class Scale:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations by the covariance of the adjustment; the length that gives the scale is taken for exact."""
+    """Standard deviations by the covariance of the adjustment; the length that gives the scale is taken for exact.
+
+    ``process`` goes by the worst frame, and the largest of many errors exceeds the standard deviation of each.
+    """
 
     focal: float
     """Of the focal length, as a fraction of it."""
@@ -69,9 +72,9 @@ class Uncertainty:
     angle_deg: Float[np.ndarray, "n"]
     """Of each frame's angle, relative to the mean of all; nan where a frame is not used."""
     rotation_deg: float
-    """Of the least certain frame's rotation in the object frame."""
+    """Of the rotation in the object frame: root mean square of the largest error of all frames."""
     position_m: float
-    """Of the least certain frame's camera position in the object frame."""
+    """Likewise, of the camera's position in the object frame."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ class TurntablePoses:
     """OpenCV's name; None where the poses rest on no markers."""
     blur_px: float = 0.0
     disc_markers: tuple[int, ...] = ()
+    disc_by_container: bool = False
+    """Whether the foot of the container's outline gives the height of the disc."""
     disc_tilt_deg: float | None = None
     loop_closure_deg: float | None = None
     findings: tuple[Finding, ...] = ()

@@ -30,8 +30,8 @@ _STRETCH_PERCENTILES = (0.5, 99.5)
 # Frames up to this part of a full turn apart are matched, and at least so many neighbours to each side.
 _NEIGHBOURS_TURN = 0.2
 _FEWEST_NEIGHBOURS = 3
-# Focal length in image widths during mapping. One orbit of a small object hardly tells it from the distance; the
-# bundle adjustment of the turntable finds it.
+# Focal length in image widths during mapping, where it is not known. One orbit of a small object hardly tells it from
+# the distance; the bundle adjustment of the turntable finds it.
 _FOCAL_FACTOR = 1.5
 _SEED = 0
 # Least contrast of a SIFT feature: less than COLMAP's 0.0067, for skin is smooth.
@@ -76,6 +76,7 @@ def structure_from_motion(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     names: Sequence[str],
     *,
+    focal_px: float | None = None,
     moving: Bool[np.ndarray, "h w"] | None = None,
 ) -> FreePoses:
     """Poses of a camera that goes round the object at rest, from the images of the turning object.
@@ -83,6 +84,7 @@ def structure_from_motion(
     Args:
         images: one gray image per frame in the order of the turn, all of one size.
         names: the frames' names, for messages.
+        focal_px: of the camera, where it is known; mapping holds it.
         moving: where features are detected; by default ``moving_pixels``.
 
     Raises:
@@ -105,7 +107,7 @@ def structure_from_motion(
         for i, image in enumerate(images):
             cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
         cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
-        _match(folder, len(images), images[0].shape)
+        _match(folder, len(images), images[0].shape, focal_px)
         reconstruction = _map(folder)
         if reconstruction is None:
             raise InputError(
@@ -156,7 +158,7 @@ def _frame_of(file_name: str) -> int:
     return int(Path(file_name).stem)
 
 
-def _match(folder: Path, frames: int, shape: tuple[int, ...]) -> None:
+def _match(folder: Path, frames: int, shape: tuple[int, ...], focal_px: float | None) -> None:
     """Features of all images, and those that neighbours in the turn share, into the folder's database."""
     import pycolmap
 
@@ -165,7 +167,7 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...]) -> None:
     height, width = shape
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_PINHOLE"
-    reader.camera_params = f"{_FOCAL_FACTOR * width},{width / 2},{height / 2}"
+    reader.camera_params = f"{focal_px or _FOCAL_FACTOR * width},{width / 2},{height / 2}"
     reader.camera_mask_path = str(folder / "mask.png")
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.peak_threshold = _PEAK_THRESHOLD

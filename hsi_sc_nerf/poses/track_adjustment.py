@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
@@ -35,13 +34,15 @@ _SMALLEST_GAIN = 1e-6
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
 _OUTLIER_ROUNDS = 4
+# Of a turntable and its reversal in depth one is wrong if it fits so many times worse before outliers are rejected.
+_CLEARLY_WORSE = 2.0
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
-# Errors of one feature in neighbouring frames are alike, and so are those of neighbouring features: residuals count
-# as if they were so many times larger (docs/validation/poses.md).
-_CORRELATION = 10.0
-_LEAST_SIGMA_PX = 0.3
+# Beside markers features weigh as if their residuals were so many times larger: what displaces them all smoothly over
+# the image does not average out.
+_BESIDE_MARKERS = 10.0
+_LEAST_SIGMA_PX = 0.03
 # A marker whose rays are nearly parallel is not placed.
 _LEAST_EIGENVALUE = 1e-3
 # Points seen in fewer frames, and frames that show fewer points, are left out.
@@ -102,18 +103,44 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | No
     Raises:
         InputError: too few tracks fit to determine an axis.
     """
+    return _refined(_roughly_adjusted(start, tracks, free), tracks, free)
 
-    def adjusted(turntable: Turntable, kept: Tracks, loss_px: float) -> Turntable:
-        turntable = turntable.restricted(kept)
-        parameters = FreeParameters(distance=False, angles=free is None or free.angles)
-        problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
-        return problem.minimise(turntable, _SMALLEST_GAIN)
 
+def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
+    """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
+
+    Raises:
+        InputError: too few tracks fit either.
+    """
+    rough, found, refused = [], [], None
+    for way in (start, reversed_in_depth(start)):
+        try:
+            rough.append(_roughly_adjusted(way, tracks))
+        except InputError as error:
+            refused = refused or error
+    best_px = min((way.misfit_px for way in rough), default=0.0)
+    for way in rough:
+        try:
+            if way.misfit_px < _CLEARLY_WORSE * best_px:
+                found.append(_refined(way, tracks))
+        except InputError as error:
+            refused = refused or error
+    if refused is not None and not found:
+        raise refused
+    return min(found, key=lambda adjusted: adjusted.misfit_px)
+
+
+def _roughly_adjusted(start: Turntable, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
     good = _enough(tracks, start.knows(tracks))
-    turntable = adjusted(start, tracks.select(good), _FIRST_LOSS_PX)
+    kept = tracks.select(good)
+    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free), kept, ~good)
+
+
+def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+    turntable, good = rough.turntable, ~rough.outliers
     for last in [False] * _OUTLIER_ROUNDS + [True]:
         kept = tracks.select(good)
-        turntable = adjusted(turntable, kept, _LOSS_PX)
+        turntable = _adjusted(turntable, kept, _LOSS_PX, free)
         size_px = np.linalg.norm(turntable.reproject(kept) - kept.pixels, axis=-1)
         outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
         if last or not outlier.any():
@@ -124,21 +151,11 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | No
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
-    """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
-
-    Raises:
-        InputError: too few tracks fit either.
-    """
-    found, refused = [], None
-    for way in (start, reversed_in_depth(start)):
-        try:
-            found.append(adjust_tracks(way, tracks))
-        except InputError as error:
-            refused = refused or error
-    if refused is not None and not found:
-        raise refused
-    return min(found, key=lambda adjusted: adjusted.misfit_px)
+def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free: FreeParameters | None) -> Turntable:
+    turntable = turntable.restricted(kept)
+    parameters = FreeParameters(distance=False, angles=free is None or free.angles)
+    problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
+    return problem.minimise(turntable, _SMALLEST_GAIN)
 
 
 def adjust_together(
@@ -155,15 +172,16 @@ def adjust_together(
         The turntable, with markers if they determine their places; and the markers that it was adjusted to.
     """
     start = found.turntable
-    sigma_px = _CORRELATION * float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN
-    sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
-    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    sigma_px = max(float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
     if markers is not None:
         start = with_markers(start, markers)
         markers = markers.select(start.knows(markers))
-    if markers is None or not len(markers):
+    alone = markers is None or not len(markers)
+    sigma_px *= 1.0 if alone else _BESIDE_MARKERS
+    points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
+    if markers is None or alone:
         problem = Problem(start, points(start), free=replace(free, distance=False))
-        return Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem), None
+        return with_hidden_errors(Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem)), None
     for last in (False, True):
         problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
@@ -173,28 +191,7 @@ def adjust_together(
             break
         markers = markers.select(fits)
         start = start.restricted(found.tracks, markers)
-    return with_hidden_errors(Adjusted(start, problem), markers), markers
-
-
-def halves_differ(found: AdjustedTracks, free: FreeParameters) -> tuple[float, float] | None:
-    """Half the difference between the upper and the lower half of the points: of the log of the focal length, and the
-    largest rotation (rad).
-
-    Features that creep over a bumpy or shiny object err together, which their residuals do not show. None where half
-    of the points cannot determine the turntable.
-    """
-    turntable, halves = found.turntable, []
-    height = turntable.points_3d[np.searchsorted(turntable.points, found.tracks.point), 2]
-    for upper in (False, True):
-        try:
-            tracks = found.tracks.select((height > np.median(height)) == upper)
-            halves.append(adjust_tracks(turntable, tracks, free=free).turntable)
-        except InputError:
-            return None
-    both = np.intersect1d(halves[0].frames, halves[1].frames)
-    one, other = (h.camera_to_world()[np.isin(h.frames, both), :3, :3] for h in halves)
-    rotation = Rotation.from_matrix(one @ np.swapaxes(other, 1, 2)).magnitude().max()
-    return abs(float(np.log(halves[0].focal_px / halves[1].focal_px))) / 2.0, float(rotation) / 2.0
+    return with_hidden_errors(Adjusted(start, problem)), markers
 
 
 def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:

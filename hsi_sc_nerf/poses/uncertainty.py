@@ -1,7 +1,7 @@
 """Standard deviations of poses in the object frame, by the covariance of the whole adjustment.
 
-The covariance counts errors that no residual shows: smooth displacements of the markers' corners, which another
-camera explains.
+The covariance counts errors that no residual shows: smooth displacements of corners and features over the image,
+which another camera explains.
 """
 
 from __future__ import annotations
@@ -12,49 +12,69 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
-from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.container_outline import ContainerOutline
 from hsi_sc_nerf.poses.object_frame import lowest_landmarks
-from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
+from hsi_sc_nerf.poses.residuals import PointResiduals
 from hsi_sc_nerf.poses.result import Uncertainty
-from hsi_sc_nerf.poses.turntable import MarkerObservations
+from hsi_sc_nerf.poses.turntable import Turntable, project, projection_jacobian
 
 _FIELD_PX = 0.007
-"""Standard deviation of each field's amplitude: print, lens and pixels are that far from the model's."""
+"""Standard deviation of each field's amplitude: print, skin, lens and pixels are that far from the model's."""
+_DRAWS = 2000
+"""Of errors by the covariance; the largest of all frames has no closed form."""
 
 
-def pose_uncertainty(adjusted: Adjusted, covariance: Float[np.ndarray, "p p"], metres: float = 1.0) -> Uncertainty:
+def pose_uncertainty(
+    adjusted: Adjusted,
+    covariance: Float[np.ndarray, "p p"],
+    metres: float = 1.0,
+    outline: ContainerOutline | None = None,
+) -> Uncertainty:
     """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
 
     Args:
         adjusted: the turntable.
         covariance: of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
+        outline: of the container, where its foot gives the disc's height.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())
-    distance = float(sigmas[4]) if 4 in layout.camera else 0.0
+    values, axes = np.linalg.eigh(covariance)
+    normal = np.random.default_rng(0).normal(size=(_DRAWS, len(values)))
+    drawn = normal * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+    angles = np.pad(drawn, ((0, 0), (0, 1)))[:, layout.angle]
     # A small rotation of the camera, and of the object about the axis, in the camera's axes.
-    turn = np.zeros((len(turntable.frames), 3, len(covariance) + 1))
-    turn[:, :, layout.camera[1:4]] = np.eye(3)
-    turn[np.arange(len(turn)), :, layout.angle] += turntable.camera_rotation[:, 2]
-    turn = turn[..., :-1]
-    variance = np.einsum("fip,pq,fiq->f", turn, covariance, turn)
+    camera = np.zeros((_DRAWS, 5))
+    camera[:, : len(layout.camera)] = drawn[:, layout.camera]
+    turns = camera[:, None, 1:4] + angles[..., None] * turntable.camera_rotation[:, 2]
     # The camera over the disc: its distance from the axis, its height, and its way along the circle from the first
     # frame's. And the size of what turns.
     height, size = _landmark_gradients(adjusted)
-    place = np.stack([np.zeros(len(covariance)), -height])
-    if 4 in layout.camera:
-        place[0, layout.camera[4]] = turntable.distance
-    angles = np.append(covariance.diagonal(), 0.0)[layout.angle]
-    along = turntable.distance**2 * float(angles.max())
+    height = height if outline is None else _foot_gradient(adjusted, outline)
+    place = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
+    position = place[:, None] + (turntable.distance * angles) ** 2
+    foot_sigma = 0.0 if outline is None else outline.foot_sigma
     return Uncertainty(
         focal=float(sigmas[0]),
-        distance=distance,
+        distance=float(sigmas[4]) if 4 in layout.camera else 0.0,
         size=float(np.sqrt(size @ covariance @ size)),
         angle_deg=adjusted.angle_sigmas_deg(covariance),
-        rotation_deg=float(np.rad2deg(np.sqrt(variance.max()))),
-        position_m=metres * float(np.sqrt(np.trace(place @ covariance @ place.T) + along)),
+        rotation_deg=float(np.rad2deg(np.sqrt((turns**2).sum(axis=-1).max(axis=1).mean()))),
+        position_m=metres * float(np.sqrt(position.max(axis=1).mean() + foot_sigma**2)),
     )
+
+
+def _foot_gradient(adjusted: Adjusted, outline: ContainerOutline) -> Float[np.ndarray, "p"]:
+    """Derivatives of the height at which the container's foot, as it is seen, meets the axis' side of the camera."""
+    layout, turntable = adjusted.problem.layout, adjusted.turntable
+    rotations, _ = turntable.motions()
+    nearest = rotations[0].T @ [outline.radius, 0.0, outline.foot]
+    frame = np.zeros(1, int)
+    jacobian = projection_jacobian(turntable, frame, project(turntable, frame, nearest[None]))
+    gradient = np.zeros(layout.motion_size)
+    gradient[layout.camera] = -jacobian.camera[0, 1, : len(layout.camera)] / jacobian.point[0, 1, 2]
+    return gradient
 
 
 def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
@@ -75,15 +95,38 @@ def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Flo
     return shifts[lowest_landmarks(turntable), 2].mean(axis=0), size
 
 
-def with_hidden_errors(adjusted: Adjusted, markers: MarkerObservations) -> Adjusted:
+def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
     """The same turntable with a covariance that counts smooth displacements over the image (``smooth_fields``).
 
-    Residuals hardly show them, for another camera explains most of them.
+    Residuals hardly show them, for another camera explains most of them. Of features they show some, which then tell
+    how large the others are.
     """
-    hidden = _FIELD_PX * smooth_fields(markers.corners_px.reshape(-1, 2))
-    corners = MarkerResiduals(adjusted.turntable, markers, LOSS_SIGMAS, hidden=hidden)
-    problem = Problem(adjusted.turntable, *adjusted.problem.residuals[:-1], corners, free=adjusted.problem.free)
-    return replace(adjusted, problem=problem)
+    turntable, problem = adjusted.turntable, adjusted.problem
+    parts = [part.with_hidden(_FIELD_PX * smooth_fields(part.pixels)) for part in problem.residuals]
+    counted = Problem(turntable, *parts, free=problem.free)
+    larger = [
+        part.with_hidden(part.hidden * np.sqrt(max(1.0, _shown_variance(counted, turntable, k))))
+        if isinstance(part, PointResiduals) and part.hidden is not None
+        else part
+        for k, part in enumerate(parts)
+    ]
+    return replace(adjusted, problem=Problem(turntable, *larger, free=problem.free))
+
+
+def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
+    """Variance of the amplitudes of one kind's hidden errors, by the method of moments.
+
+    At the solution the derivatives of the cost by the amplitudes are V a + noise: V is what the parameters leave of
+    their information, and the noise is the scatter from point to point.
+    """
+    equations, hidden = problem.normal_equations(turntable), problem.layout.hidden[kind]
+    information, (_, scores) = equations.information(), equations.reduced()[kind]
+    shown = np.setdiff1d(np.arange(len(information)), np.concatenate(problem.layout.hidden))
+    response = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True) @ information[np.ix_(shown, hidden)]
+    left = information[np.ix_(hidden, hidden)] - information[np.ix_(hidden, shown)] @ response
+    scores = scores[:, hidden] - scores[:, shown] @ response
+    gradient = scores.sum(axis=0)
+    return float((gradient @ gradient - (scores**2).sum()) / (left**2).sum())
 
 
 def smooth_fields(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 k"]:

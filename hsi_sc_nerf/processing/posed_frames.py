@@ -127,7 +127,8 @@ def posed_frames(output_dir: Path, poses: TurntablePoses) -> list[PackedFrame]:
 def container_under(session: Session, poses: TurntablePoses) -> Container | None:
     """The container, where its size is known and the object frame is such that it stands on z = 0 and in metres."""
     diameter_m, height_m = session.info.container_diameter_m, session.info.container_height_m
-    feet_known = poses.method == "markers" or bool(poses.disc_markers) or not np.isfinite(poses.overall_error_px)
+    seen = bool(poses.disc_markers) or poses.disc_by_container
+    feet_known = seen or poses.method == "markers" or not np.isfinite(poses.overall_error_px)
     if diameter_m is None or height_m is None or not poses.metric or not feet_known:
         return None
     return Container(diameter_m, height_m)

@@ -53,7 +53,7 @@ def test_a_step_is_that_of_numerical_derivatives(kinds, free):
         return problem.moved(turntable, step[: layout.motion_size], [step[columns] for columns in layout.landmarks])
 
     def numbers(turntable):
-        _, prior, _ = problem.priors(turntable)
+        prior, _ = problem.priors(turntable)
         return np.concatenate([*(part.values(turntable).ravel() for part in residuals), prior])
 
     here = start if kinds == "sides" else moved(start, 0.03 * rng.normal(size=layout.size))

@@ -1,4 +1,6 @@
-"""The container's radius in drawn frames."""
+"""The container's radius and foot in drawn frames."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -7,7 +9,7 @@ from exact_turntable import marker_turntable, point_turntable
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.poses.container_outline import container_radius
+from hsi_sc_nerf.poses.container_outline import container_outline
 
 RADIUS_M, HEIGHT_M, OVER = 0.045, 0.07, 8
 
@@ -36,16 +38,22 @@ def drawn(scene, shift_m, contrast):
     return images
 
 
+@pytest.mark.parametrize("ends_m", [0.0, 0.03])
 @pytest.mark.parametrize("shift_m", [0.0, 0.002])
-def test_the_radius_is_that_of_the_drawn_container(turntable, shift_m):
+def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, ends_m):
+    """The features end where the lid is, or well above it."""
     scene, machine = turntable
-    top = HEIGHT_M - scene.first_camera_to_world[2, 3]
-    radius, sigma = container_radius(drawn(scene, shift_m, 60.0), machine, top, HEIGHT_M / RADIUS_M / 2.0)
-    assert radius == pytest.approx(RADIUS_M, rel=2.0 * sigma)
-    assert sigma < 0.01
+    camera_m = scene.first_camera_to_world[2, 3]
+    points_3d = machine.points_3d.copy()
+    points_3d[:, 2] += HEIGHT_M + ends_m - camera_m - np.percentile(points_3d[:, 2], 1.0)
+    machine = replace(machine, points_3d=points_3d)
+    found = container_outline(drawn(scene, shift_m, 60.0), machine, HEIGHT_M / RADIUS_M / 2.0)
+    assert found.radius == pytest.approx(RADIUS_M, rel=2.0 * found.radius_sigma)
+    assert found.radius_sigma < 0.015
+    assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
+    assert found.foot_sigma < 0.002
 
 
 def test_what_is_hardly_seen_is_not_measured(turntable):
     scene, machine = turntable
-    top = HEIGHT_M - scene.first_camera_to_world[2, 3]
-    assert container_radius(drawn(scene, 0.0, 0.0), machine, top, HEIGHT_M / RADIUS_M / 2.0) is None
+    assert container_outline(drawn(scene, 0.0, 0.0), machine, HEIGHT_M / RADIUS_M / 2.0) is None

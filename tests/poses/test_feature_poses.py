@@ -65,3 +65,16 @@ def test_known_angles_are_trusted_as_far_as_they_are_even(session, sign):
     assert sigma < 0.003
     uneven = true.angles_rad + np.tile([0.02, -0.02], len(true.angles_rad) // 2)
     assert prior_of_angles(found.turntable, uneven)[1] == pytest.approx(0.02, rel=0.1)
+
+
+def test_of_known_angles_none_is_held_for_exact():
+    """A first frame that stopped off its mark does not turn all others."""
+    true = point_turntable(marker_turntable(MarkerScene(size_px=256, frames=18)), 200)
+    true = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+    off_rad = np.zeros(18)
+    off_rad[0] = 0.01
+    known = (true.angles_rad + off_rad - off_rad[0], 0.002)
+    found = adjust_tracks(true, point_tracks(true, noise_px=0.3))
+    adjusted, _ = adjust_together(found, None, FreeParameters(known_angles=known))
+    away_rad = adjusted.turntable.angles_rad - true.angles_rad
+    assert np.abs(away_rad - away_rad[0])[1:].max() < 0.005

@@ -12,7 +12,6 @@ from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
 from hsi_sc_nerf.poses.track_adjustment import (
     adjust_either_way,
     adjust_tracks,
-    halves_differ,
     with_lost_frames,
 )
 from hsi_sc_nerf.poses.turntable import Turntable
@@ -123,18 +122,6 @@ def test_tracks_of_something_else_are_refused():
     few = point_tracks(true)
     with pytest.raises(InputError, match="too few points"):
         adjust_tracks(true, few.select(few.point < 5))
-
-
-@pytest.mark.slow
-def test_halves_of_the_points_tell_the_error():
-    true = machine(np.arange(0, 360, 18.0), points=400)
-    errors, told = [], []
-    for noise_px in (0.05, 0.5):
-        found = adjust_tracks(true, point_tracks(true, noise_px=noise_px))
-        errors.append(pose_error_deg(found.turntable, true))
-        told.append(np.rad2deg(halves_differ(found, FreeParameters())[1]))
-    assert told[0] < told[1]
-    assert 0.2 < told[1] / errors[1] < 10.0
 
 
 def test_lost_frames_come_back_at_their_angle():
