@@ -1,16 +1,20 @@
 """How well the material's reflectance is told apart from the light, on simulated sessions of known materials.
 
-    uv run python benchmarks/material_reflectance.py --objects pear apple maize
+    uv run hsi-sc-nerf simulate pear SESSION --frames 30 --size 96 --bands 24 \\
+        --effects chamber_shading '{inter_reflection: {bounces: 3}}' lamp
+    uv run python benchmarks/material_reflectance.py SESSION "pear, lamp"
 
-Each object is rendered in even light, in a chamber that it shades (three reflections between object, container and
-disc), and in such a chamber with a lamp, without noise. Mesh and poses are the true ones, so that nothing but the
-light is judged. A point's spectrum is that of its most frontal view, and its true one is what the same pixels show in
-even light. The white reference of a session with a lamp faces the lamp, which is the simulator's convention.
+Light is the noise-free one of the session's truth, mesh and poses are the true ones, so that nothing but the light is
+judged. A point's spectrum is that of its most frontal view; its true one is the reflectance of the same pixels. The
+white reference of a session with a lamp faces the lamp, which is the simulator's convention. With ``--even`` the
+session's light is replaced by even light.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -23,20 +27,13 @@ from hsi_sc_nerf.light.elements import Elements, spread_elements, support_mesh
 from hsi_sc_nerf.light.evidence import shading_evidence
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.observe import observe
+from hsi_sc_nerf.processing.scene_box import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
-from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
 from hsi_sc_nerf.simulate.true_surface import relative_rms
+from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
-SHADE = ("chamber_shading", "{inter_reflection: {bounces: 3}}")
-LIGHTS: dict[str, tuple[str, ...]] = {
-    "even": (),
-    "shaded chamber": SHADE,
-    "shaded chamber, lamp": (*SHADE, "lamp"),
-}
 COLUMNS = (
-    "object",
-    "light",
+    "session",
     "shading found",
     "profile",
     "brightness as measured, 5 to 95 %",
@@ -53,71 +50,86 @@ ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 POINTS, SPOTS, SPOT_RADIUS_M = 6000, 200, 0.005
 LIFT_M = 2e-4
 PURE = 0.999
-NO_DISTORTION = (0.0, 0.0, 0.0, 0.0)
+EVEN_STD = 0.01
+"""Stated uncertainty of what is not corrected: that of the white reference."""
 
 
 @dataclass(frozen=True)
 class MaterialReflectance:
-    """Simulate sessions, tell light and material apart, compare with the truth."""
+    """Tell light and material of a simulated session apart, and compare with the truth."""
 
-    objects: tuple[str, ...] = ("pear", "apple", "maize")
-    """Shipped scenes."""
-    size: int = 128
-    """Width and height of the images, pixels."""
-    frames: int = 24
-    """Frames of one turn."""
-    bands: int = 12
-    """Spectral bands."""
+    session: tyro.conf.Positional[Path]
+    """Folder of a simulated session."""
+    name: tyro.conf.Positional[str]
+    """Of the session, in the table."""
+    even: bool = False
+    """Take even light instead of the session's own."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
-        """Measure; each row is written as soon as it is known."""
-        for name in self.objects:
-            even: Float[np.ndarray, "frames h w bands"] | None = None
-            for light, effects in LIGHTS.items():
-                scene = override(
-                    load_scene(name), size_px=self.size, frames=self.frames, bands=self.bands, effects=effects
-                )
-                scene = replace(scene, camera=replace(scene.camera, supersampling=3))
-                simulation = Simulation(scene)
-                frames = [simulation.frame(number) for number in range(self.frames)]
-                shown = np.stack([frame.light.radiance() for frame in frames])
-                even = shown if even is None else even
-                masks = np.stack([frame.coverage >= PURE for frame in frames])
-                row = [name, light, *judge(scene, simulation, shown, even, masks)]
-                write_results("material_reflectance", COLUMNS, [row], keys=2, folder=self.results)
+        """Measure, and write the table's row."""
+        truth = load_truth(self.session)
+        row = [self.name, *judge(truth, container_of(self.session), even=self.even)]
+        write_results("material_reflectance", COLUMNS, [row], keys=1, folder=self.results)
 
 
-def judge(scene: Scene, simulation: Simulation, shown: np.ndarray, even: np.ndarray, masks: np.ndarray) -> list[str]:
+def container_of(session: Path) -> tuple[float, float]:
+    """Diameter and height of the container, metres."""
+    values = json.loads((session / "truth" / "truth.json").read_text(encoding="utf-8"))["container"]
+    return values["diameter_m"], values["height_m"]
+
+
+def judge(truth: Truth, container_m: tuple[float, float], *, even: bool) -> list[str]:
     """The figures of one session."""
-    mesh, poses = simulation.object_part.mesh, simulation.camera_to_world
-    container = scene.container.diameter_m, scene.container.height_m
-    support = support_mesh(container, scene.turntable.disc_diameter_m / 2.0)
+    mesh, poses = truth.mesh(), truth.camera_to_world
+    corners = np.concatenate(list(truth.marker_layout.values()))
+    support = support_mesh(container_m, DISC_OVER_MARKERS * float(np.hypot(*corners[:, :2].T).max()))
     elements = spread_elements(mesh, mesh.vertex_normals(), support, ELEMENTS, SUPPORT_ELEMENTS)
-    camera = poses, simulation.intrinsics, NO_DISTORTION, masks
-    views = observe(elements, *camera, lambda f, line, s: shown[f, line, s].astype(float), LIFT_M)
-    lamps = [effect for effect in scene.effects if isinstance(effect, Lamp)]
-    facing = lamps[0].direction(np.eye(4)) if lamps else np.array([0.0, 0.0, 1.0])
+    masks = np.stack([truth.object_coverage(capture) >= PURE for capture in truth.captures])
+
+    @lru_cache(maxsize=len(truth.captures))
+    def cubes(frame: int) -> Float[np.ndarray, "h w both"]:
+        capture = truth.captures[frame]
+        material = truth.reflectance(capture)
+        shown = material if even else truth.light(capture).radiance()
+        return np.concatenate([shown, material], axis=-1)
+
+    def observed(some: Elements) -> tuple:
+        views = observe(
+            some,
+            poses,
+            truth.intrinsics,
+            truth.distortion,
+            masks,
+            lambda frame, line, sample: cubes(frame)[line, sample].astype(float),
+            LIFT_M,
+        )
+        shown, material = np.split(views.reflectance, 2, axis=1)
+        return replace(views, reflectance=shown), material
+
+    views, _ = observed(elements)
+    facing = np.array([0.0, 0.0, 1.0])
+    if "lamp" in truth.effects and not even:
+        facing = Lamp(**truth.effects["lamp"]).direction(np.eye(4))
     turning = turning_elements(elements, poses[:, :3, :3], LIFT_M)
     found = light_on_object(elements, turning, views, facing)
     evidence = shading_evidence(turning, views, found.spectral)
 
     points = frontal_points(elements, mesh)
-    both = np.concatenate([shown, even], axis=-1)
-    seen = observe(points, *camera, lambda f, line, s: both[f, line, s].astype(float), LIFT_M)
+    seen, material = observed(points)
     sight = poses[seen.frame, :3, 3] - points.positions[seen.element]
     cosines = (sight * points.normals[seen.element]).sum(axis=1) / np.linalg.norm(sight, axis=1)
     order = np.lexsort([-cosines, seen.element])
     point, first = np.unique(seen.element[order], return_index=True)
     best = order[first]
-    measured, true = np.split(seen.reflectance[best], 2, axis=1)
-    material, relative = measured, np.full(len(best), 0.01)
+    measured, true = seen.reflectance[best], material[best]
+    corrected, relative = measured, np.full(len(best), EVEN_STD)
     if evidence.shaded:
         irradiance, std = found.irradiance(points.positions[point], points.normals[point], seen.frame[best])
-        material, relative = measured / irradiance, std / irradiance.mean(axis=1)
-    bright, apparent = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (material, measured))
-    spots, spots_apparent = (spot_errors(points.positions[point], spectra, true) for spectra in (material, measured))
+        corrected, relative = measured / irradiance, std / irradiance.mean(axis=1)
+    bright, apparent = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (corrected, measured))
+    spots, spots_apparent = (spot_errors(points.positions[point], spectra, true) for spectra in (corrected, measured))
     sigmas = np.abs(bright - 1.0) / relative
     span = "{:.3f} to {:.3f}"
     return [

@@ -1,0 +1,106 @@
+"""The light on a run's object, and the command: a ball under a lamp, whose irradiance is known in closed form."""
+
+import ball_run
+import capture_factory as factory
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.cli.light import bands_of, summary, with_material
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.geometry.camera import pixel_rays
+from hsi_sc_nerf.light.of_run import light_of_run
+from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.packed.cube import pack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import open_packed
+
+TO_LAMP = np.array([-0.45, 0.3, 0.84]) / np.linalg.norm([-0.45, 0.3, 0.84])
+LAMP = 0.5
+FACING = np.array([0.0, 0.0, 1.0])
+
+
+def irradiance(normals, camera_to_world):
+    """On the ball without its surroundings, relative to a white reference that faces the camera."""
+    cosines = np.maximum(normals @ camera_to_world[:3, :3] @ TO_LAMP, 0.0)
+    return (1.0 - LAMP + LAMP * cosines) / (1.0 - LAMP + LAMP * TO_LAMP[2])
+
+
+def open_lit_ball(root, lit):
+    dataset = open_packed(ball_run.write_ball_dataset(root / "data"))
+    for frame in dataset.frames if lit else ():
+        mask = frame.mask()
+        line, sample = np.nonzero(mask)
+        pixels = np.stack([sample, line], axis=1) + 0.5
+        origin, directions = pixel_rays(dataset.intrinsics, frame.camera_to_world, pixels)
+        to_centre = factory.SPHERE_CENTRE_M - origin
+        along = directions @ to_centre
+        hidden = to_centre @ to_centre - along**2
+        depth = along - np.sqrt(np.maximum(factory.SPHERE_RADIUS_M**2 - hidden, 0.0))
+        normals = (origin + depth[:, None] * directions - factory.SPHERE_CENTRE_M) / factory.SPHERE_RADIUS_M
+        reflectance = np.broadcast_to(factory.BACKGROUND, (*mask.shape, factory.BANDS)).copy()
+        reflectance[mask] = factory.PLANT * irradiance(normals, frame.camera_to_world)[:, None]
+        write_packed_cube(frame.cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
+    run = open_run(ball_run.write_untrained_run(root / "data", root / "runs"))
+    ball_run.fill_with_ball(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory):
+    return light_of_run(open_lit_ball(tmp_path_factory.mktemp("lit"), lit=True), FACING)
+
+
+@pytest.fixture(scope="module")
+def even(tmp_path_factory):
+    return light_of_run(open_lit_ball(tmp_path_factory.mktemp("even"), lit=False), FACING)
+
+
+def cloud_of(found, frames):
+    """Points of the surface with what their frames measure of them."""
+    points = found.run.to_metres(sample_surface(found.mesh.vertices, found.mesh.triangles, 400))
+    normals = points - factory.SPHERE_CENTRE_M
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cameras = found.run.refined_poses_m()[
+        found.run.manager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
+    ]
+    cosines = np.stack([(normals * (pose[:3, 3] - points)).sum(axis=1) for pose in cameras], axis=1)
+    best = cosines.argmax(axis=1)
+    light = np.array([irradiance(n, cameras[b]) for n, b in zip(normals, best, strict=True)]) if frames else 1.0
+    spectra = (factory.PLANT * np.broadcast_to(light, len(points))[:, None]).astype(np.float32)
+    colours = np.zeros((len(points), 3), np.uint8)
+    cloud = SpectralCloud(
+        points.astype(np.float32), normals.astype(np.float32), colours, spectra, factory.WAVELENGTHS_NM
+    )
+    return cloud.select(cosines.max(axis=1) > 0.5 * np.linalg.norm(cameras[0, :3, 3]))
+
+
+def test_a_lamp_on_a_run_is_found_and_taken_away(lit):
+    assert lit.evidence.shaded
+    cloud = cloud_of(lit, frames=True)
+    corrected = with_material(cloud, lit, np.arange(factory.BANDS), corrected=True)
+    assert list(corrected.extra)[-2:] == ["irradiance", "irradiance_std"]
+    material = np.stack([corrected.extra[name] for name in list(corrected.extra)[: factory.BANDS]], axis=1)
+    measured = cloud.spectra.mean(axis=1) / factory.PLANT.mean()
+    found = material.mean(axis=1) / factory.PLANT.mean()
+    assert np.quantile(np.abs(measured / np.median(measured) - 1.0), 0.9) > 0.08
+    assert np.quantile(np.abs(found / np.median(found) - 1.0), 0.9) < 0.05
+    assert np.median(found) == pytest.approx(1.0, abs=0.05)
+    assert (corrected.extra["irradiance_std"] > 0.0).all()
+    np.testing.assert_array_equal(corrected.spectra, cloud.spectra)
+    told = summary(lit, corrected=True)
+    assert told["shaded"] is True
+    assert len(told["light"]["lamps"]) >= 1
+
+
+def test_even_light_is_left_alone(even):
+    assert not even.evidence.shaded
+    cloud = cloud_of(even, frames=False)
+    same = with_material(cloud, even, np.arange(factory.BANDS), corrected=False)
+    np.testing.assert_array_equal(same.extra["material_400.00nm"], cloud.spectra[:, 0])
+    np.testing.assert_array_equal(same.extra["irradiance"], 1.0)
+
+
+def test_a_cloud_of_other_bands_is_refused(tmp_path):
+    with pytest.raises(InputError):
+        bands_of(np.array([500.0, 512.0]), np.array([500.0, 510.0]), tmp_path / "cloud.ply")
