@@ -27,12 +27,16 @@ BEHIND = -0.2
 """Lamps stand on the camera's side: the cosine between their direction and the camera's is above this. By a body
 alone, a lamp before it and another behind it can hardly be told from one lamp and an uneven chamber."""
 CALLED_FOR = 30.0
-"""Twice the logarithm of likelihood that a lamp must gain: three parameters among 200 directions, with a margin."""
+"""Twice the logarithm of probability that a lamp must gain: three parameters among 200 directions, with a margin."""
 LEAST_LAMP = 0.02
 """Weaker lamps are none."""
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
 """Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
 are seen tell what is to be expected of those that are not."""
+MOST_UNEVEN = 0.1
+"""A chamber's harmonics are no larger: what is more uneven is a lamp."""
+LEAST_DISTANCE_M = 0.25
+"""Of lamps, which the first order of their nearness still describes."""
 LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
 """Expected size of a lamp, of a correction of its direction, and of one over the lamps' distance (1/m)."""
 WHITE_STD = 0.01
@@ -98,6 +102,8 @@ def fit_light(
         if misfit - fit.misfit(before) < CALLED_FOR or fit.light.lamps.min() < LEAST_LAMP:
             fit.restore(before)
             break
+    # Only what no lamp explains is the chamber's.
+    fit.converge(see_unevenness=True)
     return fit.result()
 
 
@@ -129,8 +135,8 @@ class _Fit:
         for name, value in state.items():
             setattr(self, name, value)
 
-    def converge(self) -> None:
-        """Gauss-Newton with so many lamps as there are."""
+    def converge(self, *, see_unevenness: bool = False) -> None:
+        """Gauss-Newton with so many lamps as there are; the chamber's unevenness is found as well if so."""
         for _ in range(STEPS):
             self._bounce()
             residual, jacobian = self._linearised()
@@ -143,7 +149,8 @@ class _Fit:
             hessian = weighted.T @ jacobian + prior
             step = np.linalg.solve(hessian, weighted.T @ residual[:, 0] + pull)
             self._move(step)
-            self._see_unevenness(np.linalg.inv(hessian))
+            if see_unevenness:
+                self._see_unevenness(np.linalg.inv(hessian))
             self._see_colours()
 
     def add_lamp(self) -> bool:
@@ -178,12 +185,13 @@ class _Fit:
         return True
 
     def misfit(self, weighting: dict) -> float:
-        """Minus twice the logarithm of likelihood, with the weights and scatter of a `state`."""
+        """Minus twice the logarithm of posterior probability, with the weights and scatter of a `state`."""
         self._bounce()
         residual, _ = self._linearised()
         (residual,) = self._without_materials(residual[:, None])
         squares = weighting["weights"] * self.views.tells_light * residual[:, 0] ** 2
-        return float(squares.sum() / (CORRELATED * weighting["scatter"] ** 2))
+        unexpected = (self.light.chamber[harmonic_degrees(DEGREE) > 0] / self.unevenness) ** 2
+        return float(squares.sum() / (CORRELATED * weighting["scatter"] ** 2) + unexpected.sum())
 
     def result(self) -> LightFit:
         """What the fit says, with the light's uncertainty.
@@ -296,7 +304,7 @@ class _Fit:
                 chamber=light.chamber + step[:TERMS],
                 lamps=np.maximum(light.lamps + step[TERMS : TERMS + lamps], 0.1 * light.lamps),
                 to_lamps=to_lamps / np.maximum(np.linalg.norm(to_lamps, axis=1, keepdims=True), 1e-9),
-                nearness=max(light.nearness + step[-1], 0.0) if lamps else 0.0,
+                nearness=float(np.clip(light.nearness + step[-1], 0.0, 1.0 / LEAST_DISTANCE_M)) if lamps else 0.0,
             )
         )
 
@@ -310,7 +318,7 @@ class _Fit:
         uneven = harmonic_degrees(DEGREE) > 0
         seen = np.clip(1.0 - np.diag(covariance)[:TERMS] / self.unevenness**2, 0.0, 1.0)[uneven].sum()
         square = (self.light.chamber[uneven] ** 2).sum() + UNEVENNESS_COUNT * UNEVENNESS**2
-        self.unevenness = float(np.sqrt(square / (seen + UNEVENNESS_COUNT)))
+        self.unevenness = min(float(np.sqrt(square / (seen + UNEVENNESS_COUNT))), MOST_UNEVEN)
 
     def _see_colours(self) -> None:
         """The colour of the lamps that fits each band best; the white reference stays white."""

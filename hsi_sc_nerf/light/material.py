@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
@@ -131,9 +132,9 @@ def light_on_object(
     light = fit.light
     light = replace(light, chamber_colour=between @ light.chamber_colour, lamp_colour=between @ light.lamp_colour)
     irradiance = fit.irradiance @ between.T
-    above, below = np.zeros((2, len(elements.positions), bands))
-    np.add.at(above, views.element, fit.weights[:, None] * views.reflectance * irradiance)
-    np.add.at(below, views.element, fit.weights[:, None] * irradiance**2)
+    entries = fit.weights, (views.element, np.arange(len(views.element)))
+    weighted = scipy.sparse.csr_array(entries, shape=(len(elements.positions), len(views.element)))
+    above, below = weighted @ (views.reflectance * irradiance), weighted @ irradiance**2
     seen = below[:, 0] > 0.0
     material = np.clip(above / np.maximum(below, 1e-9), 1e-4, 1.0)
     material[~seen] = material[seen][cKDTree(elements.positions[seen]).query(elements.positions[~seen])[1]]

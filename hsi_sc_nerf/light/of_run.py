@@ -82,6 +82,8 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     cameras, batch = run.manager.train_dataset.cameras, run.model.config.eval_num_rays_per_chunk
     renders = render_depth_maps(run.model, cameras, sampler.masks, batch)
     mesh = tsdf_fusion(renders, run.to_scene(dataset.object_box_m))
+    if mesh is not None:
+        mesh = seen_part(mesh, renders)
     if mesh is None or not len(mesh.triangles):
         raise InputError("the run holds no object that could cast shade; train longer.")
     scanned = Mesh(run.to_metres(mesh.vertices), mesh.triangles)
@@ -106,6 +108,16 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     turning = turning_elements(elements, poses[:, :3, :3], LIFT_M)
     light = light_on_object(elements, turning, views, white_normal)
     return RunLight(run, light, shading_evidence(turning, views, light.spectral), renders, mesh)
+
+
+def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
+    """The triangles that some frame sees: fusion also leaves a shell within the object, where its distances end."""
+    middles = mesh.vertices[mesh.triangles].mean(axis=1)
+    device = renders.camera_to_world.device
+    where, outward = (torch.from_numpy(array).float().to(device) for array in (middles, mesh.facet_normals()))
+    triangles = mesh.triangles[(renders.most_frontal(where, outward)[0] >= 0).cpu().numpy()]
+    used, corners = np.unique(triangles, return_inverse=True)
+    return SurfaceMesh(mesh.vertices[used], corners.reshape(-1, 3))
 
 
 def smooth_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
