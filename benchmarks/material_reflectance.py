@@ -48,7 +48,7 @@ COLUMNS = (
 )
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 POINTS, SPOTS, SPOT_RADIUS_M = 6000, 200, 0.005
-LIFT_M = 2e-4
+LIFT_M, SMOOTHING_M = 2e-4, 0.003
 PURE = 0.999
 EVEN_STD = 0.01
 """Stated uncertainty of what is not corrected: that of the white reference."""
@@ -85,7 +85,7 @@ def judge(truth: Truth, container_m: tuple[float, float], *, even: bool) -> list
     mesh, poses = truth.mesh(), truth.camera_to_world
     corners = np.concatenate(list(truth.marker_layout.values()))
     support = support_mesh(container_m, DISC_OVER_MARKERS * float(np.hypot(*corners[:, :2].T).max()))
-    elements = spread_elements(mesh, mesh.vertex_normals(), support, ELEMENTS, SUPPORT_ELEMENTS)
+    elements = spread_elements(mesh, support, ELEMENTS, SUPPORT_ELEMENTS, SMOOTHING_M)
     masks = np.stack([truth.object_coverage(capture) >= PURE for capture in truth.captures])
 
     @lru_cache(maxsize=len(truth.captures))
@@ -149,7 +149,7 @@ def judge(truth: Truth, container_m: tuple[float, float], *, even: bool) -> list
 
 def frontal_points(elements: Elements, mesh: Mesh) -> Elements:
     """Points of the object as a cloud has them, among the same occluders."""
-    own = spread_elements(mesh, mesh.vertex_normals(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), int)), POINTS, 0)
+    own = spread_elements(mesh, Mesh(np.zeros((0, 3)), np.zeros((0, 3), int)), POINTS, 0, SMOOTHING_M)
     return replace(own, occluders=elements.occluders, of_triangle=elements.of_triangle)
 
 

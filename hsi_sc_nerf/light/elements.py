@@ -36,20 +36,18 @@ class Elements:
     of_triangle: Int[np.ndarray, "t"]
 
 
-def spread_elements(
-    scanned: Mesh, normals: Float[np.ndarray, "v 3"], support: Mesh, on_object: int, on_support: int
-) -> Elements:
+def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: int, smoothing_m: float) -> Elements:
     """Elements spread evenly over the object and its support.
 
     Args:
         scanned: the object's mesh, with or without holes.
-        normals: outward unit normals at its vertices, smooth enough to cast shade by.
         support: what it stands on (`support_mesh`); may have no triangles.
         on_object: elements of the object.
         on_support: elements of the support.
+        smoothing_m: normals of the object are means over this radius: about a pixel, which shows no more.
     """
     points = [sample_surface(scanned.vertices, scanned.triangles, on_object)]
-    own = [normals[cKDTree(scanned.vertices).query(points[0])[1]]]
+    own = [smooth_normals(scanned, points[0], smoothing_m)]
     of_triangle = [_nearest(scanned, points[0], own[0])]
     if len(support.triangles):
         points.append(sample_surface(support.vertices, support.triangles, on_support))
@@ -63,6 +61,16 @@ def spread_elements(
     positions = np.concatenate(points)
     is_object = np.arange(len(positions)) < on_object
     return Elements(positions, np.concatenate(own), is_object, whole, np.concatenate(of_triangle))
+
+
+def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: float) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals at points of a mesh: area-weighted means over its vertices within a radius."""
+    tree, vertices = cKDTree(mesh.vertices), mesh.area_weighted_normals()
+    nearest = tree.query(positions)[1]
+    sums = np.empty((len(positions), 3))
+    for row, near in enumerate(tree.query_ball_point(positions, radius_m)):
+        sums[row] = vertices[near].sum(axis=0) if near else vertices[nearest[row]]
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
 
 
 def _nearest(

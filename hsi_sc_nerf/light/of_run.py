@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -24,8 +23,8 @@ ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 """On the object and on what it stands on: 2 to 4 mm apart on a fruit."""
 LIFT_M = 0.0005
 """Rays begin so far outside of the surface: half a voxel of the mesh."""
-SMOOTHING_VERTICES = 24
-"""Normals are means over so many vertices of the mesh, which is rough by its voxels."""
+SMOOTHING_M = 0.003
+"""Normals are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
 """Fewer measurements tell nothing of the light."""
 
@@ -90,7 +89,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     container = dataset.container
     size_m = None if container is None else (container.diameter_m, container.height_m)
     support = support_mesh(size_m, float(dataset.scene_box_m[1, 0]))
-    elements = spread_elements(scanned, smooth_normals(scanned), support, ELEMENTS, SUPPORT_ELEMENTS)
+    elements = spread_elements(scanned, support, ELEMENTS, SUPPORT_ELEMENTS, SMOOTHING_M)
     poses = renders.camera_to_world.cpu().numpy().astype(float)
     poses[:, :3, 3] = run.to_metres(poses[:, :3, 3])
 
@@ -118,10 +117,3 @@ def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
     triangles = mesh.triangles[(renders.most_frontal(where, outward)[0] >= 0).cpu().numpy()]
     used, corners = np.unique(triangles, return_inverse=True)
     return SurfaceMesh(mesh.vertices[used], corners.reshape(-1, 3))
-
-
-def smooth_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Outward unit normals at the vertices of a rough mesh: area-weighted means over ``SMOOTHING_VERTICES``."""
-    _, nearest = cKDTree(mesh.vertices).query(mesh.vertices, min(SMOOTHING_VERTICES, len(mesh.vertices)))
-    normals = mesh.area_weighted_normals()[nearest.reshape(len(mesh.vertices), -1)].sum(axis=1)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -56,28 +56,32 @@ def even(tmp_path_factory):
     return light_of_run(open_lit_ball(tmp_path_factory.mktemp("even"), lit=False), FACING)
 
 
-def cloud_of(found, frames):
-    """Points of the surface with what their frames measure of them."""
-    points = found.run.to_metres(sample_surface(found.mesh.vertices, found.mesh.triangles, 400))
+def upper_cloud(found, lit):
+    """Points of the upper half, which the disc hardly shades, with what their most frontal frames measure of them."""
+    run = found.run
+    points = run.to_metres(sample_surface(found.mesh.vertices, found.mesh.triangles, 600))
     normals = points - factory.SPHERE_CENTRE_M
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    cameras = found.run.refined_poses_m()[
-        found.run.manager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
-    ]
-    cosines = np.stack([(normals * (pose[:3, 3] - points)).sum(axis=1) for pose in cameras], axis=1)
-    best = cosines.argmax(axis=1)
-    light = np.array([irradiance(n, cameras[b]) for n, b in zip(normals, best, strict=True)]) if frames else 1.0
-    spectra = (factory.PLANT * np.broadcast_to(light, len(points))[:, None]).astype(np.float32)
-    colours = np.zeros((len(points), 3), np.uint8)
+    frames = run.manager.train_dataparser_outputs.metadata["turntable"]["frame_indices"]
+    cameras = run.refined_poses_m()[frames]
+    sight = cameras[:, :3, 3] - points[:, None]
+    cosines = (normals[:, None] * sight).sum(axis=-1) / np.linalg.norm(sight, axis=-1)
+    light = np.ones(len(points))
+    if lit:
+        light = np.array([irradiance(n, cameras[c]) for n, c in zip(normals, cosines.argmax(axis=1), strict=True)])
     cloud = SpectralCloud(
-        points.astype(np.float32), normals.astype(np.float32), colours, spectra, factory.WAVELENGTHS_NM
+        points.astype(np.float32),
+        normals.astype(np.float32),
+        np.zeros((len(points), 3), np.uint8),
+        (factory.PLANT * light[:, None]).astype(np.float32),
+        factory.WAVELENGTHS_NM,
     )
-    return cloud.select(cosines.max(axis=1) > 0.5 * np.linalg.norm(cameras[0, :3, 3]))
+    return cloud.select((cosines.max(axis=1) > 0.5) & (normals[:, 2] > 0.2))
 
 
 def test_a_lamp_on_a_run_is_found_and_taken_away(lit):
     assert lit.evidence.shaded
-    cloud = cloud_of(lit, frames=True)
+    cloud = upper_cloud(lit, lit=True)
     corrected = with_material(cloud, lit, np.arange(factory.BANDS), corrected=True)
     assert list(corrected.extra)[-2:] == ["irradiance", "irradiance_std"]
     material = np.stack([corrected.extra[name] for name in list(corrected.extra)[: factory.BANDS]], axis=1)
@@ -95,7 +99,7 @@ def test_a_lamp_on_a_run_is_found_and_taken_away(lit):
 
 def test_even_light_is_left_alone(even):
     assert not even.evidence.shaded
-    cloud = cloud_of(even, frames=False)
+    cloud = upper_cloud(even, lit=False)
     same = with_material(cloud, even, np.arange(factory.BANDS), corrected=False)
     np.testing.assert_array_equal(same.extra["material_400.00nm"], cloud.spectra[:, 0])
     np.testing.assert_array_equal(same.extra["irradiance"], 1.0)

@@ -17,7 +17,7 @@ def ball_over(disc_radius_m: float, height_m: float = 0.0) -> tuple[Elements, Tr
     ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_M)
     mesh = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, height_m]))
     support = support_mesh(None, disc_radius_m)
-    elements = spread_elements(mesh, mesh.vertex_normals(), support, 300, 200 if disc_radius_m else 0)
+    elements = spread_elements(mesh, support, 300, 200 if disc_radius_m else 0, smoothing_m=0.003)
     rays = elements.occluders, elements.of_triangle, len(elements.positions), DIRECTIONS
     return elements, transfer(elements.positions, elements.normals, *rays, lift_m=1e-4)
 
