@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
+from hsi_sc_nerf.cli.light import MaterialCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, MarkersCommand, ProcessCommand, SimulateCommand
 from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand
@@ -26,6 +27,7 @@ Commands = (
     | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SampleCommand, tyro.conf.subcommand("sample")]
+    | Annotated[MaterialCommand, tyro.conf.subcommand("material")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
     | Annotated[TraitsCommand, tyro.conf.subcommand("traits")]

@@ -42,6 +42,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "saturated": ("1", "fraction of these frames in which the pixel is saturated or without data"),
     "sampled_views": ("1", "number of training views that were averaged"),
     "sampled_std": ("1", "standard deviation of the reflectance over these views, mean over bands"),
+    "irradiance": ("1", "irradiance relative to that on the white reference, mean over bands"),
+    "irradiance_std": ("1", "standard deviation of it; material_ columns hold reflectance divided by irradiance"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
@@ -25,6 +26,8 @@ from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
 from hsi_sc_nerf.simulate.surface import Surface
 
 SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
+FAINT = 1e-3
+"""Largest weight of a colour of three materials or more that is neglected."""
 Colour: TypeAlias = tuple[int, ...]
 """Materials (columns of the endmembers), ascending, whose reflectances are multiplied; white if empty."""
 
@@ -101,10 +104,29 @@ class Lighting:
         for factor, lit in ((at_hits.chamber, self._light.chamber_lit), (at_hits.lamp, self._light.lamp_lit)):
             if factor.any():
                 light[:, : lit.shape[1]] += hits.mix(surface.triangles, len(lit), factor) @ lit
+        light[:, : self._light.chamber_lit.shape[1]] += self._reflected_lamps(hits, camera_to_world)
         light[:, chamber] = 1.0 - hits.mean(np.ones(count))
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
         return light, colours
+
+    def _reflected_lamps(
+        self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "pixels colours"] | float:
+        """Light of lamps that has met two surfaces or more, as weights of the surface's colours."""
+        surface, lamps = self._light.surface, 0.0
+        if self._light.reflection is not None:
+            lamps = sum(effect.on_points(surface, camera_to_world) for effect in self._on_view)
+        if not np.any(lamps):
+            return 0.0
+        materials = self._light.materials
+        leaving = materials * np.asarray(lamps, np.float32)[:, None]
+        reflected = self._light.reflection(_single_colours(self._renderer), leaving, materials)
+        weights = np.zeros_like(self._light.lamp_lit)
+        for column, colour in enumerate(self._light.colours):
+            # Faint colours may be neglected in one light and not in the other.
+            weights[:, column] += reflected.get(colour, 0.0)
+        return hits.mix(surface.triangles, len(weights)) @ weights
 
 
 @dataclass(frozen=True)
@@ -153,17 +175,60 @@ class SurfaceLight:
         colours: colour of each column; the first columns are the renderer's materials in their order.
         chamber_lit: weights under a chamber of radiance 1.
         lamp_lit: weights under a lamp of irradiance 1 at each point.
+        reflection: how surfaces light each other; None if they do not.
     """
 
     surface: Surface
     colours: tuple[Colour, ...]
     chamber_lit: Float[np.ndarray, "p colours"]
     lamp_lit: Float[np.ndarray, "p colours"]
+    reflection: Reflection | None = None
 
     @property
     def materials(self) -> Float[np.ndarray, "p materials"]:
         """Fraction of each material at each point."""
         return self.surface.renderer.weights[self.surface.vertex]
+
+
+@dataclass(frozen=True, eq=False)
+class Reflection:
+    """Diffuse reflections between the points of a surface.
+
+    Attributes:
+        form_factors: fraction of each point (column) in the view of each point (row).
+        bounces: reflections that light is followed over.
+    """
+
+    form_factors: scipy.sparse.csr_array
+    bounces: int
+
+    def __call__(
+        self, colours: Sequence[Colour], leaving: Float[np.ndarray, "p colours"], materials: np.ndarray
+    ) -> dict[Colour, Float[np.ndarray, "p"]]:
+        """Light that has been reflected since it left the surface, by colour.
+
+        Args:
+            colours: of the leaving light.
+            leaving: weights of these colours at each point.
+            materials: fraction of each material at each point.
+        """
+        total: dict[Colour, np.ndarray] = {}
+        for bounce in range(self.bounces):
+            arriving = (self.form_factors @ leaving).astype(np.float32)
+            reflected: dict[Colour, np.ndarray] = {}
+            for i, material in enumerate(materials.T):
+                at = np.flatnonzero(material)
+                for colour, of_neighbour in zip(colours, arriving.T, strict=True):
+                    product = material[at] * of_neighbour[at]
+                    if product.max(initial=0.0) > (FAINT if bounce else 0.0):
+                        longer = tuple(sorted((*colour, i)))
+                        reflected.setdefault(longer, np.zeros(len(materials), np.float32))[at] += product
+            for colour, weights in reflected.items():
+                total[colour] = total.get(colour, 0.0) + weights
+            if not reflected:
+                break
+            colours, leaving = tuple(reflected), np.column_stack(list(reflected.values()))
+        return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +264,12 @@ class ViewLightEffect(Effect):
     def at_hits(self, hits: Hits, light: HitLight, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
         """The light under the effect at the hits of the camera's rays."""
         raise NotImplementedError
+
+    def on_points(
+        self, surface: Surface, camera_to_world: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "p"] | float:
+        """Irradiance that the effect adds at the points of a surface, which others reflect."""
+        return 0.0
 
 
 LightEffect: TypeAlias = SurfaceLightEffect | ViewLightEffect

@@ -69,6 +69,30 @@ def test_what_stands_before_the_chamber_is_seen_through_the_light_as_well():
     assert background[0][-1] < 0.9
 
 
+# Reflections
+
+
+@pytest.mark.parametrize("bounces", [1, 3])
+def test_reflections_sum_the_series_of_form_factors(still_life, bounces):
+    """Slow reference: dense powers of the form factors, all materials white."""
+    effects = ChamberShading(16), InterReflection(16, bounces), Lamp(0.5)
+    lighting = Lighting(still_life, effects)
+    surface, camera = lighting._light.surface, np.eye(4)
+    around = surface.surroundings(16)
+    factors = around.form_factors.toarray()
+    arriving, expected = 0.5 * around.chamber_visibility + Lamp(0.5).on_points(surface, camera), 0.0
+    for _ in range(bounces):
+        arriving = factors @ arriving
+        expected = expected + arriving
+    points = np.array([[0.07, 0.0], [0.0, -0.08], [0.02, 0.02]])
+    origins = np.column_stack([points, np.full(len(points), 0.5)]).astype(np.float32)
+    hits = still_life.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
+    seen = if_white(*lighting.light(hits, camera))[:, 0]
+    direct = Lighting(still_life, [ChamberShading(16), Lamp(0.5)])
+    seen -= if_white(*direct.light(hits, camera))[:, 0]
+    np.testing.assert_allclose(seen, hits.mix(surface.triangles, len(expected)) @ expected, rtol=0.01)
+
+
 # Energy
 
 

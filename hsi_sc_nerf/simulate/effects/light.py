@@ -13,8 +13,9 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
-from hsi_sc_nerf.simulate.light import HitLight, SurfaceLight, SurfaceLightEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.render import Hits
+from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
+from hsi_sc_nerf.simulate.render import RAY_START_M, Hits
+from hsi_sc_nerf.simulate.surface import Surface
 
 DIRECTIONS = 96
 """Default number of directions in which the surroundings of a point are sampled."""
@@ -40,37 +41,30 @@ class ChamberShading(SurfaceLightEffect):
 
 @dataclass(frozen=True)
 class InterReflection(SurfaceLightEffect):
-    """Object, container and disc illuminate each other by one diffuse reflection.
+    """Object, container and disc illuminate each other by diffuse reflections.
 
     Irradiance is that of the visible chamber, as in `ChamberShading`, plus the light of the occluders. The occluders
     are lit as without this effect: evenly, or as `ChamberShading` determines if it is on. The back of a surface sends
-    no light.
+    no light. The light of a `Lamp` is reflected as well.
     """
 
     name: ClassVar[str] = "inter_reflection"
     directions: int = between(8, 4096, default=DIRECTIONS)
     """Directions sampled at each point; the error is inversely proportional to it, the time proportional."""
+    bounces: int = between(1, 8, default=1)
+    """Reflections that light is followed over."""
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
-        """Add one colour for each pair of materials of which one illuminates the other."""
+        """Add one colour for each set of materials that light meets on its way."""
         around = light.surface.surroundings(self.directions)
-        materials = light.materials
-        from_neighbours = (around.form_factors @ light.chamber_lit).astype(np.float32)
-        plain = materials * around.chamber_visibility.astype(np.float32)[:, None]
-        bounced: dict = {}
-        for i, material in enumerate(materials.T):
-            at = np.flatnonzero(material)
-            for j, of_neighbour in enumerate(from_neighbours.T):
-                product = material[at] * of_neighbour[at]
-                if product.any():
-                    colour = tuple(sorted((*light.colours[j], i)))
-                    if colour not in bounced:
-                        bounced[colour] = np.zeros(len(materials), np.float32)
-                    bounced[colour][at] += product
+        plain = light.materials * around.chamber_visibility.astype(np.float32)[:, None]
+        reflect = Reflection(around.form_factors, self.bounces)
+        bounced = reflect(light.colours, light.chamber_lit, light.materials)
         chamber_lit = np.column_stack([plain, *bounced.values()])
         lamp_lit = np.zeros_like(chamber_lit)
         lamp_lit[:, : plain.shape[1]] = light.lamp_lit
-        return replace(light, colours=(*light.colours, *bounced), chamber_lit=chamber_lit, lamp_lit=lamp_lit)
+        colours = (*light.colours, *bounced)
+        return replace(light, colours=colours, chamber_lit=chamber_lit, lamp_lit=lamp_lit, reflection=reflect)
 
 
 @dataclass(frozen=True)
@@ -79,8 +73,7 @@ class Lamp(ViewLightEffect):
 
     The rays of the lamp are parallel. Its irradiance is ``fraction`` times the cosine between normal and lamp
     direction where the lamp is visible; the chamber provides ``1 - fraction``. A white tarp that faces the lamp keeps
-    irradiance 1. `InterReflection` follows the chamber's light only, and the visible wall of the chamber does not
-    change.
+    irradiance 1. The visible wall of the chamber does not change.
     """
 
     name: ClassVar[str] = "lamp"
@@ -99,6 +92,13 @@ class Lamp(ViewLightEffect):
         lamp = np.zeros_like(light.lamp)
         lamp[lit] = self.fraction * cosine[lit] * hits.is_unoccluded(to_lamp, lit)
         return replace(light, chamber=light.chamber * np.float32(1.0 - self.fraction), lamp=lamp, to_lamp=to_lamp)
+
+    def on_points(self, surface: Surface, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "p"]:
+        """Irradiance of the lamp at the points of a surface."""
+        to_lamp, normals = self.direction(camera_to_world), surface.mesh.vertex_normals()
+        cosine = np.maximum(normals @ to_lamp, 0.0)
+        starts = surface.mesh.vertices + RAY_START_M * normals
+        return self.fraction * cosine * surface.renderer.is_unoccluded(starts, np.broadcast_to(to_lamp, starts.shape))
 
     def direction(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
         """Unit vector from the object to the lamp, object frame."""

@@ -1,0 +1,114 @@
+"""Elements: points that stand for a surface's parts, on the object and on what it stands on. Metres, object frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.geometry.mesh import Mesh
+
+SUPPORT_SIDES = 25
+"""Triangles of the support along the disc's radius: 4 mm on a turntable, so that each belongs to one element."""
+NORMAL_WEIGHT = 2.0
+"""A triangle belongs to the nearest element; a right angle between normals counts like so many spacings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """Parts of a surface.
+
+    Attributes:
+        positions: a point of each part.
+        normals: outward unit normals.
+        on_object: which parts belong to the object, not to its support.
+        occluders: the whole surface, which occludes light and reflects it.
+        of_triangle: element that each triangle of the occluders belongs to.
+    """
+
+    positions: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    on_object: Bool[np.ndarray, "n"]
+    occluders: Mesh
+    of_triangle: Int[np.ndarray, "t"]
+
+
+def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: int, smoothing_m: float) -> Elements:
+    """Elements spread evenly over the object and its support.
+
+    Args:
+        scanned: the object's mesh, with or without holes.
+        support: what it stands on (`support_mesh`); may have no triangles.
+        on_object: elements of the object.
+        on_support: elements of the support.
+        smoothing_m: normals of the object are means over this radius: about a pixel, which shows no more.
+    """
+    points = [sample_surface(scanned.vertices, scanned.triangles, on_object)]
+    own = [smooth_normals(scanned, points[0], smoothing_m)]
+    of_triangle = [_nearest(scanned, points[0], own[0])]
+    if len(support.triangles):
+        points.append(sample_surface(support.vertices, support.triangles, on_support))
+        middles = cKDTree(support.vertices[support.triangles].mean(axis=1))
+        own.append(support.facet_normals()[middles.query(points[1])[1]])
+        of_triangle.append(on_object + _nearest(support, points[1], own[1]))
+    whole = Mesh(
+        np.concatenate([scanned.vertices, support.vertices]),
+        np.concatenate([scanned.triangles, support.triangles + len(scanned.vertices)]),
+    )
+    positions = np.concatenate(points)
+    is_object = np.arange(len(positions)) < on_object
+    return Elements(positions, np.concatenate(own), is_object, whole, np.concatenate(of_triangle))
+
+
+def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: float) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals at points of a mesh: area-weighted means over its vertices within a radius."""
+    tree, vertices = cKDTree(mesh.vertices), mesh.area_weighted_normals()
+    nearest = tree.query(positions)[1]
+    sums = np.empty((len(positions), 3))
+    for row, near in enumerate(tree.query_ball_point(positions, radius_m)):
+        sums[row] = vertices[near].sum(axis=0) if near else vertices[nearest[row]]
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+
+
+def _nearest(
+    mesh: Mesh, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> Int[np.ndarray, "t"]:
+    """The element that each triangle belongs to: near it, and facing the same way."""
+    right_angle_m = NORMAL_WEIGHT * np.sqrt(mesh.area_m2() / len(positions) / 2.0)
+    middles = mesh.vertices[mesh.triangles].mean(axis=1)
+    tree = cKDTree(np.concatenate([positions, right_angle_m * normals], axis=1))
+    return tree.query(np.concatenate([middles, right_angle_m * mesh.facet_normals()], axis=1))[1]
+
+
+def support_mesh(container_m: tuple[float, float] | None, disc_radius_m: float) -> Mesh:
+    """The disc in z = 0, around the container if there is one, and the container's side and lid.
+
+    Args:
+        container_m: its diameter and height.
+        disc_radius_m: of the disc.
+    """
+    side_m = disc_radius_m / SUPPORT_SIDES
+    inner_m = 0.0 if container_m is None else container_m[0] / 2.0
+    profiles = [[(disc_radius_m, 0.0), (inner_m, 0.0)]] if disc_radius_m > inner_m else []
+    if container_m is not None:
+        profiles += [[(inner_m, 0.0), (inner_m, container_m[1])], [(inner_m, container_m[1]), (0.0, container_m[1])]]
+    vertices, triangles, count = [], [], 0
+    for start, end in np.array(profiles):
+        rings = max(1, int(np.ceil(np.linalg.norm(end - start) / side_m)))
+        segments = max(8, int(np.ceil(2.0 * np.pi * max(start[0], end[0]) / side_m)))
+        radius, height = (start + np.linspace(0.0, 1.0, rings + 1)[:, None] * (end - start)).T
+        azimuth = 2.0 * np.pi * np.arange(segments) / segments
+        ring = [radius[:, None] * np.cos(azimuth), radius[:, None] * np.sin(azimuth)]
+        vertices.append(np.stack([*ring, np.broadcast_to(height[:, None], ring[0].shape)], axis=-1).reshape(-1, 3))
+        a = count + (segments * np.arange(rings)[:, None] + np.arange(segments)).ravel()
+        b = count + (segments * np.arange(rings)[:, None] + (np.arange(segments) + 1) % segments).ravel()
+        triangles += [np.stack([a, b, b + segments], axis=1), np.stack([a, b + segments, a + segments], axis=1)]
+        count += len(vertices[-1])
+    if not vertices:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    mesh = Mesh(np.concatenate(vertices), np.concatenate(triangles))
+    # The lid's and disc's inmost ring may be a point.
+    return Mesh(mesh.vertices, mesh.triangles[mesh.triangle_areas_m2() > 0.0])

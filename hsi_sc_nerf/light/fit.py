@@ -1,0 +1,350 @@
+"""The light and the materials that explain what all views measure of all elements.
+
+An element of reflectance rho shows rho times its irradiance, which changes from view to view because it turns under
+a light that stands still; its material does not. The fit is Gauss-Newton with the materials eliminated (variable
+projection, Golub and Pereyra 1973) and Tukey's weights against gloss. Lamps are added one by one while the views call
+for them. A light that does not change with the turn shows in no view. It is known from what is expected: a nearly
+even chamber, few lamps, and irradiance 1 on the white reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.light.directions import even_directions, harmonic_degrees, tangents
+from hsi_sc_nerf.light.standing_light import DEGREE, TERMS, StandingLight, even_light, units_on
+from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
+
+MOST_LAMPS = 4
+CANDIDATES = 200
+"""Directions in which a lamp is looked for."""
+BEHIND = -0.2
+"""Lamps stand on the camera's side: the cosine between their direction and the camera's is above this. By a body
+alone, a lamp before it and another behind it can hardly be told from one lamp and an uneven chamber."""
+CALLED_FOR = 30.0
+"""Twice the logarithm of probability that a lamp must gain: three parameters among 200 directions, with a margin."""
+LEAST_LAMP = 0.02
+"""Weaker lamps are none."""
+UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
+"""Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
+are seen tell what is to be expected of those that are not."""
+MOST_UNEVEN = 0.1
+"""A chamber's harmonics are no larger: what is more uneven is a lamp."""
+LEAST_DISTANCE_M = 0.25
+"""Of lamps, which the first order of their nearness still describes."""
+LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
+"""Expected size of a lamp, of a correction of its direction, and of one over the lamps' distance (1/m)."""
+WHITE_STD = 0.01
+"""Error of the white reference's own reflectance and orientation."""
+COLOUR_STD = 0.3
+"""Expected scatter of the lamps' colour from the white reference's light."""
+LEAST_LAMPS = 0.05
+"""Lamps that give the white reference less than this part of its light have no colour of their own."""
+TUKEY = 4.685
+"""Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
+SMALLEST_SCATTER = 0.002
+CORRELATED = 8.0
+"""So many measurements count as one: neighbours share errors of mesh and poses."""
+BOUNCES = 4
+STEPS = 5
+"""Steps of Gauss-Newton for each number of lamps."""
+LARGEST_TURN_RAD = 0.2
+LEAST_IRRADIANCE = 0.02
+CLUSTER_M = 0.02
+"""Elements in a cube of this side err together."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightFit:
+    """What the views say.
+
+    Attributes:
+        light: in the camera's frame.
+        material: reflectance of each element; that of the nearest one for an element without a view.
+        weights: Tukey's weight of each measurement, 0 to 1.
+        irradiance: at each measurement.
+        scatter: robust standard deviation of the measurements relative to the model.
+        relative_std: standard deviation of each measurement's irradiance, relative to it, as far as the light's is.
+    """
+
+    light: StandingLight
+    material: Float[np.ndarray, "n bands"]
+    weights: Float[np.ndarray, "m"]
+    irradiance: Float[np.ndarray, "m bands"]
+    scatter: float
+    relative_std: Float[np.ndarray, "m"]
+
+
+def fit_light(
+    elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"], bounces: int = BOUNCES
+) -> LightFit:
+    """Fit light and materials.
+
+    Args:
+        elements: that were measured.
+        views: their measurements.
+        white_normal: outward unit normal of the white reference, camera's frame.
+        bounces: diffuse reflections between elements; 0 for none.
+    """
+    fit = _Fit(elements, views, white_normal, bounces)
+    fit.converge()
+    while len(fit.light.lamps) < MOST_LAMPS:
+        before = fit.state()
+        if not fit.add_lamp():
+            break
+        misfit = fit.misfit(before)
+        fit.converge()
+        if misfit - fit.misfit(before) < CALLED_FOR or fit.light.lamps.min() < LEAST_LAMP:
+            fit.restore(before)
+            break
+    # Only what no lamp explains is the chamber's.
+    fit.converge(see_unevenness=True)
+    return fit.result()
+
+
+class _Fit:
+    """State of the fit: the light, and what follows from it."""
+
+    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray, bounces: int) -> None:
+        self.elements, self.views, self.white, self.bounces = elements, views, white, bounces
+        count = len(views.element), len(elements.positions)
+        entries = np.ones(count[0]), (views.element, np.arange(count[0]))
+        self._sum_by_element = scipy.sparse.csr_array(entries, shape=count[::-1])
+        seen = np.bincount(views.element, minlength=count[1]) > 0
+        self._nearest_seen = np.flatnonzero(seen)[cKDTree(elements.positions[seen]).query(elements.positions)[1]]
+        self._chamber = elements.chamber_at(views)
+        self.light = even_light(views.reflectance.shape[1])
+        self.weights, self.scatter = np.ones(count[0]), 0.0
+        self.unevenness = UNEVENNESS
+        self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
+        self.lamps = elements.lamps_at(views, self.light.to_lamps)
+
+    _STATE = ("light", "lamps", "weights", "scatter", "unevenness", "bounced")
+
+    def state(self) -> dict:
+        """What `restore` needs."""
+        return {name: getattr(self, name) for name in self._STATE}
+
+    def restore(self, state: dict) -> None:
+        """Go back to an earlier `state`."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+    def converge(self, *, see_unevenness: bool = False) -> None:
+        """Gauss-Newton with so many lamps as there are; the chamber's unevenness is found as well if so."""
+        for _ in range(STEPS):
+            self._bounce()
+            residual, jacobian = self._linearised()
+            told = np.abs(residual[self.views.tells_light])
+            self.scatter = max(1.4826 * float(np.median(told)), SMALLEST_SCATTER)
+            self.weights = np.where(self.views.tells_light, _tukey(residual / self.scatter), 1.0)
+            residual, jacobian = self._without_materials(residual[:, None], jacobian)
+            weighted = jacobian * self._precision()[:, None]
+            prior, pull = self._prior()
+            hessian = weighted.T @ jacobian + prior
+            step = np.linalg.solve(hessian, weighted.T @ residual[:, 0] + pull)
+            self._move(step)
+            if see_unevenness:
+                self._see_unevenness(np.linalg.inv(hessian))
+            self._see_colours()
+
+    def add_lamp(self) -> bool:
+        """Add the lamp that explains most of what is left; False if no direction holds one."""
+        self._bounce()
+        directions = even_directions(CANDIDATES)
+        directions = directions[directions[:, 2] > BEHIND]
+        units = self.elements.lamps_at(self.views, directions).irradiance
+        residual, jacobian = self._linearised()
+        expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)
+        residual, columns, others = self._without_materials(residual[:, None], units * expected, jacobian)
+        precision = self._precision()[:, None]
+        # What chamber and lamps can explain by themselves does not count.
+        hessian = (others * precision).T @ others + self._prior()[0]
+        known = np.linalg.solve(hessian, (others * precision).T @ np.hstack([residual, columns]))
+        rest = np.hstack([residual, columns]) - others @ known
+        gradient = (rest[:, 1:] * precision).T @ rest[:, 0]
+        curvature = (rest[:, 1:] ** 2 * precision).sum(axis=0)
+        strength = gradient / np.maximum(curvature, 1e-12)
+        gain = np.where(strength > 0.0, strength * gradient, 0.0)
+        best = int(gain.argmax())
+        if gain[best] <= 0.0:
+            return False
+        light = self.light
+        self._set(
+            replace(
+                light,
+                lamps=np.append(light.lamps, strength[best]),
+                to_lamps=np.concatenate([light.to_lamps, directions[best : best + 1]]),
+            )
+        )
+        return True
+
+    def misfit(self, weighting: dict) -> float:
+        """Minus twice the logarithm of posterior probability, with the weights and scatter of a `state`."""
+        self._bounce()
+        residual, _ = self._linearised()
+        (residual,) = self._without_materials(residual[:, None])
+        squares = weighting["weights"] * self.views.tells_light * residual[:, 0] ** 2
+        unexpected = (self.light.chamber[harmonic_degrees(DEGREE) > 0] / self.unevenness) ** 2
+        return float(squares.sum() / (CORRELATED * weighting["scatter"] ** 2) + unexpected.sum())
+
+    def result(self) -> LightFit:
+        """What the fit says, with the light's uncertainty.
+
+        The covariance is robust to errors that the measurements in one cube of ``CLUSTER_M`` share (Liang and Zeger
+        1986).
+        """
+        self._bounce()
+        residual, full = self._linearised()
+        residual, jacobian = self._without_materials(residual[:, None], full)
+        precision, (prior, _) = self._precision()[:, None], self._prior()
+        cells = clusters(self.elements.positions)[self.views.element]
+        sums = np.zeros((cells.max() + 1, jacobian.shape[1]))
+        np.add.at(sums, cells, jacobian * precision * residual * np.sqrt(CORRELATED))
+        inverse = np.linalg.inv((jacobian * precision).T @ jacobian + prior)
+        covariance = inverse @ (sums.T @ sums + prior) @ inverse
+        variance = np.einsum("mi,ij,mj->m", full, covariance, full)
+        irradiance = self.irradiance()
+        return LightFit(
+            self.light, self._materials(irradiance), self.weights, irradiance, self.scatter, np.sqrt(variance)
+        )
+
+    def irradiance(self) -> Float[np.ndarray, "m bands"]:
+        """At the measurements."""
+        chamber, lamps = self._direct()
+        light = self.light
+        total = chamber[:, None] * light.chamber_colour + lamps[:, None] * light.lamp_colour + self.bounced
+        return np.maximum(total, LEAST_IRRADIANCE)
+
+    def _direct(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+        """Irradiance at the measurements by chamber and lamps, without their colours."""
+        light, units = self.light, self.lamps
+        return self._chamber @ light.chamber, (units.irradiance + light.nearness * units.by_nearness) @ light.lamps
+
+    def _bounce(self) -> None:
+        """Irradiance at the measurements by other elements, from the light and materials of now."""
+        for _ in range(1 if self.bounced.any() or not self.bounces else 2):
+            material = self._materials(self.irradiance())
+            bounced = np.zeros_like(self.bounced)
+            for frame in np.unique(self.views.frame) if self.bounces else ():
+                rows = np.flatnonzero(self.views.frame == frame)
+                arriving = self.elements.bounced(self.light, material, int(frame), self.bounces)
+                bounced[rows] = arriving[self.views.element[rows]]
+            self.bounced = bounced
+
+    def _materials(self, irradiance: np.ndarray) -> Float[np.ndarray, "n bands"]:
+        """The reflectance of each element that fits its measurements best."""
+        above = self._sum_by_element @ (self.weights[:, None] * self.views.reflectance * irradiance)
+        below = self._sum_by_element @ (self.weights[:, None] * irradiance**2)
+        return np.clip((above / np.maximum(below, 1e-9))[self._nearest_seen], 1e-4, 1.0)
+
+    def _linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
+        """Relative residuals, and relative change of what is expected with the light's parameters.
+
+        Both are means over the bands, weighted by the square of the expected reflectance. The parameters are the
+        chamber's harmonics, the lamps, their directions along two tangents, and their nearness if there are lamps.
+        """
+        light, irradiance = self.light, self.irradiance()
+        expected = self._materials(irradiance)[self.views.element] * irradiance
+        share = expected**2 / (expected**2).sum(axis=1, keepdims=True)
+        residual = (share * (self.views.reflectance / expected - 1.0)).sum(axis=1)
+        by_chamber = (share * light.chamber_colour / irradiance).sum(axis=1)[:, None]
+        by_lamps = (share * light.lamp_colour / irradiance).sum(axis=1)[:, None]
+        units: LampUnits = self.lamps
+        columns = [self._chamber * by_chamber, (units.irradiance + light.nearness * units.by_nearness) * by_lamps]
+        if len(light.lamps):
+            turning = (units.by_direction * light.lamps[:, None]).reshape(len(share), -1)
+            columns += [turning * by_lamps, (units.by_nearness @ light.lamps)[:, None] * by_lamps]
+        return residual, np.hstack(columns)
+
+    def _without_materials(self, *columns: np.ndarray) -> list[np.ndarray]:
+        """Columns without their weighted mean over each element's views, which its material takes up."""
+        total = np.maximum(self._sum_by_element @ self.weights, 1e-9)[:, None]
+        means = ((self._sum_by_element @ (self.weights[:, None] * column)) / total for column in columns)
+        return [column - mean[self.views.element] for column, mean in zip(columns, means, strict=True)]
+
+    def _precision(self) -> Float[np.ndarray, "m"]:
+        return self.weights * self.views.tells_light / (CORRELATED * max(self.scatter, SMALLEST_SCATTER) ** 2)
+
+    def _prior(self) -> tuple[np.ndarray, np.ndarray]:
+        """Precision of what is expected of the parameters, and its pull from where they are."""
+        light, lamps = self.light, len(self.light.lamps)
+        precision = np.zeros(TERMS + 3 * lamps + (lamps > 0))
+        precision[:TERMS] = np.where(harmonic_degrees(DEGREE) > 0, self.unevenness**-2.0, 0.0)
+        precision[TERMS : TERMS + lamps] = LAMP_STD**-2.0
+        precision[TERMS + lamps : TERMS + 3 * lamps] = TURN_STD_RAD**-2.0
+        if lamps:
+            precision[-1] = NEARNESS_STD**-2.0
+        now = np.zeros(len(precision))
+        now[:TERMS], now[TERMS : TERMS + lamps] = light.chamber, light.lamps
+        if lamps:
+            now[-1] = light.nearness
+        of_chamber, of_lamps = units_on(self.white, light.to_lamps)
+        white = np.zeros(len(precision))
+        white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps
+        missing = 1.0 - of_chamber @ light.chamber - of_lamps @ light.lamps
+        outer = np.outer(white, white) / WHITE_STD**2
+        return np.diag(precision) + outer, white * missing / WHITE_STD**2 - precision * now
+
+    def _move(self, step: np.ndarray) -> None:
+        """Change the parameters; lamps stay positive, and turn by no more than ``LARGEST_TURN_RAD`` at once."""
+        light, lamps = self.light, len(self.light.lamps)
+        turns = np.clip(
+            step[TERMS + lamps : TERMS + 3 * lamps].reshape(lamps, 2), -LARGEST_TURN_RAD, LARGEST_TURN_RAD
+        )
+        to_lamps = light.to_lamps + np.einsum("lt,ltk->lk", turns, tangents(light.to_lamps))
+        self._set(
+            replace(
+                light,
+                chamber=light.chamber + step[:TERMS],
+                lamps=np.maximum(light.lamps + step[TERMS : TERMS + lamps], 0.1 * light.lamps),
+                to_lamps=to_lamps / np.maximum(np.linalg.norm(to_lamps, axis=1, keepdims=True), 1e-9),
+                nearness=float(np.clip(light.nearness + step[-1], 0.0, 1.0 / LEAST_DISTANCE_M)) if lamps else 0.0,
+            )
+        )
+
+    def _set(self, light: StandingLight) -> None:
+        if not np.array_equal(light.to_lamps, self.light.to_lamps):
+            self.lamps = self.elements.lamps_at(self.views, light.to_lamps)
+        self.light = light
+
+    def _see_unevenness(self, covariance: np.ndarray) -> None:
+        """Root mean square of the chamber's harmonics as far as they are seen (MacKay 1992)."""
+        uneven = harmonic_degrees(DEGREE) > 0
+        seen = np.clip(1.0 - np.diag(covariance)[:TERMS] / self.unevenness**2, 0.0, 1.0)[uneven].sum()
+        square = (self.light.chamber[uneven] ** 2).sum() + UNEVENNESS_COUNT * UNEVENNESS**2
+        self.unevenness = min(float(np.sqrt(square / (seen + UNEVENNESS_COUNT))), MOST_UNEVEN)
+
+    def _see_colours(self) -> None:
+        """The colour of the lamps that fits each band best; the white reference stays white."""
+        light = self.light
+        of_chamber, of_lamps = light.on(self.white)
+        if of_lamps < LEAST_LAMPS * (of_chamber + of_lamps):
+            return
+        irradiance = self.irradiance()
+        expected = self._materials(irradiance)[self.views.element] * irradiance
+        chamber, lamps = self._direct()
+        slope = (lamps - chamber * of_lamps / of_chamber)[:, None] / irradiance
+        residual, slope = self._without_materials(self.views.reflectance / expected - 1.0, slope)
+        weighted = self._precision()[:, None] * slope
+        gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
+        step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain
+        # Their strength is what they have in common.
+        colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
+        chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
+        self.light = replace(light, lamp_colour=colour, chamber_colour=chamber_colour)
+
+
+def clusters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """The cube of ``CLUSTER_M`` that each position lies in."""
+    return np.unique(np.floor(positions / CLUSTER_M).astype(int), axis=0, return_inverse=True)[1].ravel()
+
+
+def _tukey(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Tukey's biweight; never quite 0, so that no element is left without a measurement."""
+    return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

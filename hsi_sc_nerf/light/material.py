@@ -1,0 +1,142 @@
+"""From what was measured of an object to its material: the irradiance at any of its points, with its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.light.directions import even_directions
+from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements
+from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, LightFit, fit_light
+from hsi_sc_nerf.light.transfer import transfer
+from hsi_sc_nerf.light.views import TurningElements, Views
+
+RAY_DIRECTIONS = 2048
+"""Over the sphere: 4.5 degrees apart."""
+BAND_GROUPS = 8
+"""The light is fitted to so many means of neighbouring bands: its colours are smooth."""
+NEIGHBOURS = 4
+"""Irradiance at a point is a mean over so many elements."""
+OCCLUSION_ERROR = 0.1
+"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
+touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectLight:
+    """Irradiance on an object, and its material.
+
+    Attributes:
+        elements: of the object and its support.
+        turning: the same as they turn.
+        views: what frames measured of them.
+        fit: the light by groups of bands.
+        spectral: the fit's light and materials at the bands of the views.
+    """
+
+    elements: Elements
+    turning: TurningElements
+    views: Views
+    fit: LightFit
+    spectral: LightFit
+
+    def irradiance(
+        self, points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], frames: Int[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]]:
+        """Irradiance at points of the object in one frame each, relative to that on the white reference.
+
+        Args:
+            points_m: object frame.
+            normals: outward unit normals.
+            frames: the frame that measured each point.
+
+        Returns:
+            The irradiance, and the standard deviation of its mean over the bands.
+        """
+        of_object = np.flatnonzero(self.elements.on_object)
+        right_angle_m = NORMAL_WEIGHT * self._spacing_m / np.sqrt(2.0)
+        places = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
+        distance, nearest = cKDTree(places).query(
+            np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(places))
+        )
+        distance, nearest = distance.reshape(len(points_m), -1), of_object[nearest.reshape(len(points_m), -1)]
+        share = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
+        share /= share.sum(axis=1, keepdims=True)
+        result = np.empty((len(points_m), self.spectral.material.shape[1]), np.float32)
+        for frame in np.unique(frames):
+            rows = np.flatnonzero(frames == frame)
+            light, material = self.spectral.light, self.spectral.material
+            whole = self.turning.direct(light, int(frame))
+            whole = whole + self.turning.bounced(light, material, int(frame), BOUNCES)
+            result[rows] = np.einsum("nk,nkb->nb", share[rows], whole[nearest[rows]])
+        result = np.maximum(result, LEAST_IRRADIANCE)
+        relative = np.sqrt((share * self._relative_variance[nearest]).sum(axis=1))
+        return result, relative * result.mean(axis=1)
+
+    @property
+    def _spacing_m(self) -> float:
+        """Typical distance between neighbouring elements of the object."""
+        positions = self.elements.positions[self.elements.on_object]
+        return float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1])) * 2.0
+
+    @property
+    def _relative_variance(self) -> Float[np.ndarray, "elements"]:
+        """Of each element's irradiance: of the light, of what occludes it, of its own views."""
+        count, views = len(self.elements.positions), np.bincount(self.views.element)
+        views = np.pad(views, (0, count - len(views)))
+        of_light = np.bincount(self.views.element, self.fit.relative_std**2, count) / np.maximum(views, 1)
+        of_light[views == 0] = of_light[views > 0].max()
+        occluded = 1.0 - self.turning.transfer.sky
+        return of_light + (OCCLUSION_ERROR * occluded) ** 2 + self.fit.scatter**2 / np.maximum(views, 1)
+
+
+def turning_elements(
+    elements: Elements, rotations: Float[np.ndarray, "frames 3 3"], lift_m: float
+) -> TurningElements:
+    """Cast the rays of the elements.
+
+    Args:
+        elements: of the object and its support.
+        rotations: camera-to-object rotation of each frame.
+        lift_m: rays begin so far outside of the surface.
+    """
+    directions = even_directions(RAY_DIRECTIONS)
+    faces = elements.of_triangle, len(elements.positions)
+    seen = transfer(elements.positions, elements.normals, elements.occluders, *faces, directions, lift_m)
+    centre_m = elements.positions[elements.on_object].mean(axis=0)
+    return TurningElements(elements.positions - centre_m, elements.normals, seen, directions, rotations)
+
+
+def light_on_object(
+    elements: Elements, turning: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]
+) -> ObjectLight:
+    """Fit the light to groups of bands, and take it to all bands.
+
+    Args:
+        elements: of the object and its support.
+        turning: the same as they turn.
+        views: what frames measured of them.
+        white_normal: outward unit normal of the white reference, camera's frame.
+    """
+    bands = views.reflectance.shape[1]
+    groups = np.array_split(np.arange(bands), min(BAND_GROUPS, bands))
+    means = np.stack([views.reflectance[:, group].mean(axis=1) for group in groups], axis=-1)
+    fit = fit_light(turning, replace(views, reflectance=means), white_normal)
+    at = np.array([group.mean() for group in groups])
+    # Linear between the groups' middles, constant beyond the outermost.
+    between = np.stack([np.interp(np.arange(bands), at, column) for column in np.eye(len(at))], axis=-1)
+    light = fit.light
+    light = replace(light, chamber_colour=between @ light.chamber_colour, lamp_colour=between @ light.lamp_colour)
+    irradiance = fit.irradiance @ between.T
+    entries = fit.weights, (views.element, np.arange(len(views.element)))
+    weighted = scipy.sparse.csr_array(entries, shape=(len(elements.positions), len(views.element)))
+    above, below = weighted @ (views.reflectance * irradiance), weighted @ irradiance**2
+    seen = below[:, 0] > 0.0
+    material = np.clip(above / np.maximum(below, 1e-9), 1e-4, 1.0)
+    material[~seen] = material[seen][cKDTree(elements.positions[seen]).query(elements.positions[~seen])[1]]
+    spectral = replace(fit, light=light, material=material, irradiance=irradiance)
+    return ObjectLight(elements, turning, views, fit, spectral)

@@ -1,0 +1,131 @@
+"""What frames measure of elements, and the irradiance that a light gives them there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from hsi_sc_nerf.light.directions import LOBE_WIDTH_RAD, harmonics, lobes, tangents
+from hsi_sc_nerf.light.standing_light import DEGREE, StandingLight
+from hsi_sc_nerf.light.transfer import Transfer
+
+LEAST_COSINE = 0.15
+"""Lamps that graze a surface hardly light it, however near."""
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Measurements, one of an element in a frame each.
+
+    Attributes:
+        element: index of the element.
+        frame: index of the frame.
+        reflectance: as measured, relative to the white reference.
+        tells_light: whether it tells of the light; others tell of their element's material alone. Markers do not,
+            whose pixels hold paper and ink.
+    """
+
+    element: Int[np.ndarray, "m"]
+    frame: Int[np.ndarray, "m"]
+    reflectance: Float[np.ndarray, "m bands"]
+    tells_light: Bool[np.ndarray, "m"]
+
+
+@dataclass(frozen=True, eq=False)
+class LampUnits:
+    """Irradiance of measurements by each lamp of strength 1 at infinity, and its changes.
+
+    Attributes:
+        irradiance: by each lamp.
+        by_direction: change with the lamp's direction along its two `tangents`, per rad.
+        by_nearness: change with the lamps' nearness, m.
+    """
+
+    irradiance: Float[np.ndarray, "m lamps"]
+    by_direction: Float[np.ndarray, "m lamps 2"]
+    by_nearness: Float[np.ndarray, "m lamps"]
+
+
+@dataclass(frozen=True, eq=False)
+class TurningElements:
+    """Elements that turn under a light that stands still in the camera's frame.
+
+    Attributes:
+        positions: relative to the point at which the white reference was captured; metres, object frame.
+        normals: outward unit normals, object frame.
+        transfer: how light reaches them.
+        directions: of the transfer's open weights, evenly spread, object frame.
+        rotations: camera-to-object rotation of each frame.
+    """
+
+    positions: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    transfer: Transfer
+    directions: Float[np.ndarray, "directions 3"]
+    rotations: Float[np.ndarray, "frames 3 3"]
+
+    def direct(self, light: StandingLight, frame: int) -> Float[np.ndarray, "n bands"]:
+        """Irradiance of all elements in a frame by chamber and lamps alone."""
+        weights, to_lamps = self.transfer.open_weights, light.to_lamps @ self.rotations[frame].T
+        chamber = weights @ (self._harmonics[frame] @ light.chamber).astype(np.float32)
+        lamps = weights @ lobes(self.directions, to_lamps).astype(np.float32)
+        lamps = lamps * (1.0 + light.nearness * _nearness(self.positions, self.normals, to_lamps))
+        return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
+
+    def bounced(
+        self, light: StandingLight, material: Float[np.ndarray, "n bands"], frame: int, bounces: int
+    ) -> Float[np.ndarray, "n bands"]:
+        """Irradiance of all elements in a frame by each other, after up to so many diffuse reflections."""
+        direct = self.direct(light, frame).astype(np.float32)
+        material = material.astype(np.float32)
+        arriving = np.zeros_like(direct)
+        for _ in range(bounces):
+            arriving = self.transfer.form_factors @ (material * (direct + arriving))
+        return arriving
+
+    def chamber_at(self, views: Views) -> Float[np.ndarray, "m terms"]:
+        """Direct irradiance at measurements by each harmonic."""
+        units = np.empty((len(views.element), self._harmonics[0].shape[1]), np.float32)
+        for frame, rows in _by_frame(views):
+            units[rows] = self.transfer.open_weights[views.element[rows]] @ self._harmonics[frame]
+        return units
+
+    def lamps_at(self, views: Views, to_lamps: Float[np.ndarray, "lamps 3"]) -> LampUnits:
+        """Direct irradiance at measurements by lamps of strength 1, and its changes."""
+        count, lamps = len(views.element), len(to_lamps)
+        units = np.empty((count, 4 * lamps), np.float32)
+        for frame, rows in _by_frame(views):
+            rotation, seen = self.rotations[frame], views.element[rows]
+            there, along = to_lamps @ rotation.T, tangents(to_lamps) @ rotation.T
+            radiance = lobes(self.directions, there)
+            slope = np.einsum("ltk,dk->dlt", along, self.directions) / LOBE_WIDTH_RAD**2
+            columns = np.hstack([radiance, (radiance[..., None] * slope).reshape(len(radiance), -1)])
+            units[rows, : 3 * lamps] = self.transfer.open_weights[seen] @ columns.astype(np.float32)
+            units[rows, 3 * lamps :] = _nearness(self.positions[seen], self.normals[seen], there)
+        irradiance = units[:, :lamps]
+        by_direction = units[:, lamps : 3 * lamps].reshape(count, lamps, 2)
+        return LampUnits(irradiance, by_direction, irradiance * units[:, 3 * lamps :])
+
+    @cached_property
+    def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:
+        return [harmonics(self.directions @ rotation, DEGREE).astype(np.float32) for rotation in self.rotations]
+
+
+def _by_frame(views: Views) -> list[tuple[int, Int[np.ndarray, "rows"]]]:
+    return [(int(frame), np.flatnonzero(views.frame == frame)) for frame in np.unique(views.frame)]
+
+
+def _nearness(
+    positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], to_lamps: Float[np.ndarray, "lamps 3"]
+) -> Float[np.ndarray, "n lamps"]:
+    """Relative change of each lamp's irradiance with the lamps' nearness, m.
+
+    At a place x the direction w of a lamp at the distance 1 / nearness becomes w - nearness (x - (x w) w), and its
+    irradiance on a surface that faces it 1 + 2 nearness (x w) times that at the centre, to first order.
+    """
+    cosines = np.maximum(normals @ to_lamps.T, LEAST_COSINE)
+    outwards = (positions * normals).sum(axis=1, keepdims=True)
+    return 3.0 * positions @ to_lamps.T - outwards / cosines

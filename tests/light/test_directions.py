@@ -1,0 +1,58 @@
+"""Directions and functions of direction against their integrals."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hsi_sc_nerf.light.directions import (
+    LOBE_WIDTH_RAD,
+    even_directions,
+    harmonic_degrees,
+    harmonics,
+    lobes,
+    tangents,
+)
+
+
+def test_even_directions_integrate_polynomials():
+    x, y, z = even_directions(4096).T
+    np.testing.assert_allclose([x.mean(), y.mean(), z.mean()], 0.0, atol=1e-3)
+    np.testing.assert_allclose([(x * x).mean(), (z * z).mean(), (x * y).mean()], [1 / 3, 1 / 3, 0.0], atol=1e-3)
+    np.testing.assert_allclose(np.maximum(z, 0.0).mean(), 0.25, atol=1e-5)
+
+
+def test_harmonics_are_orthonormal_and_begin_with_one():
+    terms = harmonics(even_directions(8192), 3)
+    np.testing.assert_allclose(terms.T @ terms / 8192, np.eye(16), atol=1e-3)
+    np.testing.assert_allclose(terms[:, 0], 1.0)
+    assert harmonic_degrees(3).tolist() == [0] + 3 * [1] + 5 * [2] + 7 * [3]
+
+
+def test_a_turn_mixes_harmonics_of_one_degree_alone():
+    directions = even_directions(512)
+    turned = harmonics(directions @ Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix(), 2)
+    mixing = np.linalg.lstsq(harmonics(directions, 2), turned, rcond=None)[0]
+    degrees = harmonic_degrees(2)
+    np.testing.assert_allclose(mixing[degrees[:, None] != degrees], 0.0, atol=1e-9)
+    np.testing.assert_allclose(mixing.T @ mixing, np.eye(9), atol=1e-9)
+
+
+def test_a_lobe_lies_around_its_middle_and_lights_what_faces_it_with_one():
+    towards = even_directions(7)
+    directions = even_directions(4096)
+    radiance = lobes(directions, towards)
+    middles = radiance.T @ directions
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    np.testing.assert_allclose((middles * towards).sum(axis=1), 1.0, atol=1e-4)
+    facing = (radiance * np.maximum(directions @ towards.T, 0.0)).mean(axis=0) * 4.0
+    np.testing.assert_allclose(facing, 1.0)
+
+
+def test_lobes_turn_as_their_tangents_say():
+    directions, towards = even_directions(4096), even_directions(5)
+    cosines = np.maximum(directions @ even_directions(5)[2], 0.0) * 4.0 / len(directions)
+    for along in np.moveaxis(tangents(towards), 1, 0):
+        np.testing.assert_allclose((along * towards).sum(axis=1), 0.0, atol=1e-12)
+        turned = np.cos(1e-3) * towards + np.sin(1e-3) * along
+        slope = (along @ directions.T).T / LOBE_WIDTH_RAD**2 * lobes(directions, towards)
+        change = (cosines @ lobes(directions, turned) - cosines @ lobes(directions, towards)) / 1e-3
+        np.testing.assert_allclose(cosines @ slope, change, atol=0.02)

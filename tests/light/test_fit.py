@@ -1,0 +1,68 @@
+"""Light and materials against a closed form: a ball in even light with a lamp."""
+
+import numpy as np
+import pytest
+from light_on_a_ball import FACING, measured, turning_ball
+
+from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.views import Views
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return turning_ball()
+
+
+def seen_rows(views, ball):
+    return np.bincount(views.element, minlength=len(ball.positions)) >= 3
+
+
+def test_even_light_stays_as_it_is(ball):
+    views, _, material = measured(ball, lamp=0.0)
+    found = fit_light(ball, views, FACING)
+    seen = seen_rows(views, ball)
+    np.testing.assert_allclose(found.material[seen] / material[seen], 1.0, atol=0.025)
+    np.testing.assert_allclose(found.irradiance, 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize("lamp", [0.2, 0.5])
+def test_a_lamp_is_told_apart_from_the_material(ball, lamp):
+    views, irradiance, material = measured(ball, lamp)
+    found = fit_light(ball, views, FACING)
+    seen = seen_rows(views, ball)
+    ratio = (found.material / material)[seen].mean(axis=1)
+    assert abs(np.median(ratio) - 1.0) < 0.02
+    assert np.quantile(np.abs(ratio - 1.0), 0.95) < 0.04
+    assert np.quantile(np.abs(irradiance - 1.0), 0.95) > 4 * 0.04 * lamp
+
+
+def test_gloss_in_a_few_views_does_not_matter(ball):
+    views, _, material = measured(ball, 0.3)
+    shiny = np.random.default_rng(1).random(len(views.element)) < 0.08
+    glossy = Views(views.element, views.frame, views.reflectance + 0.4 * shiny[:, None], views.tells_light)
+    found = fit_light(ball, glossy, FACING)
+    seen = seen_rows(views, ball)
+    assert np.quantile(np.abs((found.material / material)[seen] - 1.0), 0.9) < 0.05
+    assert found.weights[shiny].mean() < 0.1
+    assert found.weights[~shiny].mean() > 0.7
+
+
+def test_a_lamp_has_its_own_colour(ball):
+    views, _, material = measured(ball, 0.5, lamp_colour=(0.8, 1.2))
+    found = fit_light(ball, views, FACING)
+    assert found.light.lamp_colour[0] < 0.95
+    assert found.light.lamp_colour[1] > 1.05
+    seen = seen_rows(views, ball)
+    ratio = (found.material / material)[seen]
+    assert np.quantile(np.abs(ratio[:, 0] / ratio[:, 1] - 1.0), 0.9) < 0.03
+
+
+def test_a_near_lamp_is_found_to_be_near():
+    places_m = np.random.default_rng(3).uniform(-0.06, 0.06, (300, 3))
+    parts = turning_ball(places_m=places_m)
+    for distance_m in (3.0, 0.5):
+        views, _, material = measured(parts, 0.5, noise=0.002, distance_m=distance_m)
+        found = fit_light(parts, views, FACING)
+        assert found.light.nearness == pytest.approx(1.0 / distance_m, abs=0.4)
+        ratio = (found.material / material)[seen_rows(views, parts)]
+        assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.05

@@ -1,0 +1,62 @@
+"""What elements see of the sky and of each other, against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.light.directions import even_directions
+from hsi_sc_nerf.light.elements import Elements, spread_elements, support_mesh
+from hsi_sc_nerf.light.transfer import Transfer, transfer
+
+RADIUS_M = 0.03
+DIRECTIONS = even_directions(1024)
+
+
+def ball_over(disc_radius_m: float, height_m: float = 0.0) -> tuple[Elements, Transfer]:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_M)
+    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, height_m]))
+    support = support_mesh(None, disc_radius_m)
+    elements = spread_elements(mesh, support, 300, 200 if disc_radius_m else 0, smoothing_m=0.003)
+    rays = elements.occluders, elements.of_triangle, len(elements.positions), DIRECTIONS
+    return elements, transfer(elements.positions, elements.normals, *rays, lift_m=1e-4)
+
+
+def test_a_convex_body_alone_sees_the_sky_and_nothing_else():
+    _, seen = ball_over(0.0)
+    np.testing.assert_allclose(seen.sky, 1.0, atol=0.01)
+
+
+def test_a_ball_over_a_wide_plane_sees_it_by_its_slope():
+    """Form factor of an infinite plane: (1 - cos) / 2 of the angle between the normals."""
+    elements, seen = ball_over(2.0, height_m=RADIUS_M + 0.002)
+    ball = elements.on_object
+    plane = seen.form_factors[:, np.flatnonzero(~ball)].sum(axis=1)[ball]
+    expected = (1.0 - elements.normals[ball, 2]) / 2.0
+    np.testing.assert_allclose(plane, expected, atol=0.02)
+    np.testing.assert_allclose(seen.sky[ball], 1.0 - expected, atol=0.02)
+
+
+def test_a_plane_under_a_ball_sees_it_as_a_disc():
+    """Form factor of a ball for an element that it stands above: (r / d)^2 cos."""
+    elements, seen = ball_over(0.15, height_m=0.08)
+    ball = elements.on_object
+    of_ball = seen.form_factors[:, np.flatnonzero(ball)].sum(axis=1)[~ball]
+    position = elements.positions[~ball]
+    distance = np.linalg.norm(position - [0.0, 0.0, 0.08], axis=1)
+    np.testing.assert_allclose(of_ball, (RADIUS_M / distance) ** 2 * 0.08 / distance, atol=0.01)
+
+
+@pytest.mark.parametrize("disc_radius_m", [0.0, 0.1])
+def test_white_furnace(disc_radius_m):
+    elements, seen = ball_over(disc_radius_m, height_m=RADIUS_M)
+    np.testing.assert_allclose(seen.sky + seen.form_factors @ np.ones(len(elements.positions)), 1.0, atol=1e-5)
+
+
+def test_the_support_points_outwards_and_has_the_area_of_a_drum_on_a_disc():
+    mesh = support_mesh((0.08, 0.06), 0.1)
+    normals, middles = mesh.facet_normals(), mesh.vertices[mesh.triangles].mean(axis=1)
+    assert normals[:, 2].min() > -1e-9
+    assert (normals[:, :2] * middles[:, :2]).sum(axis=1).min() > -1e-9
+    assert mesh.area_m2() == pytest.approx(np.pi * 0.1**2 + np.pi * 0.08 * 0.06, rel=0.01)
+    assert not len(support_mesh(None, 0.0).triangles)

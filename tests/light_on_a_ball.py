@@ -1,0 +1,52 @@
+"""A turning ball under a lamp, which shades nothing but itself: its irradiance is known in closed form."""
+
+import numpy as np
+import scipy.sparse
+
+from hsi_sc_nerf.light.directions import even_directions
+from hsi_sc_nerf.light.transfer import Transfer
+from hsi_sc_nerf.light.views import TurningElements, Views
+
+DIRECTIONS = even_directions(2048)
+TO_LAMP = np.array([-0.5, 0.55, 0.67]) / np.linalg.norm([-0.5, 0.55, 0.67])
+FACING = np.array([0.0, 0.0, 1.0])
+FRAMES, RADIUS_M, ELEVATION = 12, 0.04, 0.4
+
+
+def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> TurningElements:
+    """Elements of a ball that sees no other, or of parts of such balls at some places, before a turning camera."""
+    normals = even_directions(count)
+    cosines = np.maximum(normals @ DIRECTIONS.T, 0.0)
+    transfer = Transfer(
+        (cosines / cosines.sum(axis=1, keepdims=True)).astype(np.float32), scipy.sparse.csr_array((count, count))
+    )
+    rotations = []
+    for azimuth in 2.0 * np.pi * np.arange(FRAMES) / FRAMES:
+        back = np.array([np.cos(ELEVATION) * np.cos(azimuth), np.cos(ELEVATION) * np.sin(azimuth), np.sin(ELEVATION)])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        rotations.append(np.stack([right, np.cross(back, right), back], axis=1))
+    return TurningElements(RADIUS_M * normals + places_m, normals, transfer, DIRECTIONS, np.array(rotations))
+
+
+def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m=None):
+    """What views show, the true irradiance and the true materials; all relative to a white that faces the camera."""
+    rng = np.random.default_rng(seed)
+    normals = ball.normals
+    material = rng.uniform(0.1, 0.8, (len(normals), 2))
+    element, frame, irradiance = [], [], []
+    for index, rotation in enumerate(ball.rotations):
+        in_camera = normals @ rotation
+        seen = np.flatnonzero(in_camera[:, 2] > 0.35)
+        to_lamp, fall = TO_LAMP, 1.0
+        if distance_m is not None:
+            to_lamp = distance_m * TO_LAMP - ball.positions[seen] @ rotation
+            fall = (distance_m / np.linalg.norm(to_lamp, axis=1)) ** 2
+            to_lamp /= np.linalg.norm(to_lamp, axis=1, keepdims=True)
+        cosines = np.maximum((in_camera[seen] * to_lamp).sum(axis=1), 0.0) * fall
+        white = 1.0 - lamp + lamp * np.array(lamp_colour) * TO_LAMP[2]
+        irradiance.append((1.0 - lamp + lamp * np.array(lamp_colour) * cosines[:, None]) / white)
+        element.append(seen)
+        frame.append(np.full(len(seen), index))
+    element, irradiance = np.concatenate(element), np.concatenate(irradiance)
+    shown = material[element] * irradiance * (1.0 + noise * rng.standard_normal((len(element), 1)))
+    return Views(element, np.concatenate(frame), shown, np.ones(len(element), bool)), irradiance, material
