@@ -22,16 +22,6 @@ if TYPE_CHECKING:
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
-SCRIPTS = {
-    "hsi-sc-nerf": ("hsi_sc_nerf.cli.main", "main"),
-    "ns-train": ("nerfstudio.scripts.train", "entrypoint"),
-    "ns-eval": ("nerfstudio.scripts.eval", "entrypoint"),
-    "ns-export": ("nerfstudio.scripts.exporter", "entrypoint"),
-}
-"""Module and function of the commands that steps are made of."""
-WITHOUT_COMPILER = {"TORCHDYNAMO_DISABLE": "1"}
-"""Environment in which PyTorch's compiler is not loaded, which takes seconds. Nothing here uses it, but nerfstudio's
-import compiles two functions of a method that is not used."""
 _RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
@@ -62,40 +52,27 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
         InputError: the command failed; the message names its log.
     """
     started = time.perf_counter()
-    # Warnings of libraries would hide the progress bars.
-    environment = WITHOUT_COMPILER | os.environ | {"PYTHONWARNINGS": "ignore"}
+    # Warnings of libraries would hide the progress bars. Nothing here is compiled by PyTorch, but nerfstudio's import
+    # compiles two functions of a method that is not used, for which PyTorch loads its compiler for seconds.
+    environment = {"TORCHDYNAMO_DISABLE": "1"} | os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
     with log.open("wb") as output:
         # A step that outlives its run would write into the folder of the next one.
-        orphans = end_with_parent if sys.platform == "linux" else None
+        orphans = _end_with_parent if sys.platform == "linux" else None
         process = subprocess.Popen(list(argv), stdout=output, env=environment, preexec_fn=orphans)
-    process.returncode = 0  # `finished_step` waits for it
-    return finished_step(name, process.pid, started, log)
-
-
-def finished_step(name: str, process: int, started: float, log: Path) -> StepCost:
-    """Wait for a process, which ends with this one's waiting, and return what it cost.
-
-    Args:
-        name: name of the step.
-        process: its number; a child of this process.
-        started: when it was (`time.perf_counter`).
-        log: file of its standard output.
-
-    Raises:
-        InputError: it failed.
-    """
-    try:
-        _, status, usage = os.wait4(process, 0)
-    except BaseException:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-        raise
-    code = os.waitstatus_to_exitcode(status)
-    if code != 0:
-        raise InputError(f"the step '{name}' failed with status {code}; its output is above and in {log}.")
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise InputError(
+            f"the step '{name}' failed with status {process.returncode}; its output is above and in {log}."
+        )
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
 
 
@@ -107,13 +84,13 @@ def own_cost(name: str, started: float) -> StepCost:
 def typed_command(words: Sequence[object]) -> list[str]:
     """Command that runs with this Python what a user would type, such as ``("ns-train", "hsi-sc-nerf", ...)``."""
     name, *rest = map(str, words)
-    module, function = SCRIPTS[name]
     if name == "hsi-sc-nerf":
-        return [sys.executable, "-m", module, *rest]
-    return [sys.executable, "-c", f"from {module} import {function}; {function}()", *rest]
+        return [sys.executable, "-m", "hsi_sc_nerf.cli.main", *rest]
+    script = {"ns-train": "train", "ns-eval": "eval", "ns-export": "exporter"}[name]
+    return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()", *rest]
 
 
-def end_with_parent() -> None:
+def _end_with_parent() -> None:
     """In a new process: end when the process that started it is killed (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 

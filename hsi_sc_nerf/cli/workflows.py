@@ -19,8 +19,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.benchmark.configurations import split_words
-from hsi_sc_nerf.benchmark.forked_steps import ForkedSteps
-from hsi_sc_nerf.benchmark.steps import SCRIPTS, StepCost, own_cost, run_step, typed_command
+from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.settings_file import between, check_options
@@ -266,15 +265,12 @@ class DemoCommand:
             "export": [*exporting, "--num-points", self.points],
         }
         costs: list[StepCost] = []
-        steps = ForkedSteps()
         for number, (name, words) in enumerate(commands.items(), start=1):
             console.print(f"[bold]{number}/{len(commands) + 1} {name}")
-            # While the simulator runs, what most steps need is imported; the export's Open3D would fill their memory.
-            meanwhile = [SCRIPTS[word][0] for word in ("hsi-sc-nerf", "ns-train", "ns-eval")] if number == 1 else []
-            costs.append(steps.run(name, words, logs / f"{name}.log", meanwhile))
+            costs.append(run_step(name, typed_command(words), logs / f"{name}.log"))
         console.print(f"[bold]{len(costs) + 1}/{len(commands) + 1} compare")
         started = time.perf_counter()
-        # Deferred because it draws and compares meshes, which the steps would have to hold in memory.
+        # Deferred because Open3D takes seconds to import.
         from hsi_sc_nerf.cli.demo_report import draw_pictures, score, show_table, write_summary
 
         metrics, processing = score(out)
