@@ -90,8 +90,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     num_nerf_samples_per_ray: int = 16
     """Samples a ray for the spectral field."""
     match_resolution: bool = True
-    """Size the field's hash grid by what a pixel resolves in the scene box. False: by num-levels, max-res and
-    log2-hashmap-size."""
+    """Size the field's hash grid by what a pixel resolves. False: by num-levels, max-res and log2-hashmap-size."""
     average_init_density: float = 0.1
     """Initial density; the box starts nearly empty."""
     use_appearance_embedding: bool = False
