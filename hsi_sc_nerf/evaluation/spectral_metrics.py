@@ -159,7 +159,7 @@ def metrics_of_regions(
     if valid is not None:
         has_angles, number, has_any = has_angle(valid), count_bands(valid), valid.any(-1)
     by_band = band_scores(predicted, target, list(regions.values()), valid)
-    found = {}
+    found: dict[str, float] = {}
     for (name, mask), (mse, similarity, windows) in zip(regions.items(), by_band, strict=True):
         values = {
             "sam": _pixel_mean(angles, mask, has_angles),

@@ -70,17 +70,17 @@ def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> 
     count = len(elements.positions)
     total = np.maximum(np.bincount(element, weights, count), 1e-9)
     means = [np.bincount(element, weights * values, count) / total for values in (brightness, light)]
-    changes = [values - mean[element] for values, mean in zip((brightness, light), means, strict=True)]
+    brighter, lighter = (values - mean[element] for values, mean in zip((brightness, light), means, strict=True))
     cells = clusters(elements.positions)
-    turning = _slope(*changes, weights, cells[element])
+    turning = _slope(brighter, lighter, weights, cells[element])
     seen = np.unique(element)
     spectra = np.stack([np.bincount(element, weights * band, count) for band in views.reflectance[rows].T], axis=-1)
     shapes = spectra[seen] / np.linalg.norm(spectra[seen], axis=1, keepdims=True)
     _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
     # Each against the mean of those like it, itself among them.
-    differences = [mean[seen] - mean[seen][alike].mean(axis=1) for mean in means]
-    profile = _slope(*differences, np.ones(len(seen)), cells[seen])
-    return ShadingEvidence(*turning, float(np.std(changes[1])), *profile, float(np.std(means[1][seen])))
+    own_brighter, own_lighter = (mean[seen] - mean[seen][alike].mean(axis=1) for mean in means)
+    profile = _slope(own_brighter, own_lighter, np.ones(len(seen)), cells[seen])
+    return ShadingEvidence(*turning, float(np.std(lighter)), *profile, float(np.std(means[1][seen])))
 
 
 def _slope(

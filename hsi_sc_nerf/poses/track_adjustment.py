@@ -112,10 +112,12 @@ def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
     Raises:
         InputError: too few tracks fit either.
     """
-    rough, found, refused = [], [], None
-    for way in (start, reversed_in_depth(start)):
+    rough: list[AdjustedTracks] = []
+    found: list[AdjustedTracks] = []
+    refused = None
+    for turned in (start, reversed_in_depth(start)):
         try:
-            rough.append(_roughly_adjusted(way, tracks))
+            rough.append(_roughly_adjusted(turned, tracks))
         except InputError as error:
             refused = refused or error
     best_px = min((way.misfit_px for way in rough), default=0.0)

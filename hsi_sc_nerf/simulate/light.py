@@ -114,14 +114,13 @@ class Lighting:
         self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "pixels colours"] | float:
         """Light of lamps that has met two surfaces or more, as weights of the surface's colours."""
-        surface, lamps = self._light.surface, 0.0
-        if self._light.reflection is not None:
-            lamps = sum(effect.on_points(surface, camera_to_world) for effect in self._on_view)
-        if not np.any(lamps):
+        surface, reflection = self._light.surface, self._light.reflection
+        by_lamps = [effect.on_points(surface, camera_to_world) for effect in self._on_view]
+        if reflection is None or not any(np.any(lit) for lit in by_lamps):
             return 0.0
         materials = self._light.materials
-        leaving = materials * np.asarray(lamps, np.float32)[:, None]
-        reflected = self._light.reflection(_single_colours(self._renderer), leaving, materials)
+        leaving = materials * np.asarray(sum(by_lamps), np.float32)[:, None]
+        reflected = reflection(_single_colours(self._renderer), leaving, materials)
         weights = np.zeros_like(self._light.lamp_lit)
         for column, colour in enumerate(self._light.colours):
             # Faint colours may be neglected in one light and not in the other.
