@@ -6,7 +6,7 @@ counts tell little, neighbouring bands tell more, and a drift of the blue alone 
 frames is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
-Statistics 13, 1985.
+Statistics 13, 1985; M. Gavish and D. Donoho, "Optimal Shrinkage of Singular Values", 2017.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from scipy import linalg
 
 MAX_TERMS = 24
 """Largest number of terms of the spline: enough for a change of slope within 30 nm in the blue."""
-RANK_MARGIN = 1.5
-"""Singular values of the drift count from this many times the largest of pure noise."""
 FREE_TERMS = 2
 """The first terms, constant and linear over 1 / wavelength: a lamp's output and its temperature."""
 SMOOTH_DIFFERENCES = 3
@@ -41,9 +39,10 @@ def common_courses(
     """The curves of all frames less the first frame's, from few courses with one spectrum each; and their variance.
 
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
-    the first. The variance is to first order that of a truncated singular value decomposition, with the posterior
-    variance of the spectra, and with that of the courses before they are made smooth: the data do not tell well how
-    much that gains. It has the variance of each frame's output and temperature too, whose changes noise may hide.
+    the first. Others count by how far they exceed it, so that a little more noise changes little. The variance is to
+    first order that of a truncated singular value decomposition, with the posterior variance of the spectra, and with
+    that of the courses before they are made smooth: the data do not tell well how much that gains. It has the
+    variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
         coefficients: of each frame, in its order in time.
@@ -55,9 +54,10 @@ def common_courses(
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, (coefficients - coefficients.mean(axis=0)).T).T
     left, singular, right = np.linalg.svd(whitened, full_matrices=False)
-    of_noise = np.sqrt(len(coefficients) - 1) + np.sqrt(len(root))
-    rank = max(1, int((singular > RANK_MARGIN * of_noise).sum()))
-    spectra = singular[:rank, None] * right[:rank]
+    signal = _signal_fraction(singular, len(coefficients) - 1, len(root))
+    signal[0] = 1.0
+    rank = int((signal > 0.0).sum())
+    spectra = (signal * singular)[:rank, None] * right[:rank]
     kept = np.stack([_kept_fraction(spectrum, roughness) for spectrum in spectra])
     courses = np.stack([_smoother(s * u) @ u for s, u in zip(singular[:rank], left.T, strict=False)], axis=1)
     courses -= courses[0]
@@ -121,6 +121,14 @@ def _smoother(course: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames 
     residual = np.abs(course - matrix @ course)
     freedom = (1.0 - np.diagonal(matrix)).clip(min=1e-9)
     return matrix if (residual <= LARGEST_RESIDUAL * np.sqrt(freedom)).all() else identity
+
+
+def _signal_fraction(singular: Float[np.ndarray, "k"], rows: int, columns: int) -> Float[np.ndarray, "k"]:
+    """Fraction of each singular value of a matrix with noise of variance 1 that is signal (Gavish, Donoho)."""
+    square = np.square(singular)
+    above = np.maximum((square - rows - columns) ** 2 - 4.0 * rows * columns, 0.0)
+    beyond_noise = singular > np.sqrt(rows) + np.sqrt(columns)
+    return np.where(beyond_noise, np.sqrt(above) / np.maximum(square, 1e-300), 0.0)
 
 
 def _kept_fraction(

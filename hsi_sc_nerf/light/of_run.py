@@ -17,7 +17,7 @@ from hsi_sc_nerf.light.observe import observe
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
-from hsi_sc_nerf.surface.surface_points import SurfaceMesh, tsdf_fusion
+from hsi_sc_nerf.surface.surface_points import SurfaceMesh, surface_mesh
 
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 """On the object and on what it stands on: 2 to 4 mm apart on a fruit."""
@@ -80,7 +80,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     sampler, dataset = run.manager.train_pixel_sampler, run.dataset
     cameras, batch = run.manager.train_dataset.cameras, run.model.config.eval_num_rays_per_chunk
     renders = render_depth_maps(run.model, cameras, sampler.masks, batch)
-    mesh = tsdf_fusion(renders, run.to_scene(dataset.object_box_m))
+    mesh = surface_mesh(run.model, renders, run.to_scene(dataset.object_box_m), batch)
     if mesh is not None:
         mesh = seen_part(mesh, renders)
     if mesh is None or not len(mesh.triangles):

@@ -19,7 +19,9 @@ from hsi_sc_nerf.poses.result import Uncertainty
 from hsi_sc_nerf.poses.turntable import Turntable, project, projection_jacobian
 
 _FIELD_PX = 0.007
-"""Standard deviation of each field's amplitude: print, skin, lens and pixels are that far from the model's."""
+"""Standard deviation of each field's amplitude for corners: print, lens and pixels are that far from the model's."""
+_FEATURE_FIELD_PX = 0.05
+"""The same for features, which creep over a skin as its light and its slope change."""
 _DRAWS = 2000
 """Of errors by the covariance; the largest of all frames has no closed form."""
 
@@ -102,7 +104,12 @@ def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
     how large the others are.
     """
     turntable, problem = adjusted.turntable, adjusted.problem
-    parts = [part.with_hidden(_FIELD_PX * smooth_fields(part.pixels)) for part in problem.residuals]
+    parts = [
+        part.with_hidden(
+            (_FEATURE_FIELD_PX if isinstance(part, PointResiduals) else _FIELD_PX) * smooth_fields(part.pixels)
+        )
+        for part in problem.residuals
+    ]
     counted = Problem(turntable, *parts, free=problem.free)
     larger = [
         part.with_hidden(part.hidden * np.sqrt(max(1.0, _shown_variance(counted, turntable, k))))

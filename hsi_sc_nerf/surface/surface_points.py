@@ -104,13 +104,12 @@ def sample_surface_points(
     Raises:
         InputError: the model holds no object, or the region holds none of it.
     """
-    mesh = tsdf_fusion(renders, box)
+    mesh = surface_mesh(model, renders, box, rays_per_batch)
     if mesh is None:
         raise InputError(
             f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
             "longer, and look at the masks in the dataset's report folder."
         )
-    mesh = _at_silhouettes(model, mesh, rays_per_batch)
     found = 0
 
     def keep(candidates: Float[np.ndarray, "n 3"]) -> SurfacePoints:
@@ -173,8 +172,23 @@ def _seen(renders: DepthRenders, mesh: SurfaceMesh, candidates: Float[np.ndarray
 
 
 @torch.no_grad()
-def _at_silhouettes(model: SpectralModel, mesh: SurfaceMesh, points_per_batch: int) -> SurfaceMesh:
-    """The mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it."""
+def surface_mesh(
+    model: SpectralModel, renders: DepthRenders, box: Float[np.ndarray, "2 3"], points_per_batch: int
+) -> SurfaceMesh | None:
+    """The fused mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it.
+
+    Args:
+        model: trained model, in evaluation mode.
+        renders: depth maps of its training cameras.
+        box: minimum and maximum of the mesh, scene units.
+        points_per_batch: vertices moved at a time.
+
+    Returns:
+        The mesh; None if the frames show no surface in the box.
+    """
+    mesh = tsdf_fusion(renders, box)
+    if mesh is None:
+        return None
     vertices, kept = mesh.vertices.copy(), np.zeros(len(mesh.vertices), bool)
     normals = mesh.normals_at(mesh.vertices)
     density_fn = partial(rendered_density, model)
