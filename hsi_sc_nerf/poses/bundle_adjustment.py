@@ -1,9 +1,9 @@
 """Bundle adjustment of a turntable and its landmarks (markers, points): Levenberg-Marquardt with a robust loss.
 
 Only what a turntable has is adjusted: one camera, one axis, one angle per frame, the landmarks, and if they are free
-radial lens distortion and small motions of a wobbling table. The Schur complement eliminates the landmarks from the
-normal equations: B. Triggs et al., "Bundle adjustment - a modern synthesis" (2000), sections 4.3 and 6.1. SciPy's
-``least_squares`` has no such elimination; thousands of points would take it minutes.
+radial lens distortion and small motions of a wobbling table. The landmarks are eliminated (``normal_equations``):
+B. Triggs et al., "Bundle adjustment - a modern synthesis" (2000), section 4.3. SciPy's ``least_squares`` has no such
+elimination; thousands of points would take it minutes.
 
 Symbols: n sightings with g residuals of r numbers each, l landmarks of d parameters, p other parameters.
 """
@@ -16,10 +16,11 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.poses.normal_equations import LandmarkEquations, NormalEquations
 from hsi_sc_nerf.poses.residuals import PointResiduals, Residuals
 from hsi_sc_nerf.poses.turntable import Jacobian, Turntable
 
@@ -95,75 +96,6 @@ class ParameterLayout:
             hidden=tuple(np.split(np.arange(motion, size), np.cumsum(hidden_sizes)[:-1])),
             landmarks=tuple(landmarks),
         )
-
-
-@dataclass(frozen=True)
-class LandmarkEquations:
-    """Gauss-Newton equations of the landmarks of one kind, and their coupling with camera and motion."""
-
-    normal: Float[np.ndarray, "l d d"]
-    gradient: Float[np.ndarray, "l d"]
-    coupling: Float[np.ndarray, "l d p"]
-    motion: Float[np.ndarray, "p p"]
-    """The equations of camera and motion by these landmarks' sightings; of the gradient, each landmark's part."""
-    motion_gradient: Float[np.ndarray, "l p"]
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """Gauss-Newton equations of camera and motion, and of the landmarks."""
-
-    motion: Float[np.ndarray, "p p"]
-    motion_gradient: Float[np.ndarray, "p"]
-    landmarks: tuple[LandmarkEquations, ...]
-
-    def solve(self, damping: float) -> tuple[Float[np.ndarray, "p"], list[Float[np.ndarray, "l d"]]]:
-        """The damped step of camera and motion, and of each kind of landmarks.
-
-        Raises:
-            LinAlgError: the damped equations are singular.
-        """
-        normal, right, eliminated = self._eliminated(damping)
-        normal[np.diag_indices_from(normal)] += damping * np.maximum(self.motion.diagonal(), 1e-12)
-        step = -cho_solve(cho_factor(normal), right)
-        return step, [
-            -np.einsum("lij,lj->li", inverse, part.gradient) - through @ step
-            for part, (inverse, through) in zip(self.landmarks, eliminated, strict=True)
-        ]
-
-    def information(self) -> Float[np.ndarray, "p p"]:
-        """The inverse covariance of camera and motion for residuals of unit variance, the landmarks being unknown."""
-        return self._eliminated(0.0)[0]
-
-    def reduced(self) -> list[tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]]:
-        """Of each kind of landmarks, these being unknown: its part of ``information``, and of the gradient of camera
-        and motion what each landmark contributes. The latter add to zero where the turntable is adjusted."""
-        return [
-            (
-                part.motion - np.einsum("ldp,ldq->pq", part.coupling, through),
-                part.motion_gradient - np.einsum("ldp,ld->lp", through, part.gradient),
-            )
-            for part, (_, through) in zip(self.landmarks, self._eliminated(0.0)[2], strict=True)
-        ]
-
-    def landmark_responses(self) -> list[Float[np.ndarray, "l d p"]]:
-        """Derivatives of the landmarks that fit best by camera and motion, of each kind."""
-        return [-through for _, through in self._eliminated(0.0)[2]]
-
-    def _eliminated(self, damping):
-        """Normal matrix and right side of camera and motion alone, and what leads back to the landmarks."""
-        normal, right, back = self.motion.copy(), self.motion_gradient.copy(), []
-        for part in self.landmarks:
-            diagonal = np.einsum("lii->li", part.normal)
-            floor = 1e-12 * (1.0 + diagonal.max(axis=0, initial=0.0))
-            inverse = np.linalg.inv(
-                part.normal + (damping * diagonal + floor)[:, :, None] * np.eye(diagonal.shape[1])
-            )
-            through = inverse @ part.coupling
-            normal -= part.coupling.reshape(-1, len(normal)).T @ through.reshape(-1, len(normal))
-            right -= through.reshape(-1, len(normal)).T @ part.gradient.ravel()
-            back.append((inverse, through))
-        return normal, right, back
 
 
 class Problem:
