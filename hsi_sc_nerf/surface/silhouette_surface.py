@@ -61,10 +61,10 @@ def move_to_silhouettes(
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
     """
     moved, touched = points, torch.ones_like(points[:, 0], dtype=torch.bool)
+    across, step = _across(normals), _NORMAL_STEP * normals
     for max_step in MAX_STEPS:
-        depth, touches = _least_touching_depth(density_fn, moved, normals)
+        depth, touches = _least_touching_depth(density_fn, moved, across)
         touched &= touches
-        step = _NORMAL_STEP * normals
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
         folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*FOLDING)
         inwards = folding * (-math.log1p(-TOUCHING_OPACITY) / depth).log()
@@ -75,25 +75,25 @@ def move_to_silhouettes(
     middles = (depths[1:] + depths[:-1]) / 2.0
     densities = _density(density_fn, points[:, None] - normals[:, None] * middles[:, None])
     collected = torch.nn.functional.pad((densities * depths.diff()).cumsum(dim=1), (1, 0))
-    target = collected.new_tensor(-math.log1p(-USUAL_OPACITY))
+    opacity = USUAL_OPACITY
     if touched.any():
         at_surface = ((points - moved) * normals).sum(dim=-1, keepdim=True)
-        target = collected.gather(1, torch.searchsorted(depths, at_surface).clamp_max(SEARCH_STEPS))[touched].median()
-    edges = depths.expand(len(points), -1)
-    in_hollow = opacity_crossing_depth(edges, densities, min(float(-torch.expm1(-target)), TOUCHING_OPACITY))
+        collected = collected.gather(1, torch.searchsorted(depths, at_surface).clamp_max(SEARCH_STEPS))
+        opacity = min(float(-torch.expm1(-collected[touched].median())), TOUCHING_OPACITY)
+    in_hollow = opacity_crossing_depth(depths.expand(len(points), -1), densities, opacity)
     return torch.where(touched[:, None], moved, points - in_hollow[:, None] * normals)
 
 
 def _least_touching_depth(
     density_fn: Callable[[Float[Tensor, "*n 3"]], Float[Tensor, "*n 1"]],
     points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
+    across: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
 ) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
     """Optical depth of the ray through each point, across its normal, that collects least; whether that one touches.
 
     A ray in a hollow does not touch: it goes deeper into the density to both sides.
     """
-    first, second = _across(normals)
+    first, second = across
     step = 2.0 * REACH / RAY_SAMPLES
     along = (torch.arange(RAY_SAMPLES, device=points.device) + 0.5) * step - REACH
     depths = []
