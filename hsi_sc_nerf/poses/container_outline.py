@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
+from hsi_sc_nerf.geometry.camera import cross_matrix
 from hsi_sc_nerf.poses.turntable import Turntable
 
 # Radii that are tried, over that of most points; and how far the edges of one frame may lie from those of all.
@@ -102,6 +103,24 @@ def container_outline(
     # What stands higher is nearer to a camera that looks down, and seems wider.
     nearer = looks[2] / depth * errors[1]
     return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))
+
+
+def radius_by_camera(outline: ContainerOutline, turntable: Turntable) -> Float[np.ndarray, "5"]:
+    """Derivatives of the log of the radius by the camera (as in ``Jacobian.camera``), the edges' pixels being fixed.
+
+    The radius is the distance of the axis from the rays through the edges: d |y| / sqrt(x^2 + y^2) of a ray's
+    direction (x, y, z).
+    """
+    fraction = outline.radius / turntable.distance
+    found = np.zeros(5)
+    for side in (-1.0, 1.0):
+        edge = [outline.radius * fraction, side * outline.radius * np.sqrt(1.0 - fraction**2), outline.foot]
+        ray = turntable.camera_rotation @ (np.array(edge) - [turntable.distance, 0.0, 0.0])
+        ray /= ray[2]
+        changes = np.stack([[-ray[0], -ray[1], 0.0], *cross_matrix(ray).T]) @ turntable.camera_rotation
+        x, y, _ = turntable.camera_rotation.T @ ray
+        found += 0.5 * np.append(changes @ [-x, x * x / y, 0.0] / (x * x + y * y), 1.0)
+    return found
 
 
 def _edges(radii, feet, heights, distance) -> Float[np.ndarray, "2 heights r 3"]:

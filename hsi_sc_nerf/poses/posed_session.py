@@ -52,12 +52,6 @@ def in_object_frame(
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
     uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, outline)
-    if source == "outline" and outline is not None:
-        # What the focal length leaves open in the object's size is now open in the camera's distance.
-        away = float(np.hypot(uncertainty.size, outline.radius_sigma))
-        reach_m = float(np.linalg.norm([turntable.distance, metres * outline.foot]))
-        position_m = float(np.hypot(uncertainty.position_m, away * reach_m))
-        uncertainty = replace(uncertainty, size=outline.radius_sigma, distance=away, position_m=position_m)
     return TurntablePoses(
         names=tuple(names),
         intrinsics=PinholeIntrinsics(*size_px, turntable.focal_px, turntable.focal_px, *turntable.centre_px),

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
-from hsi_sc_nerf.poses.container_outline import ContainerOutline
+from hsi_sc_nerf.poses.container_outline import ContainerOutline, radius_by_camera
 from hsi_sc_nerf.poses.object_frame import lowest_landmarks
 from hsi_sc_nerf.poses.residuals import PointResiduals
 from hsi_sc_nerf.poses.result import Uncertainty
@@ -38,7 +38,7 @@ def pose_uncertainty(
         adjusted: the turntable.
         covariance: of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
-        outline: of the container, where its foot gives the disc's height.
+        outline: of the container, where its radius gives the scale and its foot the disc's height.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())
@@ -53,17 +53,26 @@ def pose_uncertainty(
     # The camera over the disc: its distance from the axis, its height, and its way along the circle from the first
     # frame's. And the size of what turns.
     height, size = _landmark_gradients(adjusted)
-    height = height if outline is None else _foot_gradient(adjusted, outline)
+    radius, radius_variance = np.zeros_like(size), 0.0
+    if outline is not None:
+        height, radius_variance = _foot_gradient(adjusted, outline), outline.radius_sigma**2
+        radius[layout.camera] = radius_by_camera(outline, turntable)[: len(layout.camera)]
     place = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
     position = place[:, None] + (turntable.distance * angles) ** 2
-    foot_sigma = 0.0 if outline is None else outline.foot_sigma
+    variance = (metres**2) * position.max(axis=1).mean()
+    distance = float(sigmas[4]) ** 2 if 4 in layout.camera else 0.0
+    if outline is not None:
+        # The container's size is exact: what the camera leaves open in its radius is open in the camera's distance.
+        distance += float(radius @ covariance @ radius) + radius_variance
+        reach_sq = turntable.distance**2 + outline.foot**2
+        variance += metres**2 * (outline.foot_sigma**2 + distance * reach_sq)
     return Uncertainty(
         focal=float(sigmas[0]),
-        distance=float(sigmas[4]) if 4 in layout.camera else 0.0,
-        size=float(np.sqrt(size @ covariance @ size)),
+        distance=float(np.sqrt(distance)),
+        size=float(np.sqrt((size - radius) @ covariance @ (size - radius) + radius_variance)),
         angle_deg=adjusted.angle_sigmas_deg(covariance),
         rotation_deg=float(np.rad2deg(np.sqrt((turns**2).sum(axis=-1).max(axis=1).mean()))),
-        position_m=metres * float(np.sqrt(position.max(axis=1).mean() + foot_sigma**2)),
+        position_m=float(np.sqrt(variance)),
     )
 
 

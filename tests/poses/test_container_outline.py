@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from exact_turntable import marker_turntable, point_turntable
+from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.poses.container_outline import container_outline
+from hsi_sc_nerf.poses.container_outline import container_outline, radius_by_camera
 
 RADIUS_M, HEIGHT_M, OVER = 0.045, 0.07, 8
 
@@ -57,3 +58,25 @@ def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, en
 def test_what_is_hardly_seen_is_not_measured(turntable):
     scene, machine = turntable
     assert container_outline(drawn(scene, 0.0, 0.0), machine, HEIGHT_M / RADIUS_M / 2.0) is None
+
+
+@pytest.mark.parametrize("parameter", range(5))
+def test_radius_follows_the_camera_as_its_derivatives_say(turntable, parameter):
+    """In the same pictures another camera finds another radius."""
+    scene, machine = turntable
+    images, points_3d = drawn(scene, 0.0, 60.0), machine.points_3d.copy()
+    points_3d[:, 2] += HEIGHT_M - scene.first_camera_to_world[2, 3] - np.percentile(points_3d[:, 2], 1.0)
+    machine = replace(machine, points_3d=points_3d)
+    step = np.diag([0.03, 0.01, 0.001, 0.005, 0.03])[parameter]
+    found = []
+    for sign in (-1.0, 1.0):
+        turn = Rotation.from_rotvec(sign * step[1:4]).as_matrix()
+        other = replace(
+            machine,
+            focal_px=machine.focal_px * np.exp(sign * step[0]),
+            camera_rotation=turn @ machine.camera_rotation,
+            distance=machine.distance * np.exp(sign * step[4]),
+        )
+        found.append(container_outline(images, other, HEIGHT_M / RADIUS_M / 2.0).radius)
+    outline = container_outline(images, machine, HEIGHT_M / RADIUS_M / 2.0)
+    assert np.log(found[1] / found[0]) == pytest.approx(2.0 * step @ radius_by_camera(outline, machine), abs=0.002)
