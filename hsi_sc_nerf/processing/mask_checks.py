@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,8 @@ pixel along the mask's outline is added. Good masks have half of it, because the
 MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
 """Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
 in standard deviations of the frames' differences, for noise frays masks."""
+BACKGROUND_SIGMAS = 3.0
+"""Departure from what other frames show in a pixel, in standard deviations of theirs, up to which it is the same."""
 STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
@@ -69,7 +72,7 @@ def check_masks(
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),
         *_still(masks[~empty], brightness, None if lid_middles is None else lid_middles[~empty]),
-        *_hull(masks, names, silhouettes),
+        *_hull(masks, names, silhouettes, brightness),
     ]
 
 
@@ -144,11 +147,11 @@ def _hull(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
     silhouettes: Bool[np.ndarray, "frames h w"],
+    brightness: Float[np.ndarray, "frames h w"],
 ) -> list[Finding]:
     """Masks that contradict the visual hull, which is found by vote."""
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
-    union = (masks | silhouettes).sum(axis=(1, 2))
-    contradiction = 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
+    contradiction = _contradiction(masks, silhouettes)
     typical = float(np.median(contradiction[filled]))
     scatter = 1.4826 * float(np.median(np.abs(contradiction[filled] - typical)))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
@@ -159,6 +162,7 @@ def _hull(
             "visual hull of all, so the masks or the poses are wrong; look at report/masks.png and report/poses.png."
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
+    contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
     odd = (contradiction > typical + max(MAX_ODDITY + 0.125 * pixel, ODDITY_SIGMAS * scatter)) & filled
     if not odd.any():
         return []
@@ -171,6 +175,33 @@ def _hull(
             {"frames": {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}},
         )
     ]
+
+
+def _background(
+    masks: Bool[np.ndarray, "frames h w"],
+    silhouettes: Bool[np.ndarray, "frames h w"],
+    brightness: Float[np.ndarray, "frames h w"],
+) -> Bool[np.ndarray, "frames h w"]:
+    """Masked pixels outside of the hull that show what the other frames show there: noise, which trimming removes."""
+    beyond = masks & ~silhouettes
+    lines, samples = np.nonzero(beyond.any(axis=0))
+    shown = np.where(masks[:, lines, samples], np.nan, brightness[:, lines, samples])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a pixel that all masks hold has nothing to compare with
+        typical = np.nanmedian(shown, axis=0)
+        scatter = 1.4826 * np.nanmedian(np.abs(shown - typical), axis=0)
+    alike = np.abs(brightness[:, lines, samples] - typical) <= BACKGROUND_SIGMAS * scatter
+    background = np.zeros_like(masks)
+    background[:, lines, samples] = alike & beyond[:, lines, samples]
+    return background
+
+
+def _contradiction(
+    masks: Bool[np.ndarray, "frames h w"], silhouettes: Bool[np.ndarray, "frames h w"]
+) -> Float[np.ndarray, "frames"]:
+    """One minus intersection over union."""
+    union = (masks | silhouettes).sum(axis=(1, 2))
+    return 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
 
 
 def _list(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> list[str]:

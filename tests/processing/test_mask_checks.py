@@ -107,3 +107,14 @@ def test_a_frame_of_another_object_is_named(other):
     (finding,) = checked(masks, seen(masks))
     assert (finding.name, finding.level, list(finding.values["frames"])) == ("frames-hull", "red", ["ball_5"])
     assert "--exclude ball_5" in finding.sentence
+
+
+@pytest.mark.parametrize(("shows", "found"), [("what the other frames show there", []), ("fruit", ["frames-hull"])])
+def test_a_part_beyond_the_hull_is_another_object_only_if_it_shows_something_else(shows, found):
+    """Noise on the lid is trimmed; it is no reason to leave the frame out."""
+    masks = good_masks()
+    brightness = seen(masks)
+    masks[5, 44:52, 20:44] = True
+    if shows == "fruit":
+        brightness[5, 44:52, 20:44] = 0.4
+    assert list(findings(masks, brightness)) == found
