@@ -24,7 +24,7 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
-from hsi_sc_nerf.fields.hash_grid import fuse_hash_encodings
+from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
 
 BRIGHTNESS_GAIN = 0.05
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
@@ -178,6 +178,16 @@ class SpectralField(NerfactoField):
             loss.backward()
             optimizer.step()
         optimizer.zero_grad()
+
+    @torch.no_grad()
+    def shrink_grid(self, fraction: float) -> None:
+        """Shrink the features of the hash grid by a fraction of themselves: weight decay apart from the loss.
+
+        As Zip-NeRF's decay of its grid (Barron et al. 2023, arXiv 2304.06706), without Adam's normalisation of it.
+        """
+        for encoding in self.mlp_base.modules():
+            if fraction > 0.0 and isinstance(encoding, FusedHashEncoding):
+                encoding.hash_table.mul_(1.0 - min(fraction, 1.0))
 
     def density_gradient(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Gradient of the log density at points in scene units; its negative points out of the surface."""

@@ -184,10 +184,11 @@ class StagedTrainer(Trainer):
 
         torch.manual_seed(step_seed(self.config.machine.seed, step))
         self._model.prepare_step(step)
-        if self._captured is None:
-            loss, loss_dict, metrics_dict = super().train_iteration(step)
-        else:
-            loss, loss_dict, metrics_dict = self._captured_iteration(self._captured, step)
+        captured = self._captured
+        found = super().train_iteration(step) if captured is None else self._captured_iteration(captured, step)
+        loss, loss_dict, metrics_dict = found
+        if stage.learns("fields", step) and not self.optimizers.skipped_groups:
+            self._model.field.shrink_grid(rates["fields"] * stage.config.grid_decay)
 
         if sampler is not None:
             self._steps_since_update = sampler._steps_since_update + 1

@@ -46,6 +46,9 @@ class StageConfig:
     """Factor on every learning rate at the end of the stage; it falls exponentially in between."""
     group_lr: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Both factors for single parameter groups, in place of those above."""
+    grid_decay: float = between(0.0, math.inf, default=0.0)
+    """Fraction by which the hash grid's features shrink in a step, over its learning rate. Features that few views
+    reach fade, so that the surface is smooth between the views' outlines."""
 
 
 def full_frame_stage() -> StageConfig:
@@ -60,6 +63,7 @@ def full_frame_stage() -> StageConfig:
         fraction=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
         foreground_ray_fraction=0.5,
         boundary_ray_fraction=0.2,
+        grid_decay=0.1,
     )
 
 
@@ -73,6 +77,7 @@ def masked_stage() -> StageConfig:
         frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,
+        grid_decay=1.0,
     )
 
 

@@ -76,6 +76,15 @@ def test_coefficients_start_at_the_mean_and_are_not_bounded():
     assert coefficients.std(dim=(0, 1)).min() > 0
 
 
+def test_the_grid_shrinks_and_nothing_else():
+    made = field()
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    made.shrink_grid(0.25)
+    for name, value in made.state_dict().items():
+        expected = 0.75 * before[name] if name.endswith("hash_table") else before[name]
+        torch.testing.assert_close(value, expected)
+
+
 @pytest.mark.parametrize("distortion", [None, contraction()])
 def test_density_gradient_is_that_of_the_log_density(distortion):
     made = field(spatial_distortion=distortion).double()
