@@ -93,7 +93,7 @@ def _frames(session: Session) -> Finding:
     if session.excluded:
         parts.append(f"left out by --exclude: {names_in_short(session.excluded)}")
     if session.skipped:
-        parts.append(f"no captures: {names_in_short(list(session.skipped))}")
+        parts.append(f"beside them, no captures: {names_in_short(list(session.skipped))}")
     values = {
         "frames": [frame.name for frame in session.frames],
         "white": None if session.white is None else session.white.name,

@@ -237,8 +237,8 @@ def judge_spectra(points: Mapping[str, PointSpectra]) -> list[Finding]:
         return []
     worst = max(errors, key=lambda letter: errors[letter])
     sentence = (
-        f"Rendered spectra differ from the measured means by {np.mean(list(errors.values())):.1%} of reflectance, "
-        f"most at {worst}, {errors[worst]:.1%} (good up to {_SPECTRUM_ERROR[0]:.0%})"
+        f"Rendered spectra differ from the measured means by {100.0 * np.mean(list(errors.values())):.1f} % of "
+        f"reflectance, most at {worst}, {100.0 * errors[worst]:.1f} % (good up to {100.0 * _SPECTRUM_ERROR[0]:.0f} %)"
     )
     return [judged("spectra", errors[worst], _SPECTRUM_ERROR, sentence, "compare its curve with the noise around it")]
 
