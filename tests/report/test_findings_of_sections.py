@@ -55,6 +55,7 @@ def poses(px, used, *warnings):
         (judge_bands(np.array([0.02, 0.04, np.nan]), NM[:3]), ["green"], "500 nm"),
         (judge_bands(np.array([0.08, 0.04]), NM[:2]), ["amber"], "400 nm"),
         (judge_bands(np.array([0.2, 0.04]), NM[:2]), ["red"], "0.200"),
+        (judge_bands(np.array([0.08, 0.04]), NM[:2], np.array([0.08, 0.0])), ["green"], "0.040 beyond the noise"),
         (judge_spectra({"A": point(1.02), "B": point(0.97)}), ["green"], "at B, 3.0 %"),
         (judge_spectra({"A": point(1.1), "B": point(1.0)}), ["amber"], "at A, 10.0 %"),
         (judge_spectra({}), [], ""),
