@@ -34,4 +34,5 @@ print("imports:", *(f"{m.__name__} {m.__version__}" for m in (cv2, open3d, pycol
 CHECK
 environment/bin/hsi-sc-nerf --help > help.txt
 environment/bin/ns-train hsi-sc-nerf --help > help.txt
-echo "hsi-sc-nerf and ns-train hsi-sc-nerf start."
+environment/bin/tensorboard --version > help.txt
+echo "hsi-sc-nerf, ns-train hsi-sc-nerf and tensorboard start."

@@ -141,7 +141,8 @@ class InspectCommand:
         if self.output_dir is not None:
             write_json(self.output_dir / INSPECTION_NAME, inspection.report())
             draw_inspection(inspection, self.output_dir / "inspection.png")
-            console.print(f"{self.output_dir}: inspection.json and inspection.png are written.", highlight=False)
+            written = f"{self.output_dir}: inspection.json and inspection.png are written."
+            console.print(written, highlight=False, markup=False, soft_wrap=True)
         red = [finding.sentence for finding in inspection.findings if finding.level == "red"]
         if red:
             raise InputError(" ".join(red))
@@ -150,7 +151,7 @@ class InspectCommand:
         if not self.session.is_dir():
             raise InputError(f"{self.session}: there is no such folder to watch; check the path.")
         watch = Watch(self.session)
-        console.print(f"Watching {self.session}; Ctrl-C ends.", highlight=False)
+        console.print(f"Watching {self.session}; Ctrl-C ends.", highlight=False, markup=False, soft_wrap=True)
         try:
             while True:
                 for line in watch.new_lines():
@@ -158,7 +159,8 @@ class InspectCommand:
                 time.sleep(POLL_S)
         except KeyboardInterrupt:
             flagged = f"look at {', '.join(watch.flagged)}" if watch.flagged else "nothing is wrong with them"
-            console.print(f"{watch.captures} captures; {flagged}.", highlight=False)
+            waiting = f"; not complete: {', '.join(watch.incomplete)}" if watch.incomplete else ""
+            console.print(f"{watch.captures} captures; {flagged}{waiting}.", highlight=False, markup=False)
 
 
 def show_findings(console: Console, inspection: Inspection) -> None:
@@ -168,9 +170,10 @@ def show_findings(console: Console, inspection: Inspection) -> None:
         [f"[{colours[f.level]}]{f.level}[/{colours[f.level]}]", f.name, escape(f.sentence)]
         for f in inspection.findings
     ]
-    console.print(screen_table(["level", "check", "finding"], rows, title=str(inspection.session.path)))
+    console.print(screen_table(["level", "check", "finding"], rows, title=escape(str(inspection.session.path))))
     if not inspection.session.info_path.is_file():
-        console.print(suggestion(inspection.session, inspection.session_json), highlight=False, markup=False)
+        content = suggestion(inspection.session, inspection.session_json)
+        console.print(content, highlight=False, markup=False, soft_wrap=True)  # a broken line would be no JSON
 
 
 @dataclass(frozen=True)

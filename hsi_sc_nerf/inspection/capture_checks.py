@@ -93,7 +93,7 @@ def _frames(session: Session) -> Finding:
     if session.excluded:
         parts.append(f"left out by --exclude: {names_in_short(session.excluded)}")
     if session.skipped:
-        parts.append(f"no captures: {names_in_short(list(session.skipped))}")
+        parts.append(f"beside them, no captures: {names_in_short(list(session.skipped))}")
     values = {
         "frames": [frame.name for frame in session.frames],
         "white": None if session.white is None else session.white.name,
@@ -126,7 +126,7 @@ def _same(
     values: Mapping[str, object] = {frame.name: value_of(frame) for frame in session.frames}
     given = Counter(value for value in values.values() if value is not None)
     if not given:
-        return Finding(name, "green", f"The headers state no {what}.")
+        return Finding(name, "green", f"The headers do not state the {what}.")
     usual = given.most_common(1)[0][0]
     others = [frame for frame, value in values.items() if value not in (usual, None)]
     if not others:
@@ -188,9 +188,10 @@ def _exposure(session: Session, looks: Sequence[Look]) -> Finding:
         found = "amber"
     if bright_frames.max() > SATURATED_RED or dark_frames.max() > DARK_RED:
         found = "red"
+    most = 100.0 * saturated.mean(axis=0)[worst]
     told = (
-        f"{100.0 * bright_frames.mean():.2g} % of the frames' values are saturated (most at "
-        f"{wavelengths_nm[worst]:.0f} nm: {100.0 * saturated.mean(axis=0)[worst]:.2g} %), "
+        f"{100.0 * bright_frames.mean():.2g} % of the frames' values are saturated"
+        f"{f' (most at {wavelengths_nm[worst]:.0f} nm: {most:.2g} %)' if most else ''}, "
         f"{100.0 * dark_frames.mean():.2g} % are dark"
     )
     if bright_frames.max() > SATURATED_AMBER:

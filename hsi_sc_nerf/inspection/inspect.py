@@ -16,11 +16,13 @@ from hsi_sc_nerf.calibration.white_check import check_white
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
+from hsi_sc_nerf.poses.known_camera import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.upright import rotation_from_corners
 
@@ -98,6 +100,7 @@ def inspect_session(
         *check_markers(session, markers),
         upright,
         check_scale(session, poses, scale_known),
+        *check_angles(session, poses, markers),
     ]
     return Inspection(session, looks, markers, findings, suggested)
 
@@ -173,13 +176,27 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
         if (value := getattr(info, name)) is not None
     }
     if known or scale_known:
-        return Finding("scale", "green", f"Scale: {', '.join(known) or 'an option'} gives it.", known)
+        given = " and ".join(known) or "an option"
+        return Finding("scale", "green", f"Scale: given by {given}.", known)
     where = f"{session.info_path}: does not give" if session.info_path.is_file() else f"{session.path}: nothing gives"
     sentence = (
         f"{where} a scale; state marker_side_m, the side of a marker's black square in metres, in session.json or "
         "by --marker-side-m, or do without a scale by --poses colmap."
     )
     return Finding("scale", "red" if poses in ("auto", "markers") else "amber", sentence)
+
+
+def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[Finding]:
+    """The finding ``angles`` where ``session.json`` states angles that cannot be used, or none that are needed."""
+    needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
+    try:
+        angles_deg = known_angles_deg(session.info, len(session.frames))
+    except InputError as error:
+        return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
+    if angles_deg is not None or poses != "angles":
+        return []
+    sentence = f"{session.info_path}: the angles are not known; give nominal_step_deg or frame_angles_deg."
+    return [Finding("angles", "red", sentence)]
 
 
 def draw_inspection(inspection: Inspection, path: Path) -> None:

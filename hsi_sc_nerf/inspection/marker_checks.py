@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -23,6 +24,8 @@ from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 
+LEAST_NOISE = 1e-4
+"""Reflectance; no smaller noise is told."""
 FITTED_MARKERS = 5
 """Markers whose corners are fitted; they give their error."""
 EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
@@ -80,10 +83,7 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
     if dictionary is None:
         dictionary = find_dictionary(grays)
     else:
-        try:
-            dictionary_by_name(dictionary)
-        except InputError as error:
-            raise InputError(f"{session.info_path}: {error}.") from error
+        check_dictionary(dictionary, session.info_path)
     detections: list[Detections] = [{} for _ in grays]
     if dictionary is not None:
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -109,6 +109,18 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
         float(np.median(sides)) if sides else float("nan"),
         float(np.median(errors)) if errors else float("nan"),
     )
+
+
+def check_dictionary(name: str, stated_in: Path) -> None:
+    """Refuse a marker dictionary that OpenCV does not have.
+
+    Raises:
+        InputError: it has none of that name.
+    """
+    try:
+        dictionary_by_name(name)
+    except InputError as error:
+        raise InputError(f"{stated_in}: {error}.") from error
 
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:
@@ -184,7 +196,10 @@ def _turn(session: Session, markers: Markers) -> Finding:
 
 def _expected(session: Session, markers: Markers) -> Finding:
     noise = reflectance_noise(session)
-    spectra = f"one value of a pixel's reflectance has a noise of at most {noise:.2g}, measured between two frames"
+    spectra = (
+        f"one value of a pixel's reflectance has a noise of at most {max(noise, LEAST_NOISE):.2g}, measured between "
+        "two frames"
+    )
     if markers.dictionary is None:
         poses = "what poses are worth is not known without markers"
     elif np.median([len(seen) for seen in markers.detections]) == 0 or markers.side_px < EXPECTED[-1][0]:

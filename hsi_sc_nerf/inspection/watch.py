@@ -8,9 +8,11 @@ import numpy as np
 
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
-from hsi_sc_nerf.capture.session_info import read_session_info
+from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
 from hsi_sc_nerf.inspection.look import Look, look_at, white_counts
+from hsi_sc_nerf.inspection.marker_checks import check_dictionary
 from hsi_sc_nerf.poses.marker_detection import detect_markers, find_dictionary
 
 FEWEST_TO_COMPARE = 3
@@ -26,37 +28,59 @@ class Watch:
     Attributes:
         captures: number of captures that a line was given for.
         flagged: those of them with something wrong.
+        incomplete: why other captures cannot be read, by name.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.captures = 0
         self.flagged: list[str] = []
+        self.incomplete: dict[str, str] = {}
         self._seen: set[str] = set()
         self._looks: list[Look] = []
         self._markers: list[int] = []
+        self._told: set[str] = set()
+        self._info = SessionInfo()
         self._first: Capture | None = None
         self._dictionary: str | None = None
 
     def new_lines(self) -> list[str]:
         """A line for each capture that is complete and was not before.
 
-        A capture whose data file is shorter than its header says is still being written, and is waited for.
-
-        Raises:
-            InputError: ``session.json`` cannot be used.
+        A capture whose data file is shorter than its header says is still being written, and is waited for. A line
+        says so if another capture that came later is complete, and if ``session.json`` or the folder cannot be used.
         """
-        info = read_session_info(self.path / SESSION_INFO_NAME)
-        new = [files for files in list_captures(self.path).captures if files.name not in self._seen]
+        waited_for, self.incomplete = self.incomplete, {}
         lines = []
+        try:
+            self._info = read_session_info(self.path / SESSION_INFO_NAME)
+            if self._info.marker_dictionary is not None:
+                check_dictionary(self._info.marker_dictionary, self.path / SESSION_INFO_NAME)
+            new = [files for files in list_captures(self.path).captures if files.name not in self._seen]
+        except (InputError, OSError) as error:
+            self.incomplete = waited_for
+            return self._once(str(error))
         for files in new:
-            opened = open_captures([files], info, self.path, {})
-            if opened and self._is_complete(files):
-                self._seen.add(files.name)
-                self.captures += 1
-                is_white = files.name.lower() == info.white_reference.lower()
-                lines.append(self._line(opened[0], info.marker_dictionary, is_white))
+            opened = open_captures([files], self._info, self.path, self.incomplete)
+            if not opened:
+                continue
+            if not self._is_complete(files):
+                self.incomplete[files.name] = "its dark cube is missing"
+                continue
+            self._seen.add(files.name)
+            self.captures += 1
+            is_white = files.name.lower() == self._info.white_reference.lower()
+            lines.append(self._line(opened[0], self._info.marker_dictionary, is_white))
+        for name in self.incomplete if lines else ():
+            if name in waited_for:
+                lines += self._once(f"{name}: NOT COMPLETE, {self.incomplete[name]}")
         return lines
+
+    def _once(self, line: str) -> list[str]:
+        """The line, unless it was told before."""
+        told = line in self._told
+        self._told.add(line)
+        return [] if told else [line]
 
     def _is_complete(self, files: CaptureFiles) -> bool:
         """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""

@@ -211,7 +211,7 @@ def _inspect(session: Session, config: ProcessConfig, console: Console) -> Inspe
         )
     no_scale = any(finding.name == "scale" and finding.level == "red" for finding in inspection.findings)
     if no_scale and not session.info_path.is_file():
-        console.print(suggestion(session, inspection.session_json), highlight=False)
+        console.print(suggestion(session, inspection.session_json), highlight=False, soft_wrap=True)
     return inspection
 
 

@@ -119,7 +119,7 @@ def object_section(cloud: SpectralCloud, points: int) -> Section:
     spectra = compress_spectra(shown.spectra)
     caption = (
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
-        f"which changes reflectance by {spectra.rmse:.1e} (root mean square; at most {spectra.largest_error:.1e})."
+        f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
     return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)], judge_cloud(cloud))
 
@@ -130,8 +130,8 @@ def judge_cloud(cloud: SpectralCloud) -> list[Finding]:
         return []
     fraction = float(np.mean(cloud.extra[INCIDENCE] > MAX_INCIDENCE_DEG))
     sentence = (
-        f"{fraction:.1%} of the points are seen at more than {MAX_INCIDENCE_DEG:g}° from the front (good up to "
-        f"{_OBLIQUE_FRACTION:.0%})"
+        f"{100.0 * fraction:.1f} % of the points are seen at more than {MAX_INCIDENCE_DEG:g}° from the front (good "
+        f"up to {100.0 * _OBLIQUE_FRACTION:.0f} %)"
     )
     advice = f"show the column {INCIDENCE} to see where their spectra are mixed"
     return [judged("oblique", fraction, (_OBLIQUE_FRACTION, np.inf), sentence, advice)]

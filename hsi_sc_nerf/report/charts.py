@@ -41,8 +41,9 @@ _STYLE = STYLE | {
     "svg.fonttype": "none",
 }
 _SVG = "http://www.w3.org/2000/svg"
-_WIDTH_IN, _HEIGHT_IN, _LEGEND_ROW_IN = 6.4, 3.0, 0.2
-_LEGEND_CHARACTERS = 72
+_WIDTH_IN, _HEIGHT_IN, _LEGEND_ROW_IN = 4.8, 2.4, 0.2
+"""A phone shows an inch in 76 px, so that letters are 9 px high."""
+_LEGEND_CHARACTERS = 54
 # Smallest value of a logarithmic axis as a fraction of the largest; a curve that touches 0 would use up all the axis.
 _SMALLEST_FRACTION = 1e-6
 
@@ -146,13 +147,13 @@ def _value_range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: b
 
 
 def _draw_marks(axes: Axes, marks: Mapping[str, float]) -> None:
-    """The named vertical lines that lie within the axis."""
+    """The named vertical lines that lie within the axis, with their names above it."""
     low, high = axes.get_xlim()
     for row, (name, value) in enumerate(marks.items()):
         if low <= value <= high:
             axes.axvline(value, color=_FAINT, linewidth=0.8, linestyle=(0.0, (3.0, 3.0)))
             side = "right" if value > (low + high) / 2.0 else "left"
-            offset_pt = (3 if side == "left" else -3, -9 - 10 * row)
+            offset_pt = (3 if side == "left" else -3, 2 + 10 * row)
             axes.annotate(
                 name,
                 (value, 1.0),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int16, UInt16
 from matplotlib import colormaps
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
@@ -21,6 +22,8 @@ _MISSING = 65535
 # Below the resolution of screens and of the instrument.
 TOLERANCE = 5e-4
 MAX_RANK = 32
+_NEIGHBOURS = 8
+"""Neighbours of a point whose distance tells how many points there are on an area."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,15 @@ def thinned(cloud: SpectralCloud, max_points: int) -> SpectralCloud:
     return cloud.select(whole)
 
 
+def spacing_of(points: Float[np.ndarray, "n 3"]) -> float:
+    """Distance of neighbours on the surface: the square root of a point's area, median over the points."""
+    neighbours = min(_NEIGHBOURS, len(points) - 1)
+    if neighbours < 1:
+        return 0.0
+    reach, _ = cKDTree(points).query(points, [neighbours + 1])
+    return float(np.sqrt(np.pi / neighbours * np.median(np.square(reach))))
+
+
 def _base64(array: np.ndarray) -> str:
     """Bytes of an array, little-endian, in base64."""
     return base64.b64encode(np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()).decode()
@@ -124,6 +136,7 @@ def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str,
         "count": len(cloud.points),
         "centre_m": centre.tolist(),
         "reach_m": reach_m,
+        "spacing": spacing_of(cloud.points) / reach_m,
         "positions": _base64(np.rint((cloud.points - centre) / reach_m * _INT16).astype(np.int16)),
         "normals": _base64(np.rint(cloud.normals / lengths * 127.0).astype(np.int8)),
         "wavelengths_nm": cloud.wavelengths_nm[order].tolist(),

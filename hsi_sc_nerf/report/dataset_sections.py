@@ -103,7 +103,10 @@ def calibration_section(dataset: PackedDataset) -> Section:
 
 def judge_calibration(flagged_fraction: float, drift: Mapping[str, Any]) -> list[Finding]:
     """How many values are no measurement, and whether the lamps' drift is known."""
-    sentence = f"{flagged_fraction:.2%} of the values are no measurement (good up to {_FLAGGED_FRACTION[0]:.0%})"
+    sentence = (
+        f"{100.0 * flagged_fraction:.2f} % of the values are no measurement (good up to "
+        f"{100.0 * _FLAGGED_FRACTION[0]:.0f} %)"
+    )
     advice = "see which bands, and lower the integration time if they are saturated"
     findings = [judged("flagged", flagged_fraction, _FLAGGED_FRACTION, sentence, advice)]
     if drift and not drift.get("measured"):
@@ -190,8 +193,8 @@ def judge_masks(areas_px: Int[np.ndarray, "frames"], captures: Sequence[str]) ->
     neighbours = np.median([np.roll(areas_px, shift) for shift in (-2, -1, 1, 2)], axis=0)
     jumps = np.abs(areas_px / np.maximum(neighbours, 1.0) - 1.0)
     sentence = (
-        f"Masks differ from those of the frames beside them by up to {jumps.max():.1%} of their size (good up to "
-        f"{_MASK_JUMP:.0%})"
+        f"Masks differ from those of the frames beside them by up to {100.0 * jumps.max():.1f} % of their size (good "
+        f"up to {100.0 * _MASK_JUMP:.0f} %)"
     )
     odd = ", ".join(captures[index] for index in np.argsort(-jumps)[:5] if jumps[index] > _MASK_JUMP)
     advice = f"look at {odd}, and mend or exclude such frames"
@@ -206,14 +209,17 @@ def poses_section(dataset: PackedDataset) -> Section:
         return Section("poses", "Poses", [missing])
     blocks: list[Block] = [Table("The turntable and the camera.", ("", "found"), _pose_rows(found))]
     errors = np.array([np.nan if (e := f.reprojection_error_px) is None else e for f in dataset.frames])
+    charts: dict[str, Markup] = {}
     if np.isfinite(errors).any():
-        chart = _by_frame(errors, "reprojection error (px)", "Root mean square reprojection error by frame")
-        blocks.append(Figure([chart], "Root mean square reprojection error of the markers or features, pixels."))
+        title = "Reprojection error of the markers or features"
+        charts[title] = _by_frame(errors, "root mean square (px)", f"{title} by frame")
     steps_deg = np.diff([frame.angle_deg for frame in dataset.frames])
     if len(steps_deg):
-        chart = _by_frame(np.append(np.nan, steps_deg), "step (degrees)", "Turn of the table since the frame before")
-        caption = "Turn of the table since the frame before, degrees, positive counter-clockwise."
-        blocks.append(Figure([chart], caption))
+        title = "Turn since the frame before"
+        charts[title] = _by_frame(np.append(np.nan, steps_deg), "step (degrees)", f"{title} by frame")
+    if charts:
+        caption = "Root mean square reprojection error in pixels; turn of the table, positive counter-clockwise."
+        blocks.append(Figure(list(charts.values()), caption, list(charts), columns=2))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
     return Section("poses", "Poses", blocks, judge_poses(found))
 

@@ -26,6 +26,9 @@ WIDEST_PX = 1600
 _QUALITY = 82
 # Levels of findings as words, because colour alone does not tell everybody.
 _WORDS = {"green": "Good:", "amber": "Check:", "red": "Problem:"}
+_MOST_GOOD = 3
+"""More good findings of a section are folded."""
+_LONG_CELL = 24
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,12 @@ class Table:
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+
+    @property
+    def stacks(self) -> bool:
+        """Whether it is too wide for a phone, which shows each row as a list."""
+        long = any(len(cell) > _LONG_CELL for row in self.rows for cell in row[1:])
+        return len(self.header) > (2 if long else 3)
 
 
 @dataclass(frozen=True)
@@ -117,6 +126,7 @@ def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], section
         key_figures=key_figures,
         sections=sections,
         words=_WORDS,
+        most_good=_MOST_GOOD,
         styles=_own_text("page.css"),
         scripts=Markup("\n").join(map(_own_text, _SCRIPTS)),
         footer="Made by hsi-sc-nerf report. This file is complete: it needs no network and no other file.",

@@ -20,6 +20,8 @@ _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
 _WRONG_CONTENT = (AttributeError, KeyError, TypeError, ValueError)
 _F_SCORE_MISSING_PERCENT = (10.0, 30.0)
 _UNSEEN_FRACTION = 0.15
+_DRAWN_THRESHOLDS = 2.0
+"""Curves end at this many times the largest threshold of interest."""
 
 
 def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Section:
@@ -70,11 +72,12 @@ def comparison_key_figure(comparison: Mapping[str, Any]) -> dict[str, str]:
 def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
     found, scores = comparison["curves"], comparison["scores"]
     thresholds_mm = _MM_PER_M * np.array(found["thresholds_m"], float)
+    marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in ("chosen", "knee")}
+    drawn = thresholds_mm <= _DRAWN_THRESHOLDS * max(marks_mm.values())
     curves = [
-        Curve(name, thresholds_mm, np.array(found[key], float).reshape(len(thresholds_mm)))
+        Curve(name, thresholds_mm[drawn], np.array(found[key], float).reshape(len(thresholds_mm))[drawn])
         for key, name in _CURVES.items()
     ]
-    marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in ("chosen", "knee")}
     chart = line_chart(
         curves,
         x_label="distance threshold (mm)",
@@ -118,6 +121,9 @@ def judge_traits(traits: Mapping[str, Any]) -> list[Finding]:
     if not traits["watertight"]:
         return [Finding("watertight", "red", "The mesh has holes, so its volume cannot be trusted; mesh it anew.")]
     fraction = 1.0 - traits["seen_area_m2"] / traits["size"]["area_m2"]
-    sentence = f"The mesh is closed; {fraction:.1%} of its area was not seen (good up to {_UNSEEN_FRACTION:.0%})"
+    sentence = (
+        f"The mesh is closed; {100.0 * fraction:.1f} % of its area was not seen (good up to "
+        f"{100.0 * _UNSEEN_FRACTION:.0f} %)"
+    )
     advice = "give the container's height (--data), and see which side was not seen"
     return [judged("closed-area", fraction, (_UNSEEN_FRACTION, np.inf), sentence, advice)]

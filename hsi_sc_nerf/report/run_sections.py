@@ -88,8 +88,8 @@ def judge_training(psnr_db: Float[np.ndarray, "n"]) -> list[Finding]:
     before, end = np.array_split(psnr_db[len(psnr_db) // 2 :], 2)
     rise_db = float(np.mean(end) - np.mean(before))
     sentence = (
-        f"The PSNR of training rays rose by {rise_db:.2f} dB in the last quarter of the last stage (converged up to "
-        f"{_PSNR_RISE_DB:g} dB)"
+        f"The PSNR of training rays changed by {rise_db:+.2f} dB in the last quarter of the last stage (converged up "
+        f"to {_PSNR_RISE_DB:+g} dB)"
     )
     return [judged("convergence", rise_db, (_PSNR_RISE_DB, np.inf), sentence, "train longer")]
 

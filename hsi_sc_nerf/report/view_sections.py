@@ -185,18 +185,24 @@ def bands_section(
             f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
         )
     figure = Figure(list(charts.values()), caption, list(charts), columns=2)
-    findings = judge_bands(rmse[0].y, wavelengths_nm)
+    findings = judge_bands(rmse[0].y, wavelengths_nm, typical_uncertainty)
     return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
 
-def judge_bands(rmse: Float[np.ndarray, "bands"], wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Finding]:
-    """The band with the largest error."""
-    worst = int(np.nanargmax(rmse))
+def judge_bands(
+    rmse: Float[np.ndarray, "bands"],
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    noise: Float[np.ndarray, "bands"] | None = None,
+) -> list[Finding]:
+    """The band with the largest error, without the noise of the measurement where that is known."""
+    beyond = rmse if noise is None else np.sqrt(np.maximum(rmse**2 - noise**2, 0.0))
+    worst = int(np.nanargmax(beyond))
     sentence = (
-        f"The RMSE of reflectance is {np.nanmean(rmse):.3f} and in no band above {rmse[worst]:.3f}, at "
-        f"{wavelengths_nm[worst]:.0f} nm (good up to {_RMSE[0]:g})"
+        f"The RMSE of reflectance is {np.nanmean(rmse):.3f}, and in no band above {beyond[worst]:.3f}"
+        f"{'' if noise is None else ' beyond the noise of the measurement'}, at {wavelengths_nm[worst]:.0f} nm (good "
+        f"up to {_RMSE[0]:g})"
     )
-    return [judged("rmse", float(rmse[worst]), _RMSE, sentence, "train longer, or look at the maps of the error")]
+    return [judged("rmse", float(beyond[worst]), _RMSE, sentence, "train longer, or look at the maps of the error")]
 
 
 def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], white: float) -> Section:
@@ -237,8 +243,8 @@ def judge_spectra(points: Mapping[str, PointSpectra]) -> list[Finding]:
         return []
     worst = max(errors, key=lambda letter: errors[letter])
     sentence = (
-        f"Rendered spectra differ from the measured means by {np.mean(list(errors.values())):.1%} of reflectance, "
-        f"most at {worst}, {errors[worst]:.1%} (good up to {_SPECTRUM_ERROR[0]:.0%})"
+        f"Rendered spectra differ from the measured means by {100.0 * np.mean(list(errors.values())):.1f} % of "
+        f"reflectance, most at {worst}, {100.0 * errors[worst]:.1f} % (good up to {100.0 * _SPECTRUM_ERROR[0]:.0f} %)"
     )
     return [judged("spectra", errors[worst], _SPECTRUM_ERROR, sentence, "compare its curve with the noise around it")]
 

@@ -43,7 +43,7 @@ def spectra_plot(
 @rc_context(_STYLE)
 def colour_bar(drawn_range: tuple[float, float], colours: str, label: str) -> bytes:
     """PNG of a colour map with its range."""
-    figure = new_figure(_WIDTH_IN, 0.48)
+    figure = new_figure(_WIDTH_IN, 0.6)
     mappable = ScalarMappable(Normalize(*drawn_range), colours)
     figure.colorbar(mappable, cax=figure.add_subplot(), orientation="horizontal", label=label)
     return _png(figure)

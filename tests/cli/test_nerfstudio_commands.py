@@ -1,11 +1,19 @@
 """nerfstudio's own commands on a small run and a dataset of this package: the table of its how-to page."""
 
+import contextlib
 import json
 import shutil
+import socket
+import subprocess
 import sys
+import time
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import ball_run
 import pytest
+import small_trainer
 import torch
 import tyro
 
@@ -134,6 +142,60 @@ def ns_train(tmp_path, monkeypatch):
 
     monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
     return called
+
+
+def page(address, told, server_ended=lambda: False):
+    """What a server says as soon as it says ``told``."""
+    text = ""
+    for _ in range(240):
+        with contextlib.suppress(URLError):
+            text = urlopen(address, timeout=60).read().decode()
+        if told in text:
+            return text
+        if server_ended():
+            break
+        time.sleep(1)
+    pytest.fail(f"{address} does not say {told!r}: {text[:500]!r}")
+
+
+def test_viewer_opens_a_run(config_path):
+    with socket.socket() as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    words = [
+        Path(sys.executable).with_name("ns-viewer"),
+        "--load-config",
+        config_path,
+        "--viewer.websocket-port",
+        port,
+    ]
+    viewer = subprocess.Popen(list(map(str, words)))
+    try:
+        page(f"http://localhost:{port}", "<title>", lambda: viewer.poll() is not None)
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def test_viewer_of_no_run_is_one_sentence(tmp_path):
+    from nerfstudio.scripts.viewer import run_viewer
+
+    extend_nerfstudio_commands()
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*nowhere[^\n]*\.$"):
+        tyro.cli(run_viewer.RunViewer, args=["--load-config", str(tmp_path / "nowhere.yml")]).main()
+
+
+def test_tensorboard_shows_what_a_run_wrote(tiny_dataset, tmp_path, monkeypatch):
+    from tensorboard.program import TensorBoard
+
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
+    made = small_trainer.trainer(tiny_dataset, tmp_path)
+    made.config.logging.steps_per_log = 1
+    made.train()
+    board = TensorBoard()
+    board.configure(argv=["tensorboard", "--logdir", str(tmp_path), "--port", "0"])
+    (tags,) = json.loads(page(f"{board.launch()}data/plugin/scalars/tags", "Train Loss")).values()
+    assert {"Train Loss", "Train Metrics Dict/sam", "learning_rate/fields"} <= set(tags)
 
 
 def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path, ns_train, monkeypatch):

@@ -109,6 +109,23 @@ def test_a_blurred_frame_without_markers_is_amber(session):
     assert "fruit_10" in amber["markers"]
 
 
+@pytest.mark.parametrize(
+    ("stated", "poses", "level"),
+    [
+        ({"frame_angles_deg": list(range(0, 360, 30))}, "angles", None),
+        ({"frame_angles_deg": [0, 30]}, "angles", "red"),
+        ({"frame_angles_deg": [0, 30]}, "auto", "amber"),
+        ({}, "angles", "red"),
+        ({}, "auto", None),
+        ({"nominal_step_deg": 30}, "angles", None),
+    ],
+)
+def test_angles_that_poses_need_are_asked_for_before_any_computing(session, stated, poses, level):
+    (session / "session.json").write_text(json.dumps({**INFO, **stated}))
+    findings = inspect_session(open_session(session), poses).findings
+    assert [f.level for f in findings if f.name == "angles"] == ([] if level is None else [level])
+
+
 @pytest.mark.slow
 def test_without_session_json_it_is_written_for_the_user(good, tmp_path):
     session = Path(shutil.copytree(good, tmp_path / "fruits"))

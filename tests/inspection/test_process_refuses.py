@@ -53,6 +53,7 @@ def test_inspect_prints_all_findings_and_a_session_json(session, tmp_path, capsy
     assert all(finding["name"] in printed for finding in findings)
     assert "marker_dictionary" not in printed
     (session / "session.json").unlink()
+    session = session.rename(tmp_path / ("fruit of a long name " * 5))  # no line of the JSON is broken
     with pytest.raises(InputError, match="nothing gives a scale"):
         InspectCommand(session).main()
     printed = capsys.readouterr().out

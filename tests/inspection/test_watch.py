@@ -35,6 +35,44 @@ def test_a_capture_that_is_being_written_is_waited_for(tmp_path):
     assert len(watch.new_lines()) == 1
 
 
+def test_a_capture_that_stays_incomplete_is_named_when_a_later_one_is_complete(tmp_path):
+    watch = Watch(tmp_path)
+    for number in range(3):
+        write_one(tmp_path, f"fruit_{number}", IMAGE)
+    short = tmp_path / "fruit_1" / "capture" / "fruit_1.raw"
+    whole = short.read_bytes()
+    short.write_bytes(whole[:1000])
+    (tmp_path / "fruit_2" / "capture" / "DARKREF_fruit_2.hdr").unlink()
+    assert [line.split(":")[0] for line in watch.new_lines()] == ["fruit_0"]  # the others may still be written
+    assert list(watch.incomplete) == ["fruit_1", "fruit_2"]
+    assert watch.new_lines() == []
+    write_one(tmp_path, "fruit_3", IMAGE)
+    complete, broken, without_dark = watch.new_lines()
+    assert complete.startswith("fruit_3:")
+    assert broken.startswith("fruit_1: NOT COMPLETE, ")
+    assert without_dark == "fruit_2: NOT COMPLETE, its dark cube is missing"
+    write_one(tmp_path, "fruit_4", IMAGE)
+    assert len(watch.new_lines()) == 1
+    short.write_bytes(whole)
+    assert [line.split(":")[0] for line in watch.new_lines()] == ["fruit_1"]
+    assert list(watch.incomplete) == ["fruit_2"]
+
+
+@pytest.mark.parametrize("content", ["{", '{"marker_sidem": 1}', '{"marker_dictionary": "DICT_9X9_50"}'])
+def test_a_session_json_that_cannot_be_used_is_told_once_and_the_watch_goes_on(tmp_path, content):
+    """It may be written while captures are taken."""
+    watch = Watch(tmp_path)
+    (tmp_path / "session.json").write_text(content)
+    write_one(tmp_path, "fruit_0", IMAGE)
+    (told,) = watch.new_lines()
+    assert told.startswith(f"{tmp_path / 'session.json'}: ")
+    assert told.endswith(".")
+    assert watch.new_lines() == []
+    (tmp_path / "session.json").write_text("{}")
+    (line,) = watch.new_lines()
+    assert line.startswith("fruit_0:")
+
+
 @pytest.mark.slow
 def test_what_is_wrong_is_flagged_at_once(tmp_path):
     watch = Watch(tmp_path)

@@ -18,6 +18,7 @@ from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report.build import ReportSources, write_report
 from hsi_sc_nerf.report.dataset_sections import (
@@ -26,7 +27,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     masks_section,
     poses_section,
 )
-from hsi_sc_nerf.report.page import html_page
+from hsi_sc_nerf.report.page import Section, html_page
 from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
@@ -124,6 +125,17 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report):
     assert not list(report.parent.glob(".*")) + list(report.parent.glob("*.tmp"))
 
 
+def test_many_good_findings_are_folded_and_none_other():
+    """What is to be looked at does not drown in what is good."""
+    found = [Finding(str(i), "green", f"Check {i} is good.") for i in range(5)]
+    odd = Finding("odd", "amber", "Look here.")
+    page = html_page("a", "b", {}, [Section("few", "Few", [], found[:2]), Section("many", "Many", [], [*found, odd])])
+    many = page.split('id="many"')[1]
+    assert "Good:</strong> 5 checks" in many
+    assert many.index("Look here.") < many.index("<details") < many.index("Check 4 is good.")
+    assert "<details" not in page.split('id="few"')[1].split("</section>")[0]
+
+
 @pytest.mark.slow
 def test_sections_on_a_processed_session(flagged_dataset):
     dataset = open_packed(flagged_dataset)
@@ -210,10 +222,10 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(browser, report):
 
         # Viridis at its end for the bright half, at its middle for the other; nothing beside the ball.
         np.testing.assert_allclose(colour_at(0.5, 0.25), [253, 231, 37, 255], atol=12)
-        np.testing.assert_allclose(colour_at(0.5, 0.65), [33, 145, 140, 255], atol=12)
+        np.testing.assert_allclose(colour_at(0.5, 0.72), [33, 145, 140, 255], atol=12)
         assert colour_at(0.02, 0.02)[3] == 0
 
-        click(0.5, 0.65)
+        click(0.5, 0.72)
         click(0.02, 0.02)
         assert page.locator(".picked li").count() == 1
         assert page.locator(".missed").is_visible()
@@ -264,6 +276,8 @@ def test_a_phone_shows_all_of_it_without_scrolling_sideways(browser, report):
         assert height < 5000
         page.evaluate("for (const one of document.querySelectorAll('details')) one.open = true")
         assert page.evaluate(size)[0] == 390
+        cut = "all => all.filter((one) => one.scrollWidth > one.clientWidth).map((one) => one.innerText)"
+        assert page.locator(".wide").evaluate_all(cut) == []
         names = page.locator("tbody th").evaluate_all("all => all.map((one) => one.clientWidth)")
         assert min(names) >= 80
         reach = "all => all.map((one) => one.getBoundingClientRect().right)"

@@ -7,7 +7,7 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.ply import SpectralCloud
-from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, quantise, thinned
+from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, quantise, spacing_of, thinned
 
 
 def restored(spectra):
@@ -48,6 +48,15 @@ def test_noise_is_cut_at_the_largest_rank_and_what_is_lost_is_told():
 def test_equal_spectra_come_back():
     spectra = np.tile(np.linspace(0.1, 0.9, 7), (5, 1))
     np.testing.assert_allclose(restored(compress_spectra(spectra)), spectra, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [2000, 8000])
+@pytest.mark.parametrize("radius", [0.01, 0.2])
+def test_spacing_is_the_root_of_the_area_of_a_point(count, radius):
+    """However large the surface, or the part of its box that it fills."""
+    points = radius * ball(count).normals
+    assert spacing_of(points) == pytest.approx(radius * np.sqrt(4.0 * np.pi / count), rel=0.06)
+    assert spacing_of(points[:1]) == 0.0
 
 
 def test_quantised_numbers_come_back_and_missing_ones_are_marked():

@@ -13,6 +13,7 @@ class Cloud {
     this.count = payload.count;
     this.centre = payload.centre_m;
     this.reach = payload.reach_m;
+    this.spacing = payload.spacing;
     this.positions = decode(payload.positions, Int16Array);
     this.normals = decode(payload.normals, Int8Array);
     this.wavelengths = payload.wavelengths_nm;

@@ -47,8 +47,8 @@ class Renderer {
     this.attribute("normal", cloud.normals, gl.BYTE);
     this.colourBuffer = this.attribute("colour", new Uint8Array(3 * cloud.count), gl.UNSIGNED_BYTE);
     gl.enable(gl.DEPTH_TEST);
-    // Some times the distance of neighbours on a surface of about the object's area covers the gaps between them.
-    this.spacing = 3.2 * Math.sqrt((4 * Math.PI * 0.3) / cloud.count);
+    // Points of some times the distance of neighbours cover the gaps between them.
+    this.spacing = 2.8 * cloud.spacing;
   }
 
   attribute(name, values, type) {

@@ -1,0 +1,142 @@
+"""The documentation's pictures of pages in a browser: a run's report and the viewer, as a user has them.
+
+    uv run python benchmarks/browser_pictures.py RUN --pictures docs/images
+
+Needs playwright and Chromium. RUN is the folder of a trained run of an apple or a pear, with its dataset in place.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from hsi_sc_nerf.report.build import ReportSources, write_report
+
+REPORT_PX, VIEWER_PX = (1200, 1300), (1100, 900)
+ON_THE_OBJECT = ((0.45, 0.55), (0.88, 0.55))
+"""Points of the report's drawing that are clicked, as fractions of its width and height."""
+CLICKED_PX = (390, 330)
+"""Point of the viewer that is clicked."""
+FIRST_PICTURE_S = 300
+"""A picture at full size takes a minute or two on two cores."""
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NOTHING = b'<svg xmlns="http://www.w3.org/2000/svg" width="1" height="1"/>'
+
+
+@dataclass(frozen=True)
+class BrowserPictures:
+    """Take both pictures of a run."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run, with its ``config.yml``."""
+    cloud: Path | None = None
+    """Point cloud of the run; without it, points are sampled from the model."""
+    pictures: Path = Path("docs/images")
+    """Folder of the pictures."""
+
+    def main(self) -> None:
+        """Write the report, start the viewer, and take a picture of each."""
+        with tempfile.TemporaryDirectory() as folder, browser() as chromium:
+            report = Path(folder) / "report.html"
+            write_report(self.run, report, ReportSources(self.cloud))
+            self._report(chromium, report)
+            with viewer(self.run / "config.yml") as address:
+                self._viewer(chromium, address)
+
+    def _report(self, chromium: Any, report: Path) -> None:
+        page = _page(chromium, REPORT_PX)
+        page.goto(report.as_uri())
+        canvas = page.locator("#cloud[data-state=ready] canvas")
+        canvas.scroll_into_view_if_needed()
+        for x, y in ON_THE_OBJECT:
+            box = canvas.bounding_box()
+            page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.evaluate("scrollTo(0, 0)")
+        page.screenshot(path=self.pictures / "report.png")
+
+    def _viewer(self, chromium: Any, address: str) -> None:
+        from playwright.sync_api import expect
+
+        page = _page(chromium, VIEWER_PX)
+        # The logo is on nerfstudio's server.
+        page.route(re.compile(r"^https://"), lambda route: route.fulfill(body=NOTHING, content_type="image/svg+xml"))
+        page.goto(address, wait_until="domcontentloaded")
+        expect(page.get_by_label("Output type", exact=True)).to_have_value("rgb", timeout=1000 * FIRST_PICTURE_S)
+        for label, name in (("Output type", "composite"), ("Composite", "CIR")):
+            page.get_by_label(label, exact=True).click()
+            page.get_by_role("option", name=name, exact=True).click()
+        # The camera of a training view, where there is a measured spectrum.
+        row = page.get_by_text("Training view", exact=True).locator("xpath=ancestor::div[2]")
+        row.get_by_role("textbox").fill("1")
+        page.keyboard.press("Enter")
+        page.get_by_label("Click for spectrum").check()
+        answer = page.get_by_text(re.compile(r"x -?[\d.]+, y .* mm, opacity"))
+        for _ in range(FIRST_PICTURE_S):
+            page.mouse.click(*CLICKED_PX)
+            page.wait_for_timeout(1000)
+            if answer.count():
+                break
+        answer.scroll_into_view_if_needed()
+        page.wait_for_timeout(1000 * FIRST_PICTURE_S // 3)  # until the picture of full size is there
+        page.screenshot(path=self.pictures / "viewer.png")
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """Chromium without a screen, which draws WebGL in software."""
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=flags, timeout=120_000)
+        yield chromium
+        chromium.close()
+
+
+@contextmanager
+def viewer(config: Path) -> Iterator[str]:
+    """`ns-viewer` of a run, as long as it is looked at; its address."""
+    with socket.socket() as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    words = ["--load-config", str(config), "--viewer.websocket-port", str(port)]
+    with tempfile.TemporaryFile("w+") as log:
+        command = Path(sys.executable).with_name("ns-viewer")
+        process = subprocess.Popen([command, *words], stdout=log, stderr=subprocess.STDOUT)
+        try:
+            for _ in range(FIRST_PICTURE_S):
+                with socket.socket() as tried:
+                    tried.settimeout(1.0)
+                    if tried.connect_ex(("localhost", port)) == 0:
+                        break
+                try:
+                    process.wait(1.0)
+                except subprocess.TimeoutExpired:
+                    continue
+                log.seek(0)
+                raise SystemExit(f"ns-viewer ended: {log.read()[-2000:]}")
+            yield f"http://localhost:{port}"
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _page(chromium: Any, size_px: tuple[int, int]) -> Any:
+    page = chromium.new_page(viewport={"width": size_px[0], "height": size_px[1]}, reduced_motion="reduce")
+    page.set_default_timeout(1000 * FIRST_PICTURE_S)
+    return page
+
+
+if __name__ == "__main__":
+    tyro.cli(BrowserPictures).main()
