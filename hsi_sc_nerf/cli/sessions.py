@@ -101,7 +101,8 @@ class MarkersCommand:
         sheets = marker_sheets(self.marker_side_m, self.marker_dictionary, range(self.count), self.paper)
         write_marker_sheets(self.output, sheets)
         console = Console()
-        console.print(f"{escape(str(self.output))}: {self.count} markers on {len(sheets)} sheets.", soft_wrap=True)
+        number = "1 sheet" if len(sheets) == 1 else f"{len(sheets)} sheets"
+        console.print(f"{escape(str(self.output))}: {self.count} markers on {number}.", soft_wrap=True)
         console.print(
             f'Print at 100 %, measure the ruler, and give "marker_side_m": {self.marker_side_m:g} in session.json.',
             soft_wrap=True,
@@ -196,4 +197,6 @@ class ProcessCommand:
         Raises:
             InputError: the session cannot be used or the dataset cannot be written.
         """
+        if self.output_dir.resolve() == self.session.resolve():
+            raise InputError(f"{self.output_dir}: is the session itself; choose another --output-dir.")
         process_session(self.session, self.output_dir, self.config)

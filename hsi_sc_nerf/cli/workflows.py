@@ -22,6 +22,7 @@ from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
+from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.settings_file import between, check_options
 
 STEPS_NAME = "steps.json"
@@ -203,14 +204,17 @@ def _show_results(out: Path, console: Console) -> None:
     size = traits["size"]
     volume = f"volume {1000 * size['volume_l']:.1f} mL" if traits["watertight"] else "no closed volume"
     console.print(f"Size: height {1000 * size['height_m']:.1f} mm, area {1e4 * size['area_m2']:.1f} cm², {volume}")
-    for line in _warnings(sorted((out / "logs").glob("*.log"))):
+    for line in _warnings(out):
         console.print(f"[yellow]{escape(line)}")
     console.print(f"Open {escape(str(out / 'report.html'))} in a browser.", style="bold")
 
 
-def _warnings(logs: Sequence[Path]) -> Iterator[str]:
-    """Lines of the steps' logs that warn."""
-    for log in logs:
+def _warnings(out: Path) -> Iterator[str]:
+    """What `process` found that is not green, and lines of the steps' logs that warn."""
+    checks = out / "data" / CHECKS_PATH
+    found = json.loads(checks.read_text(encoding="utf-8"))["findings"] if checks.is_file() else []
+    yield from (f"{one['name']}: {one['sentence']}" for one in found if one["level"] != "green")
+    for log in sorted((out / "logs").glob("*.log")):
         for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("Warning"):
                 yield f"{log.stem}: {line}"

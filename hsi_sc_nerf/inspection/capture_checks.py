@@ -46,7 +46,7 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
         _same(
             session,
             "dates",
-            "acquisition days",
+            ("acquisition day", "acquisition days"),
             acquisition_day,
             "red",
             "frames of another day may show another object under other light; leave them out",
@@ -54,12 +54,14 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
         _same(
             session,
             "integration-times",
-            "integration times (ms)",
+            ("integration time (ms)", "integration times (ms)"),
             lambda capture: capture.integration_time_ms,
             "amber",
             "reflectance is scaled accordingly, with more noise in the shorter ones",
         ),
-        _same(session, "binning", "binnings", _binning, "red", "their pixels do not match; leave them out"),
+        _same(
+            session, "binning", ("binning", "binnings"), _binning, "red", "their pixels do not match; leave them out"
+        ),
     ]
 
 
@@ -120,9 +122,15 @@ def _damaged(session: Session, skip_damaged: bool) -> list[Finding]:
 
 
 def _same(
-    session: Session, name: str, what: str, value_of: Callable[[Capture], object], level: Level, advice: str
+    session: Session,
+    name: str,
+    one_and_more: tuple[str, str],
+    value_of: Callable[[Capture], object],
+    level: Level,
+    advice: str,
 ) -> Finding:
-    """Whether a value of the headers is the same in all frames; those that differ from most are named."""
+    """Whether a value of the headers, named in singular and plural, is the same in all frames; others are named."""
+    what, whats = one_and_more
     values: Mapping[str, object] = {frame.name: value_of(frame) for frame in session.frames}
     given = Counter(value for value in values.values() if value is not None)
     if not given:
@@ -137,7 +145,7 @@ def _same(
         return Finding(name, "green", f"All frames have the same {what}: {usual}.", {"usual": usual})
     differing = ", ".join(sorted({str(values[frame]) for frame in others}))
     sentence = (
-        f"{session.path}: the {what} of {names_in_short(others)} differ from the other frames' ({differing}, not "
+        f"{session.path}: the {whats} of {names_in_short(others)} differ from the other frames' ({differing}, not "
         f"{usual}): {advice}"
     )
     sentence += f" with {leave_out(others)}." if level == "red" else "."

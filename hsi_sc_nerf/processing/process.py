@@ -237,9 +237,10 @@ def _remove_transforms(output_dir: Path) -> None:
         InputError: it belongs to another kind of dataset.
     """
     transforms = output_dir / TRANSFORMS_NAME
-    if transforms.exists() and not is_packed(output_dir):
-        raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
-    transforms.unlink(missing_ok=True)
+    if transforms.exists():
+        if not is_packed(output_dir):
+            raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
+        transforms.unlink()
 
 
 def _calibrate(session: Session, config: ProcessConfig, output_dir: Path, console: Console) -> SessionCalibration:

@@ -64,5 +64,4 @@ class SessionChecks:
         Raises:
             InputError: the file cannot be written.
         """
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self._path, {**self._report, "findings": [finding.as_json() for finding in self._findings]})

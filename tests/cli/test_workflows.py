@@ -13,11 +13,13 @@ import time
 from contextlib import redirect_stdout
 
 import pytest
+from rich.console import Console
 
 from hsi_sc_nerf.benchmark.steps import own_cost
 from hsi_sc_nerf.cli.main import main
-from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step
+from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step, _show_results
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
 ALL = ["process", "train", "evaluate", "export", "traits", "report"]
@@ -113,6 +115,27 @@ def test_a_second_call_does_nothing_and_a_removed_result_is_made_again(whole, ru
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()} == files
     (out / "traits" / "traits.json").unlink()
     assert done(run(session, out)) == ["traits", "report"]
+
+
+def test_at_the_end_stand_results_warnings_and_the_file_to_open(tmp_path, capsys):
+    write_json(tmp_path / "eval.json", {"results": {"sam": 0.03, "rmse": 0.02, "ssim": 0.9, "psnr": 34.0}})
+    size = {"volume_l": 0.226, "height_m": 0.0666, "area_m2": 0.0186}
+    write_json(tmp_path / "traits" / "traits.json", {"size": size, "watertight": True})
+    findings = [
+        {"name": "frames", "level": "green", "sentence": "12 frames."},
+        {"name": "focus", "level": "amber", "sentence": "Frame [7] is blurred."},
+    ]
+    write_json(tmp_path / "data" / "report" / "inspection.json", {"findings": findings})
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "traits.log").write_text("Mesh made.\nWarning: it has holes.\n")
+    _show_results(tmp_path, Console(highlight=False, soft_wrap=True))
+    assert capsys.readouterr().out.splitlines() == [
+        "Held-out views, inside the mask: SAM 0.0300 rad, RMSE 0.0200, SSIM 0.900, PSNR 34.0 dB",
+        "Size: height 66.6 mm, area 186.0 cm², volume 226.0 mL",
+        "focus: Frame [7] is blurred.",
+        "traits: Warning: it has holes.",
+        f"Open {tmp_path / 'report.html'} in a browser.",
+    ]
 
 
 def test_a_step_depends_on_its_words_and_files(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from inspection_session import SIZE_PX, frame_picture, write_one
 
-from hsi_sc_nerf.cli.sessions import InspectCommand
+from hsi_sc_nerf.cli.sessions import InspectCommand, ProcessCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
@@ -32,6 +32,16 @@ def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left
         process(session, tmp_path / "data", accept=("dates", "other-object"))
     with pytest.raises(InputError, match="reached the poses of 11"):
         process(session, tmp_path / "data", exclude=("fruit_05",))
+
+
+def test_a_file_and_the_session_itself_are_no_folder_for_the_dataset(session, tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"file/.*: cannot be written"):
+        process(session, tmp_path / "file")
+    names = sorted(path.name for path in session.iterdir())
+    with pytest.raises(InputError, match="session itself"):
+        ProcessCommand(session, session / "." / "fruit_00" / "..").main()
+    assert sorted(path.name for path in session.iterdir()) == names
 
 
 @pytest.mark.slow
