@@ -35,6 +35,8 @@ _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
 _LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
+# Places that are tried at least; an object of a pixel or less, as of poses that are wrong, has fewer.
+_FEWEST_TRIED = 3
 # Standard deviation of an edge's place, alike in all frames: it lies somewhere in the pixel of the steepest change.
 _EDGE_PX = 1.0 / np.sqrt(12.0)
 
@@ -73,6 +75,8 @@ def container_outline(
     mean, step = pictures.mean(axis=0), _STEP_PX * turntable.distance / turntable.focal_px
     radii = np.arange(_RADII[0] * reach, _RADII[1] * reach, step)
     heights = 2.0 * radii * height_over_diameter
+    if len(radii) < _FEWEST_TRIED:
+        return None
     # Until the foot is found, the lid is where the points end.
     feet_of_radii = lowest - heights
     for _ in range(_ROUNDS):
@@ -80,12 +84,16 @@ def container_outline(
         radius = float(radii[np.argmax(sides)])
         height = 2.0 * radius * height_over_diameter
         feet = np.arange(lowest + (_LIDS[0] - 1.0) * height, lowest + (_LIDS[1] - 1.0) * height, step)
+        if len(feet) < _FEWEST_TRIED:
+            return None
         arc = _slopes(mean, turntable, _arcs(radius, feet))[0]
         foot = float(feet[np.argmax(arc)])
         feet_of_radii = np.full(len(radii), foot)
         if min(sides.max(), arc.max()) < _LEAST_SLOPE:
             return None
     radii, feet = (tried[np.abs(tried - at) < _REACH * radius] for tried, at in ((radii, radius), (feet, foot)))
+    if min(len(radii), len(feet)) < _FEWEST_TRIED:
+        return None
     edges, arcs = _edges(radii, np.full(len(radii), foot), height, turntable.distance), _arcs(radius, feet)
     found = np.empty((len(pictures), 2))
     for row, picture in zip(found, pictures, strict=True):
