@@ -35,7 +35,7 @@ _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
 _LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
-# Places that are tried at least; an object of a pixel or less, as of poses that are wrong, has fewer.
+# Places that are tried at least. Poses that are wrong can leave an object of a pixel, or one that holds the camera.
 _FEWEST_TRIED = 3
 # Standard deviation of an edge's place, alike in all frames: it lies somewhere in the pixel of the steepest change.
 _EDGE_PX = 1.0 / np.sqrt(12.0)
@@ -75,7 +75,7 @@ def container_outline(
     mean, step = pictures.mean(axis=0), _STEP_PX * turntable.distance / turntable.focal_px
     radii = np.arange(_RADII[0] * reach, _RADII[1] * reach, step)
     heights = 2.0 * radii * height_over_diameter
-    if len(radii) < _FEWEST_TRIED:
+    if len(radii) < _FEWEST_TRIED or radii[-1] >= turntable.distance:
         return None
     # Until the foot is found, the lid is where the points end.
     feet_of_radii = lowest - heights
