@@ -17,6 +17,7 @@ from rich.console import Console
 
 from hsi_sc_nerf.benchmark.steps import own_cost
 from hsi_sc_nerf.cli.main import main
+from hsi_sc_nerf.cli.sessions import MarkersCommand
 from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step, _show_results
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -149,6 +150,26 @@ def test_a_step_depends_on_its_words_and_files(tmp_path):
     assert Step("process", ("hsi-sc-nerf", "process", "--poses"), (session,), ()).fingerprint(out) != first
     (session / "a.raw").write_bytes(b"12")
     assert step.fingerprint(out) != first
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("run s --output-dir o", "Stopped; the same command goes on where it stopped."),
+        ("markers", "Stopped."),
+    ],
+)
+def test_ctrl_c_is_one_line(monkeypatch, capsys, words, told):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    for command in (RunCommand, MarkersCommand):
+        monkeypatch.setattr(command, "main", interrupted)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words.split()])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == f"{told}\n"
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
