@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -39,10 +39,10 @@ Commands = (
 def main() -> None:
     """Run the command of the command line; invalid input exits with one sentence and status 2, Ctrl-C with 130."""
     ignore_library_warnings()
-    command = None
+    command: Any = None
     try:
         # Reading the options can already raise InputError.
-        command = tyro.cli(Commands, description=__doc__)  # type: ignore[assignment]
+        command = tyro.cli(Commands, description=__doc__)  # type: ignore[arg-type]
         command.main()
     except InputError as error:
         Console(stderr=True).print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
