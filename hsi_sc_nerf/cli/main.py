@@ -42,7 +42,7 @@ def main() -> None:
     command: Any = None
     try:
         # Reading the options can already raise InputError.
-        command = tyro.cli(Commands, description=__doc__)  # type: ignore[arg-type]
+        command = tyro.cli(Commands, description=__doc__)
         command.main()
     except InputError as error:
         Console(stderr=True).print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
