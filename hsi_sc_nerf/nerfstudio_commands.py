@@ -130,8 +130,8 @@ def prepare(command: Any) -> bool:
     shown = getattr(command, "rendered_output_names", None)
     if shown is not None and not {"spectral", "gt-spectral"}.isdisjoint(shown):
         raise InputError(
-            "ns-render cannot show spectral, which has a channel for each band; take `hsi-sc-nerf render`, which writes "
-            "cubes."
+            "ns-render cannot show spectral, which has a channel for each band; take `hsi-sc-nerf render`, which "
+            "writes cubes."
         )
     if name == "DatasetRender" and shown is None:
         normals = ["normals", "pred_normals"] if config.pipeline.model.predict_normals else []
