@@ -33,6 +33,8 @@ _REFUSED = {
     "ns-export pointcloud.",
 }
 """Commands that cannot work, by the name of their class, and what to do instead."""
+_PICTURES = ("gt-rgb", "rgb", "accumulation", "depth", "expected_depth")
+"""Outputs that are pictures, which ``ns-render dataset`` writes if it is given no names."""
 
 
 def extend_nerfstudio_commands() -> None:
@@ -125,6 +127,15 @@ def prepare(command: Any) -> bool:
             "ns-render dataset --downscale-factor: this method renders frames at their own size; leave the option "
             "out, or take `hsi-sc-nerf render`."
         )
+    shown = getattr(command, "rendered_output_names", None)
+    if shown is not None and not {"spectral", "gt-spectral"}.isdisjoint(shown):
+        raise InputError(
+            "ns-render cannot show spectral, which has a channel for each band; take `hsi-sc-nerf render`, which "
+            "writes cubes."
+        )
+    if name == "DatasetRender" and shown is None:
+        normals = ["normals", "pred_normals"] if config.pipeline.model.predict_normals else []
+        command.rendered_output_names = [*_PICTURES, *normals]
     if name == "RenderInterpolated" and command.pose_source == "eval" and _held_out_views(config) == 1:
         raise InputError(
             "ns-render interpolate goes from held-out view to held-out view, and this dataset has one; add "

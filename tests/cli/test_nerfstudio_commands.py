@@ -102,6 +102,8 @@ def test_exports(call, tmp_path, words, written):
         ("ns-export", ("gaussian-splat", "--output-dir", "x"), "Gaussians"),
         ("ns-render", ("dataset", "--downscale-factor", "8"), "hsi-sc-nerf render"),
         ("ns-render", ("interpolate",), "--pose-source train"),
+        ("ns-render", ("dataset", "--rendered-output-names", "rgb", "spectral"), "hsi-sc-nerf render"),
+        ("ns-render", ("interpolate", "--rendered-output-names", "spectral"), "hsi-sc-nerf render"),
     ],
 )
 def test_what_cannot_work_is_one_sentence(call, tmp_path, monkeypatch, program, words, told):
@@ -112,8 +114,10 @@ def test_what_cannot_work_is_one_sentence(call, tmp_path, monkeypatch, program, 
 
 
 def test_renders_of_the_dataset(call, tmp_path):
-    call("ns-render", "dataset", "--output-path", tmp_path, "--rendered-output-names", "rgb", "depth")
-    assert {path.stem for path in (tmp_path / "test").iterdir()} == {"rgb", "depth"}
+    call("ns-render", "dataset", "--output-path", tmp_path)
+    pictures = list((tmp_path / "test").iterdir())
+    assert {path.stem for path in pictures} == {"gt-rgb", "rgb", "accumulation", "depth", "expected_depth"}
+    assert all(path.stat().st_size > 200 for path in pictures)
 
 
 @pytest.mark.parametrize("kind", ["interpolate", "camera-path", "spiral"])
