@@ -197,6 +197,4 @@ class ProcessCommand:
         Raises:
             InputError: the session cannot be used or the dataset cannot be written.
         """
-        if self.output_dir.resolve() == self.session.resolve():
-            raise InputError(f"{self.output_dir}: is the session itself; choose another --output-dir.")
         process_session(self.session, self.output_dir, self.config)

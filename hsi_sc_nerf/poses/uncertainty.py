@@ -21,7 +21,7 @@ from hsi_sc_nerf.poses.turntable import Turntable, project, projection_jacobian
 _FIELD_PX = 0.007
 """Standard deviation of each field's amplitude for corners: print, lens and pixels are that far from the model's."""
 _FEATURE_FIELD_PX = 0.03
-"""The same for features, which creep over a skin as its light and its slope change."""
+"""The same for features, which creep over a skin as its light and its slope change (docs/validation/poses.md)."""
 _DRAWS = 2000
 """Of errors by the covariance; the largest of all frames has no closed form."""
 

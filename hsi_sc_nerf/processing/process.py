@@ -119,10 +119,11 @@ def process_session(
         >>> dataset.frames[0].cube().shape
         (512, 512, 204)
     """
-    config = config or ProcessConfig()
+    config, output_dir = config or ProcessConfig(), Path(output_dir)
+    if output_dir.resolve() == Path(session_dir).resolve():
+        raise InputError(f"{output_dir}: is the session itself; choose another --output-dir.")
     if config.workers < 1:
         raise InputError(f"--workers is {config.workers}, but must be 1 or more; correct it.")
-    output_dir = Path(output_dir)
     # Square brackets and colons in a folder's name are no markup.
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
 

@@ -29,6 +29,7 @@ _WORDS = {"green": "Good:", "amber": "Check:", "red": "Problem:"}
 _MOST_GOOD = 3
 """More good findings of a section are folded."""
 _LONG_CELL = 24
+"""Characters from which a cell may be broken into lines."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], section
         sections=sections,
         words=_WORDS,
         most_good=_MOST_GOOD,
+        long_cell=_LONG_CELL,
         styles=_own_text("page.css"),
         scripts=Markup("\n").join(map(_own_text, _SCRIPTS)),
         footer="Made by hsi-sc-nerf report. This file is complete: it needs no network and no other file.",
