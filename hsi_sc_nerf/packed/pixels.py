@@ -96,15 +96,14 @@ class PixelSampler:
         self.num_rays_per_batch = num_rays_per_batch
         self.seed = seed
         self._foreground = np.flatnonzero(masks)
-        self._foreground_epochs = ShuffledEpochs(self._foreground, seed)
         # Number of background pixels before each foreground pixel.
         self._background_before = self._foreground - np.arange(len(self._foreground))
         self._has_flagged = has_flagged
-        self._background_epochs: ShuffledEpochs | None = None
+        self._drawn_background: Int[np.ndarray, "count"] | None = None
 
     def restrict_background(self, pixels: Bool[np.ndarray, "frames lines samples"]) -> None:
         """From now on, draw background pixels among these alone: those whose rays can meet something."""
-        self._background_epochs = ShuffledEpochs(np.flatnonzero(pixels & ~self.masks), self.seed)
+        self._drawn_background = np.flatnonzero(pixels & ~self.masks)
 
     def sample(
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
@@ -116,8 +115,6 @@ class PixelSampler:
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
     ) -> Int[np.ndarray, "count 3"]:
         """The pixels (frame, line, sample) of one batch.
-
-        The object's pixels, and those beside it, come once an epoch (`ShuffledEpochs`).
 
         Args:
             step: training step.
@@ -149,13 +146,12 @@ class PixelSampler:
                 "the masks of all training frames cover whole images, so that nothing tells where the object "
                 "ends; look at report/ in the dataset and process again with a larger --masks.threshold."
             )
-        drawn = [self._foreground_epochs.batch(step, in_foreground)]
-        if self._background_epochs is not None:
-            drawn.append(self._background_epochs.batch(step, in_background))
-        else:
-            drawn.append(self._background(rng.integers(0, background_size, in_background)))
+        drawn = [
+            self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
+            self._background(rng.integers(0, background_size, in_background)),
+        ]
         if on_boundary > 0:
-            drawn.append(self._boundary.batch(step, on_boundary))
+            drawn.append(self._boundary[rng.integers(0, len(self._boundary), on_boundary)])
         return np.stack(np.unravel_index(np.concatenate(drawn), self.masks.shape), axis=1)
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
@@ -175,16 +171,15 @@ class PixelSampler:
         return batch | {"spectral": spectral, "valid": valid}
 
     @cached_property
-    def _boundary(self) -> ShuffledEpochs:
+    def _boundary(self) -> Int[np.ndarray, "count"]:
         """Background pixels within ``BOUNDARY_PX`` of the foreground (flat indices)."""
-        boundary = np.stack([dilate(mask, 2 * BOUNDARY_PX + 1) & ~mask for mask in self.masks])
-        return ShuffledEpochs(np.flatnonzero(boundary), self.seed)
+        return np.flatnonzero(np.stack([dilate(mask, 2 * BOUNDARY_PX + 1) & ~mask for mask in self.masks]))
 
     @property
     def _background_size(self) -> int:
         """How many background pixels are drawn from."""
-        if self._background_epochs is not None:
-            return len(self._background_epochs)
+        if self._drawn_background is not None:
+            return len(self._drawn_background)
         return self.masks.size - len(self._foreground)
 
     def _background(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
@@ -193,47 +188,9 @@ class PixelSampler:
         A list of all background pixels would be the largest array of a session. A pixel's index is its rank plus the
         number of foreground pixels before it.
         """
+        if self._drawn_background is not None:
+            return self._drawn_background[ranks]
         return ranks + np.searchsorted(self._background_before, ranks, side="right")
-
-
-class ShuffledEpochs:
-    """Batches of elements in random order, each element once an epoch.
-
-    Gradients of such batches vary less than those of elements drawn anew each time (docs/notes/dead_ends.md).
-    A batch depends on the seed and its number alone, so that a resumed run sees what an uninterrupted one does.
-
-    Args:
-        elements: at least one, unless batches are empty.
-        seed: of the orders.
-
-    Example:
-        >>> epochs = ShuffledEpochs(np.arange(4), seed=0)
-        >>> sorted(np.concatenate([epochs.batch(0, 2), epochs.batch(1, 2)]))
-        [0, 1, 2, 3]
-    """
-
-    def __init__(self, elements: Int[np.ndarray, "size"], seed: int) -> None:
-        self._elements, self._seed = elements, seed
-        self._shuffled: tuple[int, Int[np.ndarray, "size"]] | None = None
-
-    def __len__(self) -> int:
-        return len(self._elements)
-
-    def batch(self, number: int, count: int) -> Int[np.ndarray, "count"]:
-        """Batch of a number, of batches that all hold ``count`` elements."""
-        first, end = number * count, (number + 1) * count
-        parts = [self._elements[:0]]
-        while first < end:
-            epoch, start = divmod(first, len(self))
-            part = self._order(epoch)[start : start + end - first]
-            parts.append(self._elements[part])
-            first += len(part)
-        return np.concatenate(parts)
-
-    def _order(self, epoch: int) -> Int[np.ndarray, "size"]:
-        if self._shuffled is None or self._shuffled[0] != epoch:
-            self._shuffled = epoch, np.random.default_rng((self._seed, epoch)).permutation(len(self))
-        return self._shuffled[1]
 
 
 def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PixelReader, PixelSampler, ShuffledEpochs, spread_over
+from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PixelReader, PixelSampler, spread_over
 
 SHAPE = (5, 7, 4)
 INDICES = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
@@ -167,19 +167,6 @@ def test_pixels_are_drawn_evenly(sampler, masks, fraction):
     else:
         expected = drawn * np.where(masks, fraction / masks.sum(), (1.0 - fraction) / (~masks).sum())
     assert (abs(counts - expected) <= 6 * np.sqrt(expected)).all()
-
-
-@pytest.mark.parametrize("count", [1, 5, 7, 30])
-def test_every_element_comes_once_an_epoch_in_an_order_of_its_own(count):
-    elements = np.arange(100, 107)
-    epochs = ShuffledEpochs(elements, seed=3)
-    drawn = np.concatenate([epochs.batch(number, count) for number in range(70)])
-    orders = drawn[: len(drawn) // 7 * 7].reshape(-1, 7)
-    np.testing.assert_array_equal(np.sort(orders, axis=1), np.broadcast_to(elements, orders.shape))
-    assert len(np.unique(orders[:10], axis=0)) > 5
-    # Neither what was asked before nor the object that is asked plays a part.
-    np.testing.assert_array_equal(ShuffledEpochs(elements, seed=3).batch(4, count), epochs.batch(4, count))
-    assert len(epochs.batch(2, 0)) == 0
 
 
 def test_the_background_is_found_without_a_list_of_it(sampler, masks):
