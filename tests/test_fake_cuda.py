@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from nerfstudio.model_components.ray_generators import RayGenerator
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -168,7 +169,7 @@ def test_held_pixels_and_rays_equal_those_read_from_files(flagged_dataset, devic
     for name, value in held(indices).items():
         np.testing.assert_array_equal(value.cpu().numpy(), read[name])
     found = CameraRays(manager.train_dataset.cameras.to(device))(indices)
-    expected = manager.train_ray_generator(indices.cpu())
+    expected = RayGenerator(manager.train_dataset.cameras)(indices.cpu())
     for name in ("origins", "directions", "pixel_area", "camera_indices"):
         torch.testing.assert_close(getattr(found, name).cpu(), getattr(expected, name), rtol=1e-5, atol=1e-6)
     assert found.metadata.keys() == expected.metadata.keys()

@@ -13,7 +13,6 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
-from nerfstudio.model_components.ray_generators import RayGenerator
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
@@ -103,18 +102,16 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_train(self) -> None:
         """Open the training cubes."""
         self.train_pixel_sampler = self._pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        cameras = self.train_dataset.cameras.to(self.device)
-        self.train_ray_generator = RayGenerator(cameras)
+        self.train_ray_generator = CameraRays(self.train_dataset.cameras.to(self.device))
         self._held: DevicePixels | None = None
         if self.config.hold_on_gpu and fits_on_gpu(self.train_dataset.frames, torch.device(self.device)):
             masks, flagged = self.train_pixel_sampler.masks, self.train_dataset.has_flagged
             self._held = DevicePixels(self.train_dataset.frames, masks, self.device, has_flagged=flagged)
-            self._rays = CameraRays(cameras)
 
     def setup_eval(self) -> None:
         """Open the held-out cubes."""
         self.eval_pixel_sampler = self._pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
-        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        self.eval_ray_generator = CameraRays(self.eval_dataset.cameras.to(self.device))
         # A view without an object in its mask would score as perfect.
         with_object = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
@@ -138,7 +135,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         if self._held is not None:
             pixels = self.train_pixel_sampler.draw(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
             indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)
-            return self._rays(indices), self._held(indices)
+            return self.train_ray_generator(indices), self._held(indices)
         batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
         return self._with_rays(batch, self.train_ray_generator)
 
@@ -157,7 +154,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         )
 
     def _with_rays(
-        self, pixels: dict[str, Shaped[np.ndarray, "rays ..."]], generator: RayGenerator
+        self, pixels: dict[str, Shaped[np.ndarray, "rays ..."]], generator: CameraRays
     ) -> tuple[RayBundle, dict]:
         batch = {key: torch.from_numpy(value) for key, value in pixels.items()}
         return generator(batch["indices"]), batch

@@ -1,4 +1,4 @@
-"""Training pixels and rays in GPU memory: a batch is transferred as pixel indices and looked up there.
+"""Training pixels and rays looked up in tables: of rays on any device, of pixels in GPU memory.
 
 A GPU trains a step in a few milliseconds. Reading some thousand pixels from files takes longer, and every transfer
 makes processor and GPU wait for each other.
@@ -71,7 +71,8 @@ class DevicePixels:
 class CameraRays:
     """Rays through pixel centres, equal to those of nerfstudio's `RayGenerator`, from a table.
 
-    All frames are of one camera: its rays are computed once and rotated by each frame's pose.
+    All frames are of one camera: its rays are computed once and rotated by each frame's pose. nerfstudio takes away
+    the lens distortion of every batch anew, in a thousand small operations.
 
     Args:
         cameras: of the frames, on the device.
