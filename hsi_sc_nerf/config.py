@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import torch
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataManagerConfig
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
+from hsi_sc_nerf.models.optimizers import MuonOptimizerConfig
 from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
@@ -35,9 +36,8 @@ def pipeline_with_panel(config: SpectralPipelineConfig, **options) -> SpectralPi
     return pipeline
 
 
-def _adam(lr: float) -> dict:
-    """An optimiser without a schedule; the stages scale its learning rate."""
-    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": None}
+def _adam(lr: float) -> OptimizerConfig:
+    return AdamOptimizerConfig(lr=lr, eps=1e-15)
 
 
 def _published_lr(step: int) -> float:
@@ -48,7 +48,7 @@ def _published_lr(step: int) -> float:
 def _method(
     method_name: str,
     pipeline: SpectralPipelineConfig,
-    optimizers: dict[str, float],
+    optimizers: dict[str, OptimizerConfig],
     full_frame: StageConfig,
     masked: StageConfig,
 ) -> StagedTrainerConfig:
@@ -61,7 +61,8 @@ def _method(
         steps_per_eval_image=5000,
         steps_per_eval_all_images=20_000,
         pipeline=pipeline,
-        optimizers={name: _adam(lr) for name, lr in optimizers.items()},
+        # Without schedules: the stages scale the learning rates.
+        optimizers={name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()},
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         # The progress bar of the stages replaces nerfstudio's table.
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),
@@ -80,7 +81,12 @@ hsi_sc_nerf = MethodSpecification(
             datamanager=SpectralDataManagerConfig(),
             model=SpectralModelConfig(),
         ),
-        {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 3e-4},
+        {
+            "fields": _adam(1.5e-2),
+            "field_networks": MuonOptimizerConfig(),
+            "proposal_networks": _adam(1e-2),
+            "camera_opt": _adam(3e-4),
+        },
         full_frame=full_frame_stage(),
         masked=masked_stage(),
     ),
@@ -127,7 +133,10 @@ hsi_sc_nerf_paper = MethodSpecification(
                 camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
             ),
         ),
-        {"fields": paper.LEARNING_RATE, "proposal_networks": paper.LEARNING_RATE, "camera_opt": 1e-3},
+        {
+            **{name: _adam(paper.LEARNING_RATE) for name in ("fields", "field_networks", "proposal_networks")},
+            "camera_opt": _adam(1e-3),
+        },
         full_frame=StageConfig(
             name="full-frame",
             fraction=0.5,

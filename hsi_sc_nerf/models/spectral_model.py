@@ -39,6 +39,7 @@ from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
+from hsi_sc_nerf.models.optimizers import with_network_group
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.numerics import safe_log10
@@ -75,8 +76,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
     stand still while the object turns."""
     predict_normals: bool = False
-    """Predict normals, as the paper does. Steps take half again as long, and the cloud's normals are the density's in
-    any case."""
+    """Predict normals, as the paper does. Steps take half again as long, and the cloud's normals are the density's."""
     near_plane: float = 0.01
     """Least distance of samples from the camera, scene units."""
     disable_scene_contraction: bool = True
@@ -224,8 +224,8 @@ class SpectralModel(NerfactoModel):
         self.occupancy.refresh(self.field.density_fn, step)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Nerfacto's groups, without that of the proposals where there are none."""
-        return {name: group for name, group in super().get_param_groups().items() if group}
+        """Nerfacto's groups, with one for the weights of the field's networks, and without those that are empty."""
+        return with_network_group(super().get_param_groups(), self.field)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

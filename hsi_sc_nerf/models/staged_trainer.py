@@ -26,6 +26,7 @@ from hsi_sc_nerf.models.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
+from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import (
@@ -39,7 +40,6 @@ from hsi_sc_nerf.models.stages import (
     step_seed,
 )
 from hsi_sc_nerf.models.training_watch import (
-    GuardedOptimizers,
     NonFiniteGuard,
     TrainingDivergedError,
     non_finite_names,
@@ -134,10 +134,7 @@ class StagedTrainer(Trainer):
             for group, parameters in optimizers.parameters.items()
         }
         if self.pipeline.device.type == "cuda":
-            for optimizer in optimizers.optimizers.values():
-                for group in optimizer.param_groups:
-                    # One pass over the hash grid's tables, in place of one for each operation of a step of Adam.
-                    group.update(fused=True, foreach=False)
+            optimizers.fuse()
         return optimizers
 
     @property

@@ -20,7 +20,8 @@ from hsi_sc_nerf.settings_file import between
 
 @dataclass
 class StageConfig:
-    """One stage of training. The parameter groups are fields, proposal_networks and camera_opt."""
+    """One stage of training. The parameter groups are fields (the hash grid), field_networks (the weights of its
+    networks), proposal_networks and camera_opt."""
 
     name: str
     """Shown in the progress bar, and the name of the stage's checkpoint folder."""

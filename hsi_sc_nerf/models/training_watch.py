@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
-from nerfstudio.engine.optimizers import Optimizers
 from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
-from torch.cuda.amp.grad_scaler import GradScaler
 
 from hsi_sc_nerf.models.stages import Stage
 from hsi_sc_nerf.terminal import timed_progress
@@ -36,31 +34,6 @@ def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
     # The sum of magnitudes is finite only if all elements are; one transfer from the GPU for all.
     sums = torch.stack(torch._foreach_norm([value.detach().float() for value in values.values()], 1))
     return [name for name, finite in zip(values, torch.isfinite(sums).tolist(), strict=True) if not finite]
-
-
-class GuardedOptimizers(Optimizers):
-    """nerfstudio's optimisers, which skip a step with a non-finite gradient.
-
-    Attributes:
-        skipped_groups: parameter groups whose gradient was not finite in the last step; empty after a good one.
-    """
-
-    skipped_groups: tuple[str, ...] = ()
-
-    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Step the optimisers of ``param_groups``, or none of them. A gradient scaler skips such steps itself."""
-        if grad_scaler.is_enabled():
-            super().optimizer_scaler_step_some(grad_scaler, param_groups)
-            return
-        gradients = {
-            f"{group}/{i}": parameter.grad
-            for group in param_groups
-            for i, parameter in enumerate(self.parameters[group])
-            if parameter.grad is not None
-        }
-        self.skipped_groups = tuple(dict.fromkeys(name.split("/")[0] for name in non_finite_names(gradients)))
-        if not self.skipped_groups:
-            super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
 class NonFiniteGuard:

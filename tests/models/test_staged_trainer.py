@@ -53,7 +53,7 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch):
     """Frozen groups, learning rates, the grid's decay and the paper's rays, by stage."""
     first, second = full_frame_stage(), masked_stage()
-    first.frozen_groups, first.group_lr = ("fields",), {"fields": (0.1, 0.1)}
+    first.frozen_groups, first.group_lr = ("fields", "field_networks"), {"fields": (0.1, 0.1)}
     second.frozen_groups, second.foreground_ray_fraction = ("camera_opt",), 1.0
     first.grid_decay, second.grid_decay = 0.2, 3.0
     made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
@@ -72,9 +72,9 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
 
     made.train_iteration = train_iteration
     made.train()
-    assert rates[:3] == pytest.approx([1e-3] * 3)
+    assert rates[:3] == pytest.approx([0.1 * made.config.optimizers["fields"]["optimizer"].lr] * 3)
     assert {name for step, name in changed if step < 3} == {"camera_opt"}
-    assert {name for step, name in changed if step >= 3} == {"fields"}
+    assert {name for step, name in changed if step >= 3} == {"fields", "field_networks"}
     assert shrunk == pytest.approx([3.0 * rate for rate in rates[3:]])  # the first stage does not learn the field
 
 

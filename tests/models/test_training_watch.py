@@ -2,48 +2,16 @@
 
 import pytest
 import torch
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from small_trainer import STEPS, trainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.amp.grad_scaler import GradScaler
 
 from hsi_sc_nerf.models.training_watch import (
     MAX_SKIPPED_IN_A_ROW,
-    GuardedOptimizers,
     NonFiniteGuard,
     TrainingDivergedError,
     non_finite_names,
     stage_summary,
 )
-
-
-def optimizers():
-    groups = {name: [torch.nn.Parameter(torch.ones(3))] for name in ("fields", "camera_opt")}
-    config = {name: {"optimizer": AdamOptimizerConfig(lr=0.1), "scheduler": None} for name in groups}
-    return GuardedOptimizers(config, groups), groups
-
-
-def step(optimizers, groups):
-    optimizers.optimizer_scaler_step_some(GradScaler("cpu", enabled=False), list(groups))
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_a_non_finite_gradient_changes_no_group(bad):
-    guarded, groups = optimizers()
-    groups["fields"][0].grad = torch.ones(3)
-    groups["camera_opt"][0].grad = torch.tensor([0.0, bad, 0.0])
-    step(guarded, groups)
-    assert guarded.skipped_groups == ("camera_opt",)
-    assert all((parameters[0] == 1.0).all() for parameters in groups.values())
-
-
-def test_finite_gradients_step():
-    guarded, groups = optimizers()
-    groups["fields"][0].grad = torch.ones(3)
-    step(guarded, groups)
-    assert guarded.skipped_groups == ()
-    assert (groups["fields"][0] < 1.0).all()
-    assert (groups["camera_opt"][0] == 1.0).all()
 
 
 def test_names_of_non_finite_terms():
@@ -93,7 +61,7 @@ def test_events_of_a_run(events):
     assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error")} <= set(tags["images"])
 
     rates = [event.value for event in events.Scalars("learning_rate/fields")]
-    assert rates == pytest.approx([1e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
+    assert rates == pytest.approx([1.5e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
     assert [event.step for event in events.Scalars("Train Loss")] == list(range(STEPS))
     ends = [event.step for event in events.Scalars("Eval Images Metrics Dict (all images)/sam")]
     assert ends == [STEPS // 2 - 1, STEPS - 1]
