@@ -76,7 +76,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
     stand still while the object turns."""
     predict_normals: bool = False
-    """Predict normals, as the paper does. Steps take half again as long, and the cloud's normals are the density's."""
+    """Predict normals, as the paper does. Steps take half again as long, and the cloud has the density's."""
     near_plane: float = 0.01
     """Least distance of samples from the camera, scene units."""
     disable_scene_contraction: bool = True

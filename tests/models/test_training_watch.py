@@ -61,7 +61,8 @@ def test_events_of_a_run(events):
     assert {f"Eval Images/{name}" for name in ("img", "spectral_angle", "error")} <= set(tags["images"])
 
     rates = [event.value for event in events.Scalars("learning_rate/fields")]
-    assert rates == pytest.approx([1.5e-2 * f for f in (1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02)])  # both stages, 3 steps each
+    factors = [1, 0.5**0.5, 0.5, 0.5, 0.1, 0.02]  # both stages, 3 steps each
+    assert rates == pytest.approx([1.5e-2 * factor for factor in factors])
     assert [event.step for event in events.Scalars("Train Loss")] == list(range(STEPS))
     ends = [event.step for event in events.Scalars("Eval Images Metrics Dict (all images)/sam")]
     assert ends == [STEPS // 2 - 1, STEPS - 1]
