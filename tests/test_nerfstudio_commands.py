@@ -4,6 +4,7 @@ import copy
 import inspect
 import sys
 import types
+from pathlib import Path
 
 import pytest
 import yaml
@@ -47,7 +48,7 @@ def other(tmp_path):
 
 def test_a_run_without_a_checkpoint_is_one_sentence_and_other_methods_pass(ours, other):
     with pytest.raises(InputError, match=r"^[^\n]*holds no checkpoint[^\n]*\.$"):
-        adapter.prepare(command("ComputePSNR", ours))
+        adapter.prepare(command("ComputePSNR", ours, output_path=Path("scores.json")))
     for kind in ("ComputePSNR", "ExportMarchingCubesMesh"):
         assert adapter.prepare(command(kind, other)) is False
 
@@ -72,7 +73,7 @@ def test_a_config_of_another_version_is_one_sentence(ours, old, new):
     assert old in text
     ours.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=r"^[^\n]*config.yml: cannot be read[^\n]*\.$"):
-        adapter.prepare(command("ComputePSNR", ours))
+        adapter.prepare(command("ComputePSNR", ours, output_path=Path("scores.json")))
 
 
 def test_a_script_under_import_is_adapted_once_complete(ours, other, monkeypatch):
