@@ -59,6 +59,15 @@ def test_poisson_estimates_normals_where_the_model_has_none(ours):
     assert made.normal_method == "open3d"
 
 
+def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path):
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path / "file", "x", "run"
+    config.output_dir.write_text("months of work")
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cannot be made a folder[^\n]*\.$"):
+        config.save_config()
+    assert config.output_dir.read_text() == "months of work"
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.files import make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
@@ -89,6 +89,10 @@ class StagedTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Check the settings, then write ``config.yml``, the first file of a run."""
         self.plan()
+        try:
+            make_folder(self.get_base_dir())
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
         super().save_config()
 
 
