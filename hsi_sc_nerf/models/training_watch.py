@@ -11,6 +11,7 @@ from contextlib import contextmanager
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import writer
 from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
@@ -119,3 +120,11 @@ def training_progress(total_steps: int, first_step: int) -> Iterator[Callable[[i
     with timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}")) as bar:
         task = bar.add_task("training", total=total_steps, completed=first_step, quality="")
         yield update
+
+
+def flush_logs() -> None:
+    """Write the logs to disk; TensorBoard's writer would lose its buffer if the process ended."""
+    writer.write_out_storage()
+    for event_writer in writer.EVENT_WRITERS:
+        if isinstance(event_writer, writer.TensorboardWriter):
+            event_writer.tb_writer.flush()
