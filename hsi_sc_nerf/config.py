@@ -21,10 +21,8 @@ from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
-from hsi_sc_nerf.terminal import ignore_library_warnings
 from hsi_sc_nerf.viewer.panel import attach_spectral_panel
 
-ignore_library_warnings()
 allow_nerfstudio_checkpoints()
 extend_nerfstudio_commands()
 

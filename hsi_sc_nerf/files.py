@@ -64,6 +64,20 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
+def require_writable(folder: Path) -> None:
+    """Refuse a folder that could not be written to, before anything is computed for it; nothing is made.
+
+    Raises:
+        InputError: something else has its name or a parent's, or the system does not permit to write there.
+    """
+    there = folder.absolute()
+    while not os.path.lexists(there):
+        there = there.parent
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        why = "may not be written to" if there.is_dir() else "is no folder"
+        raise InputError(f"{folder}: cannot be written to, because {there} {why}; choose another folder.")
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` as indented JSON.
 

@@ -77,12 +77,18 @@ class _ScriptBeingImported(types.ModuleType):
 def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
     def main(self: Any) -> None:
         try:
-            if prepare(self) and type(self).__name__ == "ExportPointCloud":
+            ours = prepare(self)
+            if ours and type(self).__name__ == "ExportPointCloud":
                 _export_spectral_cloud(self)
                 return
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        original(self)
+        try:
+            original(self)
+        except OSError as error:
+            if not ours or error.filename is None:
+                raise
+            raise SystemExit(f"hsi-sc-nerf: {error.filename}: {error.strerror}; choose another path.") from error
 
     main.__doc__ = original.__doc__
     return main
@@ -122,6 +128,8 @@ def prepare(command: Any) -> bool:
         return False
     if name in _REFUSED:
         raise InputError(_REFUSED[name])
+    if name == "ComputePSNR" and command.output_path.suffix != ".json":
+        raise InputError(f"{command.output_path}: ns-eval writes JSON; give an --output-path that ends in .json.")
     if name == "DatasetRender" and command.downscale_factor is not None:
         raise InputError(
             "ns-render dataset --downscale-factor: this method renders frames at their own size; leave the option "

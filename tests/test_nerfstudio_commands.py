@@ -4,6 +4,7 @@ import copy
 import inspect
 import sys
 import types
+from pathlib import Path
 
 import pytest
 import yaml
@@ -47,7 +48,7 @@ def other(tmp_path):
 
 def test_a_run_without_a_checkpoint_is_one_sentence_and_other_methods_pass(ours, other):
     with pytest.raises(InputError, match=r"^[^\n]*holds no checkpoint[^\n]*\.$"):
-        adapter.prepare(command("ComputePSNR", ours))
+        adapter.prepare(command("ComputePSNR", ours, output_path=Path("scores.json")))
     for kind in ("ComputePSNR", "ExportMarchingCubesMesh"):
         assert adapter.prepare(command(kind, other)) is False
 
@@ -56,6 +57,15 @@ def test_poisson_estimates_normals_where_the_model_has_none(ours):
     made = command("ExportPoissonMesh", with_checkpoint(ours), normal_method="model_output")
     assert adapter.prepare(made) is True
     assert made.normal_method == "open3d"
+
+
+def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path):
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path / "file", "x", "run"
+    config.output_dir.write_text("months of work")
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cannot be made a folder[^\n]*\.$"):
+        config.save_config()
+    assert config.output_dir.read_text() == "months of work"
 
 
 @pytest.mark.parametrize(
@@ -72,7 +82,7 @@ def test_a_config_of_another_version_is_one_sentence(ours, old, new):
     assert old in text
     ours.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=r"^[^\n]*config.yml: cannot be read[^\n]*\.$"):
-        adapter.prepare(command("ComputePSNR", ours))
+        adapter.prepare(command("ComputePSNR", ours, output_path=Path("scores.json")))
 
 
 def test_a_script_under_import_is_adapted_once_complete(ours, other, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -93,7 +94,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
             "have in common, such as those of scale, poses or training."
         )
     rows = [
-        [name, f"{factor * size[key]:.4g}{f' ± {factor * spread[key]:.2g}' if spread else ''}", unit]
+        [name, _with_sd(factor * size[key], factor * spread[key]) if spread else f"{factor * size[key]:.4g}", unit]
         for key, (name, unit, factor) in _SIZES.items()
     ]
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
@@ -160,6 +161,14 @@ def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits
 def _plain(value: MeanAndSd) -> dict[str, float | None]:
     """Ready for JSON."""
     return {key: float(one) if np.isfinite(one) else None for key, one in (("mean", value.mean), ("sd", value.sd))}
+
+
+def _with_sd(value: float, sd: float) -> str:
+    """The standard deviation with two digits that count, the value with as many decimals."""
+    if not (math.isfinite(sd) and sd > 0.0):
+        return f"{value:.4g} ± {sd:.2g}"
+    decimals = max(0, 1 - math.floor(math.log10(float(f"{sd:.1e}"))))
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def _mean_and_sd(value: Mapping[str, Any]) -> str:

@@ -80,9 +80,10 @@ def _check_clipped(session: Session, calibration: SessionCalibration) -> Finding
     worst = int(by_band.argmax())
     worst_nm = float(session.wavelengths_nm[calibration.bands[worst]])
     values = {"clipped": float(np.mean(clipped)), "saturated": float(by_band[worst]), "saturated_nm": worst_nm}
+    of_a_band = f"at most {100.0 * values['saturated']:.2g} % of a band ({worst_nm:.0f} nm) are"
     told = (
-        f"{100.0 * values['clipped']:.2g} % of the values are clipped at the upper bound, and at most "
-        f"{100.0 * values['saturated']:.2g} % of a band ({worst_nm:.0f} nm) are saturated"
+        f"{100.0 * values['clipped']:.2g} % of the values are clipped at the upper bound, and "
+        f"{of_a_band if values['saturated'] else 'none is'} saturated"
     )
     if values["clipped"] > CLIPPED_RED or values["saturated"] > SATURATED_RED:
         return Finding("clipped", "red", f"{session.path}: {told}; check the white and the integration time.", values)

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
-from hsi_sc_nerf.capture.envi import DATA_SUFFIXES, Cube
+import numpy as np
+
+from hsi_sc_nerf.capture.envi import DATA_SUFFIXES
+from hsi_sc_nerf.capture.envi_header import EnviHeader
 from hsi_sc_nerf.errors import InputError
 
 _PRODUCT = "reflectance_"
@@ -22,6 +25,8 @@ _ROLES = {"": "counts", "darkref_": "dark", "whiteref_": "white", "whitedarkref_
 _PREFIXES = tuple(prefix for prefix in _ROLES if prefix)
 IMAGE_ROTATION_DEG = 90
 """The slit is upright and scans sideways: the files' images are turned by this, counter-clockwise."""
+SPECIM_IQ_FWHM_NM = 7.0
+"""Width of a SPECIM IQ's bands by the paper ("Imaging setup"); its headers list none."""
 
 
 @dataclass(frozen=True)
@@ -206,13 +211,26 @@ def read_metadata(path: Path) -> SpecimMetadata:
     )
 
 
-def usual_rotation_deg(cube: Cube) -> int:
+def usual_rotation_deg(header: EnviHeader) -> int:
     """Rotation of a file's image from upright, counter-clockwise, as far as its header tells.
 
     It is 90 if the ``sensor type`` or ``description`` is that of a real SPECIM IQ, else 0.
     """
-    camera = _normalised(" ".join(str(cube.fields.get(key, "")) for key in ("sensor type", "description")))
+    camera = _camera(header)
     return IMAGE_ROTATION_DEG if "specimiq" in camera and "simulated" not in camera else 0
+
+
+def with_band_widths(header: EnviHeader) -> EnviHeader:
+    """The header, with the widths of a SPECIM IQ's bands where it lists none and nothing was binned."""
+    binned = any(str(number) != "1" for number in np.atleast_1d(header.fields.get("binning", "1")))
+    if header.fwhm_nm is not None or binned or "specimiq" not in _camera(header):
+        return header
+    return replace(header, fwhm_nm=np.full(header.shape[2], SPECIM_IQ_FWHM_NM))
+
+
+def _camera(header: EnviHeader) -> str:
+    """What a header says about the camera, normalised."""
+    return _normalised(" ".join(str(header.fields.get(key, "")) for key in ("sensor type", "description")))
 
 
 def dark_of_white(

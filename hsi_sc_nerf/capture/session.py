@@ -22,6 +22,7 @@ from hsi_sc_nerf.capture.instrument import (
     list_captures,
     read_metadata,
     usual_rotation_deg,
+    with_band_widths,
 )
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_band_centres, read_session_info
@@ -269,7 +270,7 @@ def open_captures(
     opened: list[Capture] = []
 
     def read_headers(files: CaptureFiles) -> None:
-        headers[files.name] = {role: read_header(header) for role, header in files.headers.items()}
+        headers[files.name] = {role: with_band_widths(read_header(path)) for role, path in files.headers.items()}
         for header in headers[files.name].values():
             if header.wavelengths_nm is not None:
                 by_band_count.setdefault(header.shape[2], header.wavelengths_nm)

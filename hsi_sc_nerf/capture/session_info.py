@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -57,15 +58,22 @@ def read_session_info(path: Path) -> SessionInfo:
     """Read ``session.json``; if there is none, every value is unknown.
 
     Raises:
-        InputError: no JSON object, an unknown key, a value of the wrong kind, or a named file that is missing.
+        InputError: no readable file, no JSON object, an unknown key, a value of the wrong kind, or a named file that
+            is missing.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return SessionInfo()
     known = [field.name for field in fields(SessionInfo)]
     try:
         values = {k: v for k, v in json.loads(path.read_text(encoding="utf-8")).items() if v is not None}
     except (ValueError, AttributeError) as error:
-        raise InputError(f"{path}: is no JSON object ({error}); write {{...}} with keys of {known}.") from error
+        raise InputError(
+            f"{path}: is no JSON object ({error}); write {{...}} with keys of {', '.join(known)}."
+        ) from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); put a file of JSON there, or nothing."
+        ) from error
     for key, value in values.items():
         if key not in known:
             raise InputError(f"{path}: does not know the key {key}; the keys are {', '.join(known)}.")

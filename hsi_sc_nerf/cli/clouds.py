@@ -18,6 +18,7 @@ from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, compare, read_reference
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
+from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.terminal import screen_table
 
@@ -49,6 +50,7 @@ class CompareCommand:
         Raises:
             InputError: a file or a setting cannot be used, or the two cannot be aligned.
         """
+        require_writable(self.output_dir)
         console = Console(stderr=True)
 
         def shown(items: Sequence[Any], doing: str) -> Iterable[Any]:
@@ -120,6 +122,7 @@ class TraitsCommand:
         check_options(self)
         if self.classes and self.library is None:
             raise InputError("--classes names spectra of a library; give it with --library.")
+        require_writable(self.output_dir)
         picked = [RegionOfInterest(name, (x_m, y_m, z_m), radius_m) for name, x_m, y_m, z_m, radius_m in self.roi]
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:

@@ -53,16 +53,17 @@ class MaterialCommand:
         """
         check_options(self)
         from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
-        from hsi_sc_nerf.files import write_json
+        from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_run
 
+        output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
+        require_writable(output.parent)
         cloud = read_spectral_ply(self.cloud)
         run = open_run(self.load_config)
         bands = bands_of(cloud.wavelengths_nm, run.model.wavelengths_nm, self.cloud)
         found = light_of_run(run, self._white_normal())
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
-        output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
         write_spectral_ply(output, with_material(cloud, found, bands, corrected=corrected))
         write_json(output.with_suffix(".json"), summary(found, corrected=corrected))
         console, evidence = Console(), found.evidence

@@ -14,7 +14,7 @@ from rich.markup import escape
 from hsi_sc_nerf import paper as published
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.files import require_writable, write_json
 from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, draw_inspection, inspect_session, suggestion
 from hsi_sc_nerf.inspection.watch import Watch
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
@@ -136,6 +136,8 @@ class InspectCommand:
         if self.watch:
             self._watch(console)
             return
+        if self.output_dir is not None:
+            require_writable(self.output_dir)
         session = open_session(self.session, exclude=self.exclude, skip_damaged=True)
         inspection = inspect_session(session)
         show_findings(console, inspection)

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.options import CloudOptions
+from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.settings_file import between, check_options
 
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -83,6 +84,8 @@ class SampleCommand:
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_run
 
+        output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
+        require_writable(output.parent)
         given = read_points(self.points)
         normals = given.normals()
         run = open_run(self.load_config)
@@ -94,7 +97,6 @@ class SampleCommand:
                 f"{self.points}: none of its points lies on the object; give them in the object's frame (origin on "
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
-        output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
         name = run_name(self.load_config)
         write_sampled_ply(output, given, found, run.dataset.wavelengths_nm, run.model.rgb_bands, name)
         console = Console()
@@ -145,6 +147,7 @@ class RenderCommand:
         check_options(self)
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
+        require_writable(self.output_dir)
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
         from hsi_sc_nerf.rendering.pictures import compare, find_false_colour, open_video, write_report
@@ -220,6 +223,7 @@ class ReportCommand:
 
         run = self.run.parent if self.run.name == "config.yml" else self.run
         output = self.output or run / "report.html"
+        require_writable(output.parent)
         sources = ReportSources(self.cloud, self.comparison, self.traits, self.views, self.points)
         write_report(run, output, sources)
         size_mb = output.stat().st_size / 1e6

@@ -20,6 +20,7 @@ from rich.markup import escape
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
+from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
@@ -108,9 +109,11 @@ class RunCommand:
             raise InputError(f"{self.session}: is no folder; give that of a capture session.")
         if out.resolve() == self.session.resolve():
             raise InputError(f"{out}: is the session itself; choose another --output-dir.")
-        make_folder(out)
-        if not (out / STEPS_NAME).is_file() and any(out.iterdir()):
+        if out.is_dir() and not (out / STEPS_NAME).is_file() and any(out.iterdir()):
             raise InputError(f"{out}: holds something other than a run of `hsi-sc-nerf run`; choose another folder.")
+        if not is_session(self.session):
+            raise InputError(f"{self.session}: holds no captures; give the folder of a capture session.")
+        make_folder(out)
         console = Console(highlight=False, soft_wrap=True)
         steps = self._steps()
         for number, step in enumerate(steps, start=1):

@@ -25,6 +25,10 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, is_packed, open_packed
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.spectra import nearest_bands
+from hsi_sc_nerf.terminal import ignore_library_warnings
+
+# Of all that nerfstudio discovers this is imported first, and most of its own modules come after it.
+ignore_library_warnings()
 
 FRAME_INDEX = "frame_index"
 """Camera metadata: index of the session's frame that a ray belongs to."""

@@ -25,6 +25,7 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
+from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
@@ -60,6 +61,7 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
         PosixPath('export/point_cloud.ply')
     """
     target = Path(output_dir) / "point_cloud"
+    require_writable(target.parent)
     bands = select_bands(run.model.wavelengths_nm, options.bands)
     require_format(target, options.format, len(bands), len(EXTRA))
     sampler, dataset = run.manager.train_pixel_sampler, run.manager.train_dataset

@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.files import make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
@@ -42,6 +42,7 @@ from hsi_sc_nerf.models.stages import (
 from hsi_sc_nerf.models.training_watch import (
     NonFiniteGuard,
     TrainingDivergedError,
+    flush_logs,
     non_finite_names,
     stage_summary,
     training_progress,
@@ -89,6 +90,10 @@ class StagedTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Check the settings, then write ``config.yml``, the first file of a run."""
         self.plan()
+        try:
+            make_folder(self.get_base_dir())
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
         super().save_config()
 
 
@@ -163,7 +168,7 @@ class StagedTrainer(Trainer):
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         finally:
-            _flush_logs()
+            flush_logs()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step of its stage."""
@@ -271,7 +276,7 @@ class StagedTrainer(Trainer):
             results = {"stage": stage.config.name, "step": step, "checkpoint": kept.name, "results": metrics}
             write_json(kept.with_suffix(".json"), results)
         link_checkpoint(checkpoint_path(self.checkpoint_dir, step), kept.parent)
-        _flush_logs()
+        flush_logs()
 
     def _after_train(self) -> None:
         """Save, then finish as nerfstudio does."""
@@ -337,11 +342,3 @@ class StagedTrainer(Trainer):
         self.plan = resumed_plan(self.plan, **training["stage"], completed_at=completed_at)
         self._loaded = path
         CONSOLE.print(f"Going on from {escape(str(path))}", soft_wrap=True)
-
-
-def _flush_logs() -> None:
-    """Write the logs to disk; TensorBoard's writer would lose its buffer if the process ended."""
-    writer.write_out_storage()
-    for event_writer in writer.EVENT_WRITERS:
-        if isinstance(event_writer, writer.TensorboardWriter):
-            event_writer.tb_writer.flush()

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
+from nerfstudio.utils import writer
 from rich.progress import MofNCompleteColumn, TextColumn
 from torch import Tensor
 
@@ -92,3 +93,11 @@ def training_progress(total_steps: int, first_step: int) -> Iterator[Callable[[i
     with timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}")) as bar:
         task = bar.add_task("training", total=total_steps, completed=first_step, quality="")
         yield update
+
+
+def flush_logs() -> None:
+    """Write the logs to disk; TensorBoard's writer would lose its buffer if the process ended."""
+    writer.write_out_storage()
+    for event_writer in writer.EVENT_WRITERS:
+        if isinstance(event_writer, writer.TensorboardWriter):
+            event_writer.tb_writer.flush()

@@ -24,7 +24,7 @@ from hsi_sc_nerf.calibration.report import (
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.files import require_writable, write_png
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session, suggestion
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
@@ -51,7 +51,7 @@ from hsi_sc_nerf.processing.posed_frames import (
 )
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
 from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
-from hsi_sc_nerf.processing.session_checks import SessionChecks
+from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.voted_hull import VotedHull, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -124,6 +124,8 @@ def process_session(
         raise InputError(f"{output_dir}: is the session itself; choose another --output-dir.")
     if config.workers < 1:
         raise InputError(f"--workers is {config.workers}, but must be 1 or more; correct it.")
+    require_checks(config.accept)
+    require_writable(output_dir)
     # Square brackets and colons in a folder's name are no markup.
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding, refuse_red
 from hsi_sc_nerf.inspection.inspect import Inspection
@@ -14,6 +15,26 @@ _log = logging.getLogger(__name__)
 
 CHECKS_PATH = Path("report") / "inspection.json"
 """In the dataset; the inspection's content and the findings of all later steps."""
+MAY_BE_RED = (
+    *("angles", "binning", "copies", "damaged", "dates", "exposure", "other-object", "scale", "turn"),
+    *("white", "white-clipped", "clipped", "drift", "noise"),
+    *("poses-angles", "poses-camera", "poses-direction", "poses-scale", "poses-uncertain"),
+    *("frames-hull", "masks-border", "masks-cut", "masks-empty", "masks-hull", "masks-static"),
+)
+"""Checks whose findings may be red, in their order: of the session, the calibration, the poses and the masks."""
+
+
+def require_checks(names: Collection[str]) -> None:
+    """Refuse names of checks that there are not.
+
+    Raises:
+        InputError: one of ``names`` is no check whose finding may be red.
+    """
+    unknown = [name for name in names if name not in MAY_BE_RED]
+    if unknown:
+        raise InputError(
+            f"--accept {unknown[0]}: there is no such check; those that refuse are {', '.join(MAY_BE_RED)}."
+        )
 
 
 class SessionChecks:

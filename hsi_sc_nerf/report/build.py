@@ -108,7 +108,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     if comparison is not None:
         key_figures |= comparison_key_figure(comparison)
     title = f"{dataset.object_name}: hyperspectral 3D reconstruction"
-    page = html_page(title, _subtitle(dataset), key_figures, sections)
+    page = html_page(title, _subtitle(dataset, output), key_figures, sections)
     with atomic_write(output) as (temporary,):
         temporary.write_text(page, encoding="utf-8")
 
@@ -167,10 +167,13 @@ def _rendered(run: TrainedRun, count: int | None) -> list[HeldOutView]:
     return views
 
 
-def _subtitle(dataset: PackedDataset) -> str:
+def _subtitle(dataset: PackedDataset, output: Path) -> str:
+    """Size of the dataset and its name: where it lies seen from the report, or that of its folder alone."""
+    root, beside = dataset.root.resolve(), output.resolve().parent
+    name = root.relative_to(beside).as_posix() if root.is_relative_to(beside) else root.name
     low, high = dataset.wavelengths_nm.min(), dataset.wavelengths_nm.max()
     return f"{len(dataset.frames)} frames of {dataset.intrinsics.w} x {dataset.intrinsics.h} pixels, " + (
-        f"{len(dataset.wavelengths_nm)} bands from {low:.0f} to {high:.0f} nm, dataset {dataset.root}"
+        f"{len(dataset.wavelengths_nm)} bands from {low:.0f} to {high:.0f} nm, dataset {name}"
     )
 
 

@@ -67,8 +67,13 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
     if content is None:
         return []
     try:
-        findings = [Finding(one["name"], one["level"], one["sentence"]) for one in content["findings"]]
-    except (KeyError, TypeError) as error:
+        above = f"{Path(content.get('session', '')).parent}/"
+        findings = [
+            # The folders of the machine that processed the session tell a reader nothing.
+            Finding(one["name"], one["level"], one["sentence"].replace(above, ""))
+            for one in content["findings"]
+        ]
+    except (AttributeError, KeyError, TypeError) as error:
         raise InputError(f"{path}: holds no findings ({error}); inspect the session again.") from error
     return [Section("inspection", "The session", [], findings)]
 

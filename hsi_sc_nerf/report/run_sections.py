@@ -103,11 +103,13 @@ def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
 
 
 def flat_settings(config: Any, prefix: str = "") -> dict[str, str]:
-    """Settings of nested dataclasses and mappings as text, by their dotted names."""
+    """Settings of nested dataclasses and mappings as text, by their dotted names; of whole paths the last name."""
     if is_dataclass(config) and not isinstance(config, type):
         parts = {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _NO_SETTINGS}
     elif isinstance(config, Mapping) and config:
         parts = {str(key): value for key, value in config.items()}
+    elif isinstance(config, Path) and config.is_absolute():
+        return {prefix: config.name}
     else:
         return {prefix: str(config)}
     flat: dict[str, str] = {}

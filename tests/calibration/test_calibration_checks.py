@@ -67,6 +67,16 @@ def test_clipped(calibrated, spoilt, changes, level):
     assert level_of("clipped", calibrated, frames=tuple(frames)) == level
 
 
+def test_saturation_is_told_of_a_band_only_where_there_is_some(calibrated):
+    def told(**changes):
+        frames = tuple(replace(frame, **changes) for frame in calibrated[1].frames)
+        findings = check_calibration(calibrated[0], replace(calibrated[1], frames=frames))
+        return next(finding.sentence for finding in findings if finding.name == "clipped")
+
+    assert " nm)" not in told()
+    assert " nm)" in told(saturation_counts=1000.0)
+
+
 @pytest.mark.parametrize(
     ("slope", "measured", "scatter", "level"),
     [

@@ -57,6 +57,24 @@ def write_capture(
         (session / name / "metadata" / f"{name}.xml").write_text(xml)
 
 
+@pytest.mark.parametrize(
+    ("fields", "fwhm_nm"),
+    [
+        ({"sensor type": "SPECIM IQ", "binning": [1, 1]}, 7.0),
+        ({"description": "Data recorded with Specim IQ"}, 7.0),
+        ({"sensor type": "SPECIM IQ", "fwhm": [5.5] * BANDS}, 5.5),
+        ({"sensor type": "SPECIM IQ", "binning": [2, 1]}, None),
+        ({"sensor type": "FX10"}, None),
+        ({}, None),
+    ],
+)
+def test_band_widths_are_listed_or_those_of_the_camera(tmp_path, fields, fwhm_nm):
+    for name in ("a", "b"):
+        write(tmp_path / f"REFLECTANCE_{name}.hdr", REFLECTANCE, **fields)
+    widths_nm = open_session(tmp_path).frames[0].cube.fwhm_nm
+    assert widths_nm is None if fwhm_nm is None else (widths_nm == np.full(BANDS, fwhm_nm)).all()
+
+
 def two(session: Path, **options) -> Path:
     for name in ("444", "445"):
         write_capture(session, name, **options)

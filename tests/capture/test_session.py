@@ -234,10 +234,18 @@ def test_session_info_round_trip(tmp_path):
     assert info.container_height_m == 0.07
 
 
+def test_something_else_in_the_place_of_session_info_is_not_taken_for_none(tmp_path):
+    (tmp_path / "session.json").mkdir()
+    (tmp_path / "elsewhere.json").symlink_to(tmp_path / "gone.json")
+    for name in ("session.json", "elsewhere.json"):
+        with pytest.raises(InputError, match=rf"{name}: cannot be read"):
+            read_session_info(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "no JSON object"),
+        ("{", "no JSON object [^][]*nominal_step_deg, direction"),
         ("[]", "no JSON object"),
         ('{"marker_size": 1}', "does not know the key marker_size"),
         ('{"marker_side_m": "2 cm"}', "marker_side_m is '2 cm'"),

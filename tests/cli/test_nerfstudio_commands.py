@@ -102,6 +102,8 @@ def test_exports(call, tmp_path, words, written):
         ("ns-export", ("gaussian-splat", "--output-dir", "x"), "Gaussians"),
         ("ns-render", ("dataset", "--downscale-factor", "8"), "hsi-sc-nerf render"),
         ("ns-render", ("interpolate",), "--pose-source train"),
+        ("ns-eval", ("--output-path", "scores.txt"), "ends in .json"),
+        ("ns-eval", ("--output-path", "/proc/nowhere/scores.json"), "/proc/nowhere"),
         ("ns-render", ("dataset", "--rendered-output-names", "rgb", "spectral"), "hsi-sc-nerf render"),
         ("ns-render", ("interpolate", "--rendered-output-names", "spectral"), "hsi-sc-nerf render"),
     ],

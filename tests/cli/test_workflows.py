@@ -199,3 +199,11 @@ def test_a_file_is_no_folder_for_the_demo(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match="out: cannot be made a folder"):
         DemoCommand(output_dir=tmp_path / "out").main()
+
+
+def test_run_on_a_folder_without_captures_is_one_sentence_and_leaves_nothing(tmp_path):
+    session = tmp_path / "session"
+    session.mkdir()
+    with pytest.raises(InputError, match="holds no captures"):
+        RunCommand(session, tmp_path / "out").main()
+    assert list(tmp_path.iterdir()) == [session]

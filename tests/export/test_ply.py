@@ -66,6 +66,18 @@ def test_open3d_reads_it_and_its_copy_reads_back(tmp_path: Path) -> None:
     assert_equal(read_spectral_ply(copy), written)
 
 
+@pytest.mark.slow
+def test_pyvista_reads_what_it_knows_of(tmp_path: Path) -> None:
+    """VTK's reader takes positions, normals and colours of a PLY file, and no other columns."""
+    pyvista = pytest.importorskip("pyvista")
+    written = random_cloud()
+    write_spectral_ply(tmp_path / "cloud.ply", written)
+    read = pyvista.read(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(read.points, written.points)
+    np.testing.assert_array_equal(read.point_data["Normals"], written.normals)
+    np.testing.assert_array_equal(read.point_data["RGB"], written.colours)
+
+
 def test_bands_closer_than_two_decimals_get_more(tmp_path: Path) -> None:
     wavelengths = np.array([500.001, 500.004, 500.0041, 600.0])
     assert band_property_names(wavelengths[[0, 3]]) == ["scalar_500.00nm", "scalar_600.00nm"]

@@ -36,7 +36,7 @@ def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left
 
 def test_a_file_and_the_session_itself_are_no_folder_for_the_dataset(session, tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match=r"file/.*: cannot be written"):
+    with pytest.raises(InputError, match="file: cannot be written"):
         process(session, tmp_path / "file")
     names = sorted(path.name for path in session.iterdir())
     with pytest.raises(InputError, match="session itself"):

@@ -53,6 +53,19 @@ def test_spy_reads_a_view_as_it_was(tmp_path, dataset, kind):
     assert valid.bands.centers is None
 
 
+@pytest.mark.parametrize("kind", ["float32", "uint16"])
+def test_spy_knows_colours_and_widths_from_a_simulated_session_to_its_rendered_views(tmp_path, tiny_dataset, kind):
+    simulated = open_packed(tiny_dataset[0])
+    shape = (4, 5, len(simulated.wavelengths_nm))
+    write_view(tmp_path, "view", RenderedView(torch.rand(shape), torch.ones(shape[:2])), simulated, kind)
+    for header in (simulated.frames[0].cube_path, tmp_path / "view.hdr"):
+        read = spectral.open_image(str(header))
+        np.testing.assert_allclose(read.bands.bandwidths, 7.0)
+        shown_nm = [read.bands.centers[int(band) - 1] for band in read.metadata["default bands"]]
+        assert shown_nm == sorted(shown_nm, reverse=True)
+        np.testing.assert_allclose(shown_nm, (598, 548, 449), atol=30)
+
+
 def test_false_colours_are_the_viewers():
     wavelengths_nm = np.arange(400.0, 1001.0, 10.0)
     values = torch.rand(3, 4, len(wavelengths_nm), generator=torch.Generator().manual_seed(0))

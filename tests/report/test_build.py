@@ -71,8 +71,8 @@ def run(tmp_path_factory):
     data = ball_run.write_ball_dataset(folder / "data")
     transforms = (data / "transforms.json").read_text()
     (data / "transforms.json").write_text(transforms.replace('"ball"', json.dumps(HOSTILE)))
-    finding = {"name": "white", "level": "amber", "sentence": HOSTILE, "values": {}}
-    write_json(data / "report" / "inspection.json", {"findings": [finding]})
+    finding = {"name": "white", "level": "amber", "sentence": f"{folder}/session: {HOSTILE}", "values": {}}
+    write_json(data / "report" / "inspection.json", {"session": f"{folder}/session", "findings": [finding]})
     run = ball_run.write_untrained_run(data, folder / "runs").parent
     write_spectral_ply(run / "point_cloud.ply", ball(factory.WAVELENGTHS_NM))
     (run / "comparison.json").write_text(json.dumps(COMPARISON))
@@ -102,7 +102,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_page_is_complete_and_names_from_outside_stay_text(report):
+def test_the_page_is_complete_and_names_from_outside_stay_text(report, tmp_path_factory):
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert [section["id"] for section in page.all("section")] == SECTIONS
@@ -116,10 +116,12 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report):
     addresses = re.findall(r"[a-z]+://[^\s\"'<]+", re.sub(r"base64,[\w+/=]+", "", text))
     assert set(addresses) <= {"http://www.w3.org/2000/svg"}  # a name, which nothing fetches
 
+    assert str(tmp_path_factory.getbasetemp()) not in text  # folders of this machine
+    assert "session: " in text
     assert "<img src=x" not in text
     assert text.count("{{ 7 * 7 }}") > 5
     assert len(page.all("script")) == 2
-    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229 ± 1", "250 ± 2", "cm²", "mL"):
+    for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229.0 ± 1.0", "250.0 ± 2.0", "cm²", "mL"):
         assert shown in text
     assert "run <code>ns-train" in text  # it has no log
     assert not list(report.parent.glob(".*")) + list(report.parent.glob("*.tmp"))

@@ -1,0 +1,30 @@
+import pytest
+
+from hsi_sc_nerf.analysis.report import trait_tables
+from hsi_sc_nerf.analysis.traits import WHOLE
+
+SIZES = ("area_m2", "volume_l", "height_m", "largest_diameter_m", "smallest_diameter_m", "equivalent_diameter_m")
+
+
+@pytest.mark.parametrize(
+    ("height_m", "sd_m", "shown"),
+    [
+        (0.078341, 8.5e-6, "78.3410 ± 0.0085"),
+        (0.078341, 3.4e-4, "78.34 ± 0.34"),
+        (0.078341, 9.96e-4, "78.3 ± 1.0"),
+        (0.078341, 0.0123, "78 ± 12"),
+        (0.078341, 0.0, "78.34 ± 0"),
+        (0.078341, None, "78.34"),
+    ],
+)
+def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
+    content = {
+        "size": dict.fromkeys(SIZES, height_m),
+        "size_sd": None if sd_m is None else dict.fromkeys(SIZES, sd_m),
+        "seen_area_m2": 0.01,
+        "watertight": True,
+        "classes": None,
+        "regions": {WHOLE: {"indices": {}}},
+    }
+    (sizes,) = trait_tables(content)
+    assert ["height", shown, "mm"] in sizes.rows
