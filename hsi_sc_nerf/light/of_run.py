@@ -24,7 +24,7 @@ ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 LIFT_M = 0.0005
 """Rays begin so far outside of the surface: half a voxel of the mesh."""
 SMOOTHING_M = 0.003
-"""Normals are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
+"""Normals and light are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
 """Fewer measurements tell nothing of the light."""
 
@@ -104,7 +104,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
-    turning = turning_elements(elements, poses[:, :3, :3], LIFT_M)
+    turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     light = light_on_object(elements, turning, views, white_normal)
     return RunLight(run, light, shading_evidence(turning, views, light.spectral), renders, mesh)
 
