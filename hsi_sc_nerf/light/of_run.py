@@ -55,12 +55,19 @@ class RunLight:
         These frames give the spectra of an exported cloud. For a point that no frame sees it is that of the first
         frame.
         """
+        frames, _, normals = self.frontal(points_m)
+        return self.light.irradiance(points_m, normals, np.maximum(frames, 0))
+
+    def frontal(
+        self, points_m: Float[np.ndarray, "n 3"]
+    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
+        """The frame that sees each point most from the front or -1, image coordinates there, and unit normals."""
         points = self.run.to_scene(points_m)
         normals = self.mesh.normals_at(points)
         device = self.renders.camera_to_world.device
         where, outward = (torch.from_numpy(array).float().to(device) for array in (points, normals))
-        frames: Int[np.ndarray, "n"] = self.renders.most_frontal(where, outward)[0].cpu().numpy()
-        return self.light.irradiance(points_m, normals, np.maximum(frames, 0))
+        frames, xy_px, _ = self.renders.most_frontal(where, outward)
+        return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
 
 
 def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLight:
