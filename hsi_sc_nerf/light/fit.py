@@ -36,8 +36,6 @@ LEAST_LAMP = 0.02
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
 """Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
 are seen tell what is to be expected of those that are not."""
-UNEVENNESS_AT_FIRST = 0.003
-"""The same while the first lamp is looked for, lest the chamber explain it."""
 MOST_UNEVEN = 0.1
 """A chamber's harmonics are no larger: what is more uneven is a lamp."""
 LEAST_DISTANCE_M = 0.25
@@ -53,9 +51,6 @@ LEAST_LAMPS = 0.05
 TUKEY = 4.685
 """Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
 SMALLEST_SCATTER = 0.002
-OCCLUSION_ERROR = 0.1
-"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
-touch."""
 BOUNCES = 4
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
@@ -104,13 +99,10 @@ def fit_light(
         if not fit.add_lamp():
             break
         fit.converge()
-        fit.unevenness = UNEVENNESS
-        fit.converge()
         if fit.light.lamps.min() < LEAST_LAMP:
             fit.restore(before)
             break
     # Only what no lamp explains is the chamber's.
-    fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
     fit.converge(see_unevenness=True)
     return fit.result()
@@ -128,12 +120,10 @@ class _Fit:
         self._nearest_seen = np.flatnonzero(seen)[cKDTree(elements.positions[seen]).query(elements.positions)[1]]
         self._chamber = elements.chamber_at(views)
         self.errors = SharedErrors(elements.cells[views.element])
-        occluded = 1.0 - elements.transfer.sky[views.element]
-        self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._precision = np.zeros(count[0])
         self.light = even_light(views.reflectance.shape[1])
         self.weights, self.scatter = np.ones(count[0]), 0.0
-        self.unevenness = UNEVENNESS_AT_FIRST
+        self.unevenness = UNEVENNESS
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
         self.lamps = elements.lamps_at(views, self.light.to_lamps)
 
@@ -268,8 +258,8 @@ class _Fit:
         """Find the scatter and the measurements' weights."""
         told = self.views.tells_light
         self.scatter = max(1.4826 * float(np.median(np.abs(residual[told]))), SMALLEST_SCATTER)
-        beyond = scatter_beyond(residual[told], self._own_std[told])
-        std = np.hypot(beyond, self._own_std)
+        beyond = scatter_beyond(residual[told], self.views.own_std[told])
+        std = np.hypot(beyond, self.views.own_std)
         self.weights = np.where(told, _tukey(residual / std), 1.0)
         self._precision = self.weights * told / std**2
 
