@@ -36,6 +36,8 @@ LEAST_LAMP = 0.02
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
 """Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
 are seen tell what is to be expected of those that are not."""
+UNEVENNESS_AT_FIRST = 0.003
+"""The same while a lamp is looked for, lest the chamber explain how near it is."""
 MOST_UNEVEN = 0.1
 """A chamber's harmonics are no larger: what is more uneven is a lamp."""
 LEAST_DISTANCE_M = 0.25
@@ -99,10 +101,13 @@ def fit_light(
         if not fit.add_lamp():
             break
         fit.converge()
+        fit.unevenness = UNEVENNESS
+        fit.converge()
         if fit.light.lamps.min() < LEAST_LAMP:
             fit.restore(before)
             break
     # Only what no lamp explains is the chamber's.
+    fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
     fit.converge(see_unevenness=True)
     return fit.result()
@@ -123,7 +128,7 @@ class _Fit:
         self._precision = np.zeros(count[0])
         self.light = even_light(views.reflectance.shape[1])
         self.weights, self.scatter = np.ones(count[0]), 0.0
-        self.unevenness = UNEVENNESS
+        self.unevenness = UNEVENNESS_AT_FIRST
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
         self.lamps = elements.lamps_at(views, self.light.to_lamps)
 
