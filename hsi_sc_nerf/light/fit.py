@@ -53,6 +53,9 @@ LEAST_LAMPS = 0.05
 TUKEY = 4.685
 """Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
 SMALLEST_SCATTER = 0.002
+OCCLUSION_ERROR = 0.1
+"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
+touch."""
 BOUNCES = 4
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
@@ -125,6 +128,8 @@ class _Fit:
         self._nearest_seen = np.flatnonzero(seen)[cKDTree(elements.positions[seen]).query(elements.positions)[1]]
         self._chamber = elements.chamber_at(views)
         self.errors = SharedErrors(elements.cells[views.element])
+        occluded = 1.0 - elements.transfer.sky[views.element]
+        self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._precision = np.zeros(count[0])
         self.light = even_light(views.reflectance.shape[1])
         self.weights, self.scatter = np.ones(count[0]), 0.0
@@ -263,8 +268,8 @@ class _Fit:
         """Find the scatter and the measurements' weights."""
         told = self.views.tells_light
         self.scatter = max(1.4826 * float(np.median(np.abs(residual[told]))), SMALLEST_SCATTER)
-        beyond = scatter_beyond(residual[told], self.views.own_std[told])
-        std = np.hypot(beyond, self.views.own_std)
+        beyond = scatter_beyond(residual[told], self._own_std[told])
+        std = np.hypot(beyond, self._own_std)
         self.weights = np.where(told, _tukey(residual / std), 1.0)
         self._precision = self.weights * told / std**2
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.light.directions import even_directions
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
-from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, LightFit, fit_light
+from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
 from hsi_sc_nerf.light.transfer import transfer
 from hsi_sc_nerf.light.views import TurningElements, Views
 
@@ -21,9 +21,6 @@ BAND_GROUPS = 8
 """The light is fitted to so many means of neighbouring bands: its colours are smooth."""
 NEIGHBOURS = 4
 """Irradiance at a point is a mean over so many elements."""
-OCCLUSION_ERROR = 0.1
-"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
-touch."""
 UNEXPLAINED = 2.0
 """Error of irradiance relative to the scatter: what the model misses in single views it also misses in their mean."""
 
