@@ -3,16 +3,24 @@
     uv run hsi-sc-nerf simulate pear SESSION --frames 30 --size 96 --bands 24 \\
         --effects chamber_shading '{inter_reflection: {bounces: 3}}' lamp
     uv run python benchmarks/material_reflectance.py SESSION "pear, lamp"
+    uv run python benchmarks/material_reflectance.py SESSION "pear, lamp" \\
+        --config RUN/config.yml --cloud EXPORT/point_cloud.ply
 
-Light is the noise-free one of the session's truth, mesh and poses are the true ones, so that nothing but the light is
-judged. A point's spectrum is that of its most frontal view; its true one is the reflectance of the same pixels. The
-white reference of a session with a lamp faces the lamp, which is the simulator's convention. With ``--even`` the
-session's light is replaced by even light.
+Without a run, light is the noise-free one of the session's truth, mesh and poses are the true ones, so that nothing
+but the light is judged. A point's spectrum is that of its most frontal view; its true one is the reflectance of the
+same pixels. With ``--even`` the session's light is replaced by even light.
+
+With a run, all is as in `hsi-sc-nerf material`: the trained surface, the poses of the dataset, its noisy frames, and
+the cloud's spectra. A point's true spectrum is that of the nearest point of the true surface. The true irradiance is
+that of the pixel which shows the point most from the front.
+
+The white reference of a session with a lamp faces the lamp, which is the simulator's convention.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,36 +30,46 @@ import tyro
 from jaxtyping import Float
 from results_table import RESULTS, write_results
 
+from hsi_sc_nerf.export.cloud import INCIDENCE
+from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import Elements, spread_elements, support_mesh
-from hsi_sc_nerf.light.evidence import shading_evidence
+from hsi_sc_nerf.light.evidence import ShadingEvidence, shading_evidence
+from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
-from hsi_sc_nerf.light.observe import observe
+from hsi_sc_nerf.light.observe import LARGEST_INCIDENCE_DEG, observe
+from hsi_sc_nerf.light.of_run import light_of_run
+from hsi_sc_nerf.light.views import Views
+from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.processing.scene_box import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
-from hsi_sc_nerf.simulate.true_surface import relative_rms
+from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
 COLUMNS = (
     "session",
+    "kind",
     "shading found",
     "profile",
     "brightness as measured, 5 to 95 %",
     "brightness of material, 5 to 95 %",
     "median",
-    "spots as measured, worst, %",
+    "with the true irradiance, 5 to 95 %",
+    "spots as measured, median, %",
+    "worst, %",
     "spots of material, median, %",
     "90 %",
-    "worst, %",
+    "worst of material, %",
+    "irradiance, true to found, 5 to 95 %",
+    "stated std, median, %",
     "within 1 std, %",
     "within 2 std, %",
+    "CPU seconds",
 )
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 POINTS, SPOTS, SPOT_RADIUS_M = 6000, 200, 0.005
 LIFT_M, SMOOTHING_M = 2e-4, 0.003
 PURE = 0.999
-EVEN_STD = 0.01
-"""Stated uncertainty of what is not corrected: that of the white reference."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +82,22 @@ class MaterialReflectance:
     """Of the session, in the table."""
     even: bool = False
     """Take even light instead of the session's own."""
+    config: Path | None = None
+    """The config.yml of a run that was trained on the session, to be judged instead of the true mesh."""
+    cloud: Path | None = None
+    """The cloud that was exported from it."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, and write the table's row."""
         truth = load_truth(self.session)
-        row = [self.name, *judge(truth, container_of(self.session), even=self.even)]
-        write_results("material_reflectance", COLUMNS, [row], keys=1, folder=self.results)
+        if self.config is not None and self.cloud is not None:
+            kind, judged = "trained", judge_run(truth, self.config, self.cloud)
+        else:
+            kind, judged = "true mesh", judge_true_mesh(truth, container_of(self.session), even=self.even)
+        row = [self.name, kind, *judged.cells()]
+        write_results("material_reflectance", COLUMNS, [row], keys=2, folder=self.results)
 
 
 def container_of(session: Path) -> tuple[float, float]:
@@ -80,71 +106,123 @@ def container_of(session: Path) -> tuple[float, float]:
     return values["diameter_m"], values["height_m"]
 
 
-def judge(truth: Truth, container_m: tuple[float, float], *, even: bool) -> list[str]:
-    """The figures of one session."""
+def facing_of(truth: Truth) -> Float[np.ndarray, "3"]:
+    """Normal of the white reference, camera's frame."""
+    lamp = truth.effects.get("lamp")
+    return np.array([0.0, 0.0, 1.0]) if lamp is None else Lamp(**lamp).direction(np.eye(4))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What is compared: spectra of points and their irradiance; its truth is NaN where no pixel tells it."""
+
+    evidence: ShadingEvidence
+    points: Float[np.ndarray, "n 3"]
+    measured: Float[np.ndarray, "n bands"]
+    true: Float[np.ndarray, "n bands"]
+    irradiance: Float[np.ndarray, "n bands"]
+    std: Float[np.ndarray, "n"]
+    true_irradiance: Float[np.ndarray, "n"]
+    seconds: float
+
+    def cells(self) -> list[str]:
+        """The row of the table."""
+        evidence, found, std = self.evidence, self.irradiance, self.std
+        if not evidence.shaded:
+            found, std = np.ones_like(found), np.full(len(std), WHITE_STD)
+        corrected = self.measured / found
+        bright, apparent = (spectra.mean(axis=1) / self.true.mean(axis=1) for spectra in (corrected, self.measured))
+        spots, as_measured = (spot_errors(self.points, spectra, self.true) for spectra in (corrected, self.measured))
+        light, relative = self.true_irradiance / found.mean(axis=1), std / found.mean(axis=1)
+        sigmas = (np.abs(light - 1.0) / relative)[np.isfinite(light)]
+        span = "{:.3f} to {:.3f}"
+        return [
+            "yes" if evidence.shaded else "no",
+            f"{evidence.profile:.2f} ± {evidence.profile_std:.2f}",
+            span.format(*np.quantile(apparent, [0.05, 0.95])),
+            span.format(*np.quantile(bright, [0.05, 0.95])),
+            f"{np.median(bright):.3f}",
+            span.format(*np.nanquantile(apparent / self.true_irradiance, [0.05, 0.95])),
+            f"{100.0 * np.median(as_measured):.1f}",
+            f"{100.0 * as_measured.max():.1f}",
+            f"{100.0 * np.median(spots):.2f}",
+            f"{100.0 * np.quantile(spots, 0.9):.1f}",
+            f"{100.0 * spots.max():.1f}",
+            span.format(*np.nanquantile(light, [0.05, 0.95])),
+            f"{100.0 * np.median(relative):.1f}",
+            f"{100.0 * (sigmas < 1.0).mean():.0f}",
+            f"{100.0 * (sigmas < 2.0).mean():.0f}",
+            f"{self.seconds:.0f}",
+        ]
+
+
+def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: bool) -> Judged:
+    """The light on the true mesh."""
     mesh, poses = truth.mesh(), truth.camera_to_world
     corners = np.concatenate(list(truth.marker_layout.values()))
     support = support_mesh(container_m, DISC_OVER_MARKERS * float(np.hypot(*corners[:, :2].T).max()))
     elements = spread_elements(mesh, support, ELEMENTS, SUPPORT_ELEMENTS, SMOOTHING_M)
     masks = np.stack([truth.object_coverage(capture) >= PURE for capture in truth.captures])
 
-    @lru_cache(maxsize=len(truth.captures))
-    def cubes(frame: int) -> Float[np.ndarray, "h w both"]:
+    @lru_cache(maxsize=2 * len(truth.captures))
+    def cube(frame: int, of_material: bool) -> Float[np.ndarray, "h w bands"]:
         capture = truth.captures[frame]
-        material = truth.reflectance(capture)
-        shown = material if even else truth.light(capture).radiance()
-        return np.concatenate([shown, material], axis=-1)
+        return truth.reflectance(capture) if of_material else truth.light(capture).radiance()
 
-    def observed(some: Elements) -> tuple:
-        views = observe(
+    def observed(some: Elements, *, of_material: bool) -> Views:
+        return observe(
             some,
             poses,
             truth.intrinsics,
             truth.distortion,
             masks,
-            lambda frame, line, sample: cubes(frame)[line, sample].astype(float),
+            lambda frame, line, sample: cube(frame, of_material)[line, sample].astype(float),
             LIFT_M,
         )
-        shown, material = np.split(views.reflectance, 2, axis=1)
-        return replace(views, reflectance=shown), material
 
-    views, _ = observed(elements)
-    facing = np.array([0.0, 0.0, 1.0])
-    if "lamp" in truth.effects and not even:
-        facing = Lamp(**truth.effects["lamp"]).direction(np.eye(4))
-    turning = turning_elements(elements, poses[:, :3, :3], LIFT_M)
+    views = observed(elements, of_material=even)
+    facing = np.array([0.0, 0.0, 1.0]) if even else facing_of(truth)
+    started = time.process_time()
+    turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     found = light_on_object(elements, turning, views, facing)
     evidence = shading_evidence(turning, views, found.spectral)
+    seconds = time.process_time() - started
 
     points = frontal_points(elements, mesh)
-    seen, material = observed(points)
+    seen, material = observed(points, of_material=even), observed(points, of_material=True)
     sight = poses[seen.frame, :3, 3] - points.positions[seen.element]
     cosines = (sight * points.normals[seen.element]).sum(axis=1) / np.linalg.norm(sight, axis=1)
     order = np.lexsort([-cosines, seen.element])
     point, first = np.unique(seen.element[order], return_index=True)
     best = order[first]
-    measured, true = seen.reflectance[best], material[best]
-    corrected, relative = measured, np.full(len(best), EVEN_STD)
-    if evidence.shaded:
-        irradiance, std = found.irradiance(points.positions[point], points.normals[point], seen.frame[best])
-        corrected, relative = measured / irradiance, std / irradiance.mean(axis=1)
-    bright, apparent = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (corrected, measured))
-    spots, spots_apparent = (spot_errors(points.positions[point], spectra, true) for spectra in (corrected, measured))
-    sigmas = np.abs(bright - 1.0) / relative
-    span = "{:.3f} to {:.3f}"
-    return [
-        "yes" if evidence.shaded else "no",
-        f"{evidence.profile:.2f} ± {evidence.profile_std:.2f}",
-        span.format(*np.quantile(apparent, [0.05, 0.95])),
-        span.format(*np.quantile(bright, [0.05, 0.95])),
-        f"{np.median(bright):.3f}",
-        f"{100.0 * spots_apparent.max():.1f}",
-        f"{100.0 * np.median(spots):.2f}",
-        f"{100.0 * np.quantile(spots, 0.9):.1f}",
-        f"{100.0 * spots.max():.1f}",
-        f"{100.0 * (sigmas < 1.0).mean():.0f}",
-        f"{100.0 * (sigmas < 2.0).mean():.0f}",
-    ]
+    measured, true = seen.reflectance[best], material.reflectance[best]
+    irradiance, std = found.irradiance(points.positions[point], points.normals[point], seen.frame[best])
+    shown = measured.mean(axis=1) / true.mean(axis=1)
+    return Judged(evidence, points.positions[point], measured, true, irradiance, std, shown, seconds)
+
+
+def judge_run(truth: Truth, config: Path, cloud_path: Path) -> Judged:
+    """The light on a run's surface, and the spectra of its cloud."""
+    run, cloud = open_run(config), read_spectral_ply(cloud_path)
+    started = time.process_time()
+    found = light_of_run(run, facing_of(truth))
+    seconds, surface = time.process_time() - started, TrueSurface.of(truth)
+    frontal = np.flatnonzero(cloud.extra[INCIDENCE] < LARGEST_INCIDENCE_DEG)
+    chosen = np.random.default_rng(0).choice(frontal, min(2 * POINTS, len(frontal)), replace=False)
+    points = cloud.points[chosen].astype(float)
+    irradiance, std = found.irradiance(points)
+    frames, xy_px, _ = found.frontal(points)
+    shown = np.full(len(points), np.nan)
+    for index, frame in enumerate(run.manager.train_dataset.frames):
+        rows = np.flatnonzero(frames == index)
+        sample, line = xy_px[rows].astype(int).T
+        radiance, material = truth.light(frame.capture).radiance(), truth.reflectance(frame.capture)
+        pure = truth.object_coverage(frame.capture)[line, sample] >= PURE
+        rows, line, sample = rows[pure], line[pure], sample[pure]
+        shown[rows] = radiance[line, sample].mean(axis=1) / material[line, sample].mean(axis=1)
+    _, weights, _ = surface.nearest(points)
+    true = weights @ surface.endmembers
+    return Judged(found.evidence, points, cloud.spectra[chosen], true, irradiance, std, shown, seconds)
 
 
 def frontal_points(elements: Elements, mesh: Mesh) -> Elements:

@@ -25,7 +25,10 @@ def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> Turnin
         back = np.array([np.cos(ELEVATION) * np.cos(azimuth), np.cos(ELEVATION) * np.sin(azimuth), np.sin(ELEVATION)])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         rotations.append(np.stack([right, np.cross(back, right), back], axis=1))
-    return TurningElements(RADIUS_M * normals + places_m, normals, transfer, DIRECTIONS, np.array(rotations))
+    on_object = np.ones(count, bool)
+    return TurningElements(
+        RADIUS_M * normals + places_m, normals, on_object, transfer, DIRECTIONS, np.array(rotations)
+    )
 
 
 def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m=None):
@@ -49,4 +52,5 @@ def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m
         frame.append(np.full(len(seen), index))
     element, irradiance = np.concatenate(element), np.concatenate(irradiance)
     shown = material[element] * irradiance * (1.0 + noise * rng.standard_normal((len(element), 1)))
-    return Views(element, np.concatenate(frame), shown, np.ones(len(element), bool)), irradiance, material
+    of_object, no_std = np.ones(len(element), bool), np.zeros(len(element))
+    return Views(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material

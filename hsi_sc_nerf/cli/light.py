@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.export.cloud import SpectralCloud
     from hsi_sc_nerf.light.of_run import RunLight
 
-_MATERIAL = "material_"
+COLUMNS = ("irradiance", "irradiance_std")
+UNCERTAIN = 0.05
+"""Irradiance that is more uncertain than this, relative to it, is warned of."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class MaterialCommand:
     load_config: Path
     """The config.yml of the run that it was exported from."""
     output: Path | None = None
-    """File to write. By default NAME-material.ply in the folder of the cloud."""
+    """File to write; its name ends in .ply, .las, .nc or .zarr. By default NAME-material.ply in the folder of the
+    cloud."""
     correct: Literal["auto", "always", "never"] = "auto"
     """Whether to correct the light. auto: where shading is found beyond noise. never: the material's columns hold
     what was measured."""
@@ -52,32 +55,52 @@ class MaterialCommand:
             InputError: cloud and run do not fit together or cannot be used, or the result cannot be written.
         """
         check_options(self)
-        from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
+        from hsi_sc_nerf.export.cloud import stream
+        from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
+        from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply
         from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_run
 
         output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
         require_writable(output.parent)
+        file_format, stem = format_of(output), output.with_suffix("")
         cloud = read_spectral_ply(self.cloud)
+        extra = {*cloud.extra, *COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
+        require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
         run = open_run(self.load_config)
         bands = bands_of(cloud.wavelengths_nm, run.model.wavelengths_nm, self.cloud)
         found = light_of_run(run, self._white_normal())
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
-        write_spectral_ply(output, with_material(cloud, found, bands, corrected=corrected))
-        write_json(output.with_suffix(".json"), summary(found, corrected=corrected))
-        console, evidence = Console(), found.evidence
-        shaded = "uneven light is found" if evidence.shaded else "no uneven light is found beyond noise"
-        console.print(
-            f"{shaded}: like spectra are as bright as the light says by the factor {evidence.profile:.2f} ± "
-            f"{evidence.profile_std:.2f} (1: right, 0: even light); {'corrected' if corrected else 'not corrected'}.",
-            soft_wrap=True,
-        )
-        console.print(f"{escape(str(output))}: {len(cloud):,} points.", soft_wrap=True)
+        result = with_material(cloud, found, bands, corrected=corrected)
+        told = summary(found, result, corrected=corrected)
+        write_cloud(stem, stream(result), file_format)
+        write_json(output.with_suffix(".json"), told)
+        console = Console(soft_wrap=True, highlight=False)
+        for line in sentences(told):
+            console.print(line, style="yellow" if line.startswith("Warning") else None)
+        console.print(f"{escape(str(output))}: {len(cloud):,} points.")
 
     def _white_normal(self) -> Float[np.ndarray, "3"]:
         azimuth, elevation = np.deg2rad([self.white_azimuth_deg, self.white_elevation_deg])
         return np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
+
+
+def sentences(told: dict[str, Any]) -> list[str]:
+    """What a `summary` says of the light, in words; what warns begins with that word."""
+    evidence, std = told["evidence"], told["relative_std"]
+    decided = "the material's columns are corrected" if told["corrected"] else "nothing is corrected"
+    lines = [
+        f"{'Uneven light is found' if told['shaded'] else 'No uneven light is found beyond noise'}; {decided} "
+        f"(like spectra are as bright as the light says by the factor {evidence['profile']:.2f} ± "
+        f"{evidence['profile_std']:.2f}; 1 is right, 0 is even light)."
+    ]
+    if told["corrected"] and std > UNCERTAIN:
+        lines.append(
+            f"Warning: the light is uncertain by {100.0 * std:.0f} % (irradiance_std), and so is the material; "
+            "do not compare its brightness with that of other objects."
+        )
+    return lines
 
 
 def bands_of(cloud_nm: Float[np.ndarray, "selected"], run_nm: Float[np.ndarray, "bands"], path: Path) -> np.ndarray:
@@ -95,26 +118,28 @@ def bands_of(cloud_nm: Float[np.ndarray, "selected"], run_nm: Float[np.ndarray, 
 def with_material(cloud: SpectralCloud, found: RunLight, bands: np.ndarray, *, corrected: bool) -> SpectralCloud:
     """The cloud with the columns of material and irradiance."""
     from hsi_sc_nerf.export.ply import band_property_names
+    from hsi_sc_nerf.light.fit import WHITE_STD
 
-    material, irradiance, std = cloud.spectra, np.ones(len(cloud)), np.zeros(len(cloud))
+    # Shade that is found but not corrected is an error of unknown size.
+    std = np.full(len(cloud), np.nan if found.evidence.shaded else WHITE_STD)
+    material, irradiance = cloud.spectra, np.ones(len(cloud))
     if corrected:
         by_band, std = found.irradiance(cloud.points.astype(float))
         material, irradiance = cloud.spectra / by_band[:, bands], by_band.mean(axis=1)
-    names = [name.replace("scalar_", _MATERIAL) for name in band_property_names(cloud.wavelengths_nm)]
-    columns = dict(zip(names, material.T, strict=True)) | {"irradiance": irradiance, "irradiance_std": std}
+    names = band_property_names(cloud.wavelengths_nm, "material")
+    columns = dict(zip([*names, *COLUMNS], [*material.T, irradiance, std], strict=True))
     extra = {name: column for name, column in cloud.extra.items() if name not in columns}
     return replace(cloud, extra=extra | {name: column.astype(np.float32) for name, column in columns.items()})
 
 
-def summary(found: RunLight, *, corrected: bool) -> dict[str, object]:
-    """The light and what tells of it, ready for JSON."""
-    from dataclasses import asdict
-
-    light = found.light.fit.light
+def summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
+    """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON."""
+    light, (irradiance, std) = found.light.fit.light, (cloud.extra[name] for name in COLUMNS)
     return {
         "corrected": corrected,
         "shaded": found.evidence.shaded,
         "evidence": asdict(found.evidence),
+        "relative_std": float(np.median(std / irradiance)) if np.isfinite(std).all() else None,
         "scatter": found.light.fit.scatter,
         "light": {
             "chamber_harmonics": light.chamber.tolist(),

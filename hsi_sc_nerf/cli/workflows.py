@@ -21,6 +21,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.capture.session import is_session
+from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
@@ -28,6 +29,8 @@ from hsi_sc_nerf.settings_file import between, check_options
 
 STEPS_NAME = "steps.json"
 """File of the output folder that says which steps were done with what; it marks the folder as a run's."""
+MATERIAL_NAME = "point_cloud-material.json"
+"""File of the output folder that says what was decided of the light on the object."""
 ITERATIONS_ON_CPU = 4000
 """Without a GPU, 40 000 iterations take hours; these come close (docs/validation/reconstruction.md)."""
 ITERATIONS_ON_GPU = 40_000
@@ -55,12 +58,14 @@ class Step:
         words: the command as a user would type it.
         inputs: files and folders that its results depend on.
         outputs: files that it leaves.
+        needed: whether the run ends where it fails.
     """
 
     name: str
     words: tuple[str, ...]
     inputs: tuple[Path, ...]
     outputs: tuple[Path, ...]
+    needed: bool = True
 
     def fingerprint(self, outside: Path) -> str:
         """Hash of command, version, and sizes and times of the inputs but for those inside the folder ``outside``."""
@@ -75,7 +80,10 @@ class Step:
 
 @dataclass(frozen=True)
 class RunCommand:
-    """Process a session, train, evaluate, export the cloud, measure traits and write the report.
+    """Process a session, train, evaluate, export the cloud, tell material and light apart, measure traits, report.
+
+    Where the light on the object is uneven beyond noise, point_cloud-material.ply holds the reflectance of the
+    material beside that measured; the last lines say so. Traits and report are those of the cloud as measured.
 
     Each step is a command of its own, which is printed as it starts. A step is skipped while its inputs, its words
     and its results are unchanged. A run that was stopped goes on where it stopped, also within the training.
@@ -93,6 +101,9 @@ class RunCommand:
     """More words for `hsi-sc-nerf process`, joined to the option by an equals sign: --process="--poses colmap"."""
     train: str = ""
     """More words for `ns-train hsi-sc-nerf`, likewise: --train="--pipeline.model.head direct"."""
+    material: str = ""
+    """More words for `hsi-sc-nerf material`, likewise, such as the direction that the white reference faced:
+    --material="--white-azimuth-deg -35"."""
 
     def main(self, run_step: StepRunner = run_step) -> None:
         """Run the steps that are not up to date and print what was found.
@@ -145,6 +156,12 @@ class RunCommand:
             ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
             ("export", exporting, (packed, weights), (cloud,)),
             (
+                "material",
+                ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(self.material)],
+                (packed, weights, cloud),
+                (out / "point_cloud-material.ply", out / MATERIAL_NAME),
+            ),
+            (
                 "traits",
                 ["hsi-sc-nerf", "traits", cloud, "--data", data, "--output-dir", traits],
                 (cloud,),
@@ -157,7 +174,10 @@ class RunCommand:
                 (out / "report.html",),
             ),
         ]
-        return [Step(name, tuple(map(str, words)), inputs, outputs) for name, words, inputs, outputs in table]
+        return [
+            Step(name, tuple(map(str, words)), inputs, outputs, name != "material")
+            for name, words, inputs, outputs in table
+        ]
 
     def _iterations(self) -> int:
         if self.max_num_iterations is not None:
@@ -190,7 +210,15 @@ class RunCommand:
         make_folder(logs)
         # A training whose last stage is kept was killed between its end and the next line of steps.json.
         if step.name != "train" or not (same and any(run.glob("stage-masked/*.ckpt"))):
-            cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
+            try:
+                cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
+            except InputError as error:
+                if step.needed:
+                    raise
+                for path in step.outputs:
+                    path.unlink(missing_ok=True)
+                console.print(f"[yellow]{escape(str(error))} The other steps do without.")
+                return
             entry["seconds"] = round(cost.seconds, 1)
         missing = [path for path in step.outputs if not path.is_file()]
         if missing:
@@ -207,6 +235,8 @@ def _show_results(out: Path, console: Console) -> None:
     size = traits["size"]
     volume = f"volume {1000 * size['volume_l']:.1f} mL" if traits["watertight"] else "no closed volume"
     console.print(f"Size: height {1000 * size['height_m']:.1f} mm, area {1e4 * size['area_m2']:.1f} cm², {volume}")
+    if (out / MATERIAL_NAME).is_file():
+        console.print(f"Light: {sentences(json.loads((out / MATERIAL_NAME).read_text(encoding='utf-8')))[0]}")
     for line in _warnings(out):
         console.print(f"[yellow]{escape(line)}")
     console.print(f"Open {escape(str(out / 'report.html'))} in a browser.", style="bold")
@@ -234,7 +264,7 @@ class DemoCommand:
     """Folder for all results; an earlier demo there is replaced."""
     scene: str = "pear"
     """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
-    iterations: int = 800
+    iterations: int = 600
     """Training steps of both stages together."""
     points: int = 60_000
     """Number of points of the cloud."""

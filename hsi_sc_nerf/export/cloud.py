@@ -28,6 +28,7 @@ FRAME = (
     "the first frame"
 )
 REFLECTANCE = ("1", "reflectance factor relative to the white reference in full light")
+MATERIAL = ("1", "reflectance factor of the material: as measured, divided by the irradiance in the band")
 _POSITION = ("m", "position in the object frame")
 _NORMAL = ("1", "outward unit normal")
 _COLOUR = ("1", "pseudo-RGB of the spectrum, 0 to 255")
@@ -43,7 +44,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "sampled_views": ("1", "number of training views that were averaged"),
     "sampled_std": ("1", "standard deviation of the reflectance over these views, mean over bands"),
     "irradiance": ("1", "irradiance relative to that on the white reference, mean over bands"),
-    "irradiance_std": ("1", "standard deviation of it; material_ columns hold reflectance divided by irradiance"),
+    "irradiance_std": ("1", "standard deviation of the irradiance"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
 
@@ -158,6 +159,9 @@ def comment_lines(columns: Iterable[str], run: str = "") -> list[str]:
     """
     lines = [f"{name}: {value}" for name, value in cloud_attributes(run).items()]
     lines.append("bands [{}]: {}, one column a band, named by its centre in nm".format(*REFLECTANCE))
+    columns = tuple(columns)
+    if any(name.startswith("material_") for name in columns):
+        lines.append("material_ [{}]: {}".format(*MATERIAL))
     alike: dict[tuple[str, str], list[str]] = {}
     for name in columns:
         if name in COLUMNS:

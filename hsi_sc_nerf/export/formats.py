@@ -1,9 +1,10 @@
 """Write spectral point clouds as PLY, LAS, NetCDF or Zarr.
 
 LAS 1.4 holds each band as a dimension of extra bytes (ASPRS LAS 1.4 R15, "Extra Bytes"). NetCDF-4 and Zarr are tables
-that xarray opens, with the dimensions ``point`` and ``wavelength`` (nm): ``reflectance`` (point, wavelength), and per
-point ``x y z`` (metres, object frame), ``nx ny nz``, ``red green blue`` and the extra columns. They are written
-without xarray, which needs the whole table at once.
+that xarray opens, with the dimensions ``point`` and ``wavelength`` (nm): ``reflectance`` (point, wavelength),
+likewise ``material`` where the cloud has the material's columns, and per point ``x y z`` (metres, object frame),
+``nx ny nz``, ``red green blue`` and the other extra columns. They are written without xarray, which needs the whole
+table at once.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ import numpy as np
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import CHUNK_POINTS, COLUMNS, REFLECTANCE, CloudStream, cloud_attributes, comment_lines
+from hsi_sc_nerf.export.cloud import (
+    CHUNK_POINTS,
+    COLUMNS,
+    MATERIAL,
+    REFLECTANCE,
+    CloudStream,
+    cloud_attributes,
+    comment_lines,
+)
 from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, make_folder
 
@@ -64,6 +73,18 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
     }
     writers[file_format](path, cloud)
     return path
+
+
+def format_of(path: Path) -> CloudFormat:
+    """The format that the suffix of a file names.
+
+    Raises:
+        InputError: it names none.
+    """
+    for file_format, suffix in _SUFFIXES.items():
+        if path.suffix.lower() == suffix:
+            return file_format
+    raise InputError(f"{path}: is no name of a cloud; let it end in {', '.join(_SUFFIXES.values())}.")
 
 
 def require_format(path_without_suffix: Path, file_format: CloudFormat, num_bands: int, num_extra: int) -> Path:
@@ -119,13 +140,22 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
 
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable."""
-    meanings = {"reflectance": REFLECTANCE} | COLUMNS
-    for name in ("reflectance", "x", "y", "z", *_NORMALS, *_COLOURS, *cloud.extra_names):
+    meanings = {"reflectance": REFLECTANCE, "material": MATERIAL} | COLUMNS
+    of_material = _of_material(cloud)
+    spectral = ("reflectance", "material") if of_material else ("reflectance",)
+    others = (name for name in cloud.extra_names if name not in of_material)
+    for name in (*spectral, "x", "y", "z", *_NORMALS, *_COLOURS, *others):
         attributes = dict(zip(("units", "long_name"), meanings.get(name, ()), strict=False))
-        if name == "reflectance":
+        if name in spectral:
             yield name, "<f4", ("point", "wavelength"), attributes | {"coordinates": "x y z"}
         else:
             yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
+
+
+def _of_material(cloud: CloudStream) -> list[str]:
+    """Names of the columns that hold the material's reflectance, one a band; none if the cloud lacks any."""
+    names = band_property_names(cloud.wavelengths_nm, "material")
+    return names if set(names) <= set(cloud.extra_names) else []
 
 
 def _table_attributes(cloud: CloudStream) -> dict[str, str]:
@@ -134,14 +164,17 @@ def _table_attributes(cloud: CloudStream) -> dict[str, str]:
 
 def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:
     """Write the chunks into the variables of a table."""
-    start = 0
+    start, of_material = 0, _of_material(cloud)
     for chunk in cloud.chunks:
+        extra = dict(chunk.extra)
+        material = [extra.pop(name) for name in of_material]
         columns = {
             "reflectance": chunk.spectra,
+            **({"material": np.stack(material, axis=-1)} if material else {}),
             **dict(zip("xyz", chunk.points.T, strict=True)),
             **dict(zip(_NORMALS, chunk.normals.T, strict=True)),
             **dict(zip(_COLOURS, chunk.colours.T, strict=True)),
-            **chunk.extra,
+            **extra,
         }
         for name, values in columns.items():
             variables[name][start : start + len(chunk)] = values

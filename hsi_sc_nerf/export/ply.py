@@ -80,15 +80,19 @@ def write_spectral_ply(
         faces.tofile(file)
 
 
-def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[str]:
+def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"], kind: str = "scalar") -> list[str]:
     """``scalar_397.32nm`` a band: two decimals, or as many as it takes to distinguish all bands.
+
+    Args:
+        wavelengths_nm: band centres.
+        kind: ``scalar`` for reflectance as measured, ``material`` for that of the material.
 
     Raises:
         ValueError: two wavelengths are equal.
     """
     wavelengths = [float(wavelength) for wavelength in wavelengths_nm]
     for decimals in range(2, 16):
-        names = [f"scalar_{wavelength:.{decimals}f}nm" for wavelength in wavelengths]
+        names = [f"{kind}_{wavelength:.{decimals}f}nm" for wavelength in wavelengths]
         if len(set(names)) == len(names):
             return names
     raise ValueError("two bands have the same wavelength")

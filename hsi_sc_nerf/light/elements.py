@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 
 SUPPORT_SIDES = 25
 """Triangles of the support along the disc's radius: 4 mm on a turntable, so that each belongs to one element."""
+POINTS_EACH = 4
+"""Points of the object's surface for each of its elements; a pixel shows several times as many."""
 NORMAL_WEIGHT = 2.0
 """A triangle belongs to the nearest element; a right angle between normals counts like so many spacings."""
 
@@ -61,6 +64,46 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
     positions = np.concatenate(points)
     is_object = np.arange(len(positions)) < on_object
     return Elements(positions, np.concatenate(own), is_object, whole, np.concatenate(of_triangle))
+
+
+def shown_points(
+    elements: Elements, radius_m: float, lift_m: float
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], scipy.sparse.csr_array]:
+    """Points that pixels show of the elements: kernels of an ear shade each other and have normals of their own.
+
+    Args:
+        elements: of the object and its support, which is smooth.
+        radius_m: points lie within this of their element.
+        lift_m: lines of sight begin so far outside of the surface.
+
+    Returns:
+        Points, outward unit normals, and the share of each in each element as seen along its normal.
+    """
+    count, whole = len(elements.positions), elements.occluders
+    scanned = Mesh(whole.vertices, whole.triangles[elements.on_object[elements.of_triangle]])
+    points = sample_surface(scanned.vertices, scanned.triangles, POINTS_EACH * int(elements.on_object.sum()))
+    facets = ray_scene(scanned.vertices, scanned.triangles).compute_closest_points(points.astype(np.float32))
+    normals = facets["primitive_normals"].numpy().astype(float)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    near = cKDTree(points).query_ball_point(elements.positions, radius_m)
+    element = np.repeat(np.arange(count), [len(some) for some in near])
+    point = np.concatenate([np.asarray(some, int) for some in near])
+    cosine = (normals[point] * elements.normals[element]).sum(axis=1)
+    kept = elements.on_object[element] & (cosine > 0.0)
+    shape = count, len(points)
+    shares = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
+    # What lies in a groove is hidden to one who looks along the mean normal of the elements around.
+    sight = np.concatenate([points + lift_m * normals, shares.T @ elements.normals], axis=1, dtype=np.float32)
+    hidden = ray_scene(whole.vertices, whole.triangles).test_occlusions(sight).numpy()
+    shares = shares @ scipy.sparse.diags_array(1.0 - hidden)
+    # An element that is left without a point, and those of the support, stand for themselves.
+    alone = shares.sum(axis=1) <= 0.0
+    shares = scipy.sparse.hstack([shares, scipy.sparse.diags_array(alone.astype(float))], format="csr")
+    shares.eliminate_zeros()
+    used = shares.sum(axis=0) > 0.0
+    shares = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / shares.sum(axis=1)) @ shares[:, used])
+    points = np.concatenate([points, elements.positions])[used]
+    return points, np.concatenate([normals, elements.normals])[used], shares
 
 
 def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: float) -> Float[np.ndarray, "n 3"]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.fit import LightFit, clusters
+from hsi_sc_nerf.light.fit import LightFit
 from hsi_sc_nerf.light.views import TurningElements, Views
 
 ALIKE = 12
@@ -71,7 +71,7 @@ def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> 
     total = np.maximum(np.bincount(element, weights, count), 1e-9)
     means = [np.bincount(element, weights * values, count) / total for values in (brightness, light)]
     brighter, lighter = (values - mean[element] for values, mean in zip((brightness, light), means, strict=True))
-    cells = clusters(elements.positions)
+    cells = elements.cells
     turning = _slope(brighter, lighter, weights, cells[element])
     seen = np.unique(element)
     spectra = np.stack([np.bincount(element, weights * band, count) for band in views.reflectance[rows].T], axis=-1)

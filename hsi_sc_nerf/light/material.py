@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.light.directions import even_directions
-from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements
-from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, LightFit, fit_light
+from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
+from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
 from hsi_sc_nerf.light.transfer import transfer
 from hsi_sc_nerf.light.views import TurningElements, Views
 
@@ -21,9 +21,8 @@ BAND_GROUPS = 8
 """The light is fitted to so many means of neighbouring bands: its colours are smooth."""
 NEIGHBOURS = 4
 """Irradiance at a point is a mean over so many elements."""
-OCCLUSION_ERROR = 0.1
-"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
-touch."""
+UNEXPLAINED = 2.0
+"""Error of irradiance relative to the scatter: what the model misses in single views it also misses in their mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,30 +84,34 @@ class ObjectLight:
 
     @property
     def _relative_variance(self) -> Float[np.ndarray, "elements"]:
-        """Of each element's irradiance: of the light, of what occludes it, of its own views."""
+        """Of each element's irradiance: of the light, of what occludes it, of what the model misses."""
         count, views = len(self.elements.positions), np.bincount(self.views.element)
         views = np.pad(views, (0, count - len(views)))
         of_light = np.bincount(self.views.element, self.fit.relative_std**2, count) / np.maximum(views, 1)
         of_light[views == 0] = of_light[views > 0].max()
         occluded = 1.0 - self.turning.transfer.sky
-        return of_light + (OCCLUSION_ERROR * occluded) ** 2 + self.fit.scatter**2 / np.maximum(views, 1)
+        return of_light + (OCCLUSION_ERROR * occluded) ** 2 + (UNEXPLAINED * self.fit.scatter) ** 2
 
 
 def turning_elements(
-    elements: Elements, rotations: Float[np.ndarray, "frames 3 3"], lift_m: float
+    elements: Elements, rotations: Float[np.ndarray, "frames 3 3"], pixel_m: float, lift_m: float
 ) -> TurningElements:
     """Cast the rays of the elements.
 
     Args:
         elements: of the object and its support.
         rotations: camera-to-object rotation of each frame.
+        pixel_m: what pixels show of an element lies within this radius.
         lift_m: rays begin so far outside of the surface.
     """
     directions = even_directions(RAY_DIRECTIONS)
+    points, normals, shares = shown_points(elements, pixel_m, lift_m)
     faces = elements.of_triangle, len(elements.positions)
-    seen = transfer(elements.positions, elements.normals, elements.occluders, *faces, directions, lift_m)
+    seen = transfer(points, normals, elements.occluders, *faces, directions, lift_m).mean(shares)
     centre_m = elements.positions[elements.on_object].mean(axis=0)
-    return TurningElements(elements.positions - centre_m, elements.normals, seen, directions, rotations)
+    return TurningElements(
+        elements.positions - centre_m, elements.normals, elements.on_object, seen, directions, rotations
+    )
 
 
 def light_on_object(

@@ -17,6 +17,11 @@ from hsi_sc_nerf.light.views import Views
 LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG = 70.0, 80.0
 """More oblique pixels also hold what lies beside. The lid is seen obliquely by every camera."""
 
+SMALLEST = 1e-3
+"""Reflectance that noise does not exceed."""
+MISPLACED_PX = 0.3
+"""Poses, surface and interpolation are uncertain by this part of a pixel."""
+
 Pixels = Callable[[int, Int[np.ndarray, "n"], Int[np.ndarray, "n"]], Float[np.ndarray, "n bands"]]
 """Reflectance of pixels of a frame, given by line and sample; NaN where nothing was measured."""
 
@@ -47,7 +52,7 @@ def observe(
     starts = elements.positions + lift_m * elements.normals
     least = np.where(elements.on_object, LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG)
     least = np.cos(np.deg2rad(least))
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    found: list[tuple[np.ndarray, ...]] = []
     for frame, pose in enumerate(camera_to_world):
         sight = pose[:3, 3] - elements.positions
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -61,15 +66,20 @@ def observe(
         seen = seen[~scene.test_occlusions(rays).numpy()]
         sample, line = corner[seen].astype(int).T
         part = xy.numpy()[seen] - 0.5 - corner[seen]
-        value, of_object = 0.0, []
+        value, of_object, across, along = 0.0, [], 0.0, 0.0
         for down in (0, 1):
             for right in (0, 1):
-                share = np.abs(1 - right - part[:, 0]) * np.abs(1 - down - part[:, 1])
-                value = value + share[:, None] * pixels(frame, line + down, sample + right)
+                share_across, share_along = np.abs(1 - right - part[:, 0]), np.abs(1 - down - part[:, 1])
+                pixel = pixels(frame, line + down, sample + right)
+                value = value + (share_across * share_along)[:, None] * pixel
+                across = across + (2 * right - 1) * share_along * pixel.mean(axis=1)
+                along = along + (2 * down - 1) * share_across * pixel.mean(axis=1)
                 of_object.append(masks[frame, line + down, sample + right])
         on = elements.on_object[seen]
         whole = np.where(on, np.all(of_object, axis=0), ~np.any(of_object, axis=0))
         whole &= np.isfinite(np.asarray(value)).all(axis=1)
-        found.append((seen[whole], np.full(int(whole.sum()), frame), np.asarray(value)[whole]))
-    element, frames, reflectance = (np.concatenate(column) for column in zip(*found, strict=True))
-    return Views(element, frames, reflectance, elements.on_object[element])
+        value = np.asarray(value)[whole]
+        std = MISPLACED_PX * np.hypot(across, along)[whole] / np.maximum(value.mean(axis=1), SMALLEST)
+        found.append((seen[whole], np.full(len(value), frame), value, std))
+    element, frames, reflectance, std = (np.concatenate(column) for column in zip(*found, strict=True))
+    return Views(element, frames, reflectance, elements.on_object[element], std)

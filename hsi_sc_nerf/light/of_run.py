@@ -24,7 +24,7 @@ ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 LIFT_M = 0.0005
 """Rays begin so far outside of the surface: half a voxel of the mesh."""
 SMOOTHING_M = 0.003
-"""Normals are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
+"""Normals and light are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
 """Fewer measurements tell nothing of the light."""
 
@@ -55,12 +55,19 @@ class RunLight:
         These frames give the spectra of an exported cloud. For a point that no frame sees it is that of the first
         frame.
         """
+        frames, _, normals = self.frontal(points_m)
+        return self.light.irradiance(points_m, normals, np.maximum(frames, 0))
+
+    def frontal(
+        self, points_m: Float[np.ndarray, "n 3"]
+    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
+        """The frame that sees each point most from the front or -1, image coordinates there, and unit normals."""
         points = self.run.to_scene(points_m)
         normals = self.mesh.normals_at(points)
         device = self.renders.camera_to_world.device
         where, outward = (torch.from_numpy(array).float().to(device) for array in (points, normals))
-        frames: Int[np.ndarray, "n"] = self.renders.most_frontal(where, outward)[0].cpu().numpy()
-        return self.light.irradiance(points_m, normals, np.maximum(frames, 0))
+        frames, xy_px, _ = self.renders.most_frontal(where, outward)
+        return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
 
 
 def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLight:
@@ -104,7 +111,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
-    turning = turning_elements(elements, poses[:, :3, :3], LIFT_M)
+    turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     light = light_on_object(elements, turning, views, white_normal)
     return RunLight(run, light, shading_evidence(turning, views, light.spectral), renders, mesh)
 

@@ -32,6 +32,11 @@ class Transfer:
         """Irradiance in an even chamber with black occluders, 0 to 1."""
         return self.open_weights.sum(axis=1)
 
+    def mean(self, shares: scipy.sparse.csr_array) -> Transfer:
+        """Means over points, by their shares in each row."""
+        means = np.asarray(shares @ self.open_weights, np.float32)
+        return Transfer(means, scipy.sparse.csr_array(shares @ self.form_factors))
+
 
 def transfer(
     points: Float[np.ndarray, "n 3"],

@@ -14,6 +14,10 @@ from hsi_sc_nerf.light.transfer import Transfer
 
 LEAST_COSINE = 0.15
 """Lamps that graze a surface hardly light it, however near."""
+CELLS_ACROSS = 4
+"""Cells across the object; elements in one of them share errors of mesh and poses."""
+FACING_SIDE = 0.35
+"""Cells of normals in the camera's frame, 20 degrees wide; in one of them elements share errors of the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +30,14 @@ class Views:
         reflectance: as measured, relative to the white reference.
         tells_light: whether it tells of the light; others tell of their element's material alone. Markers do not,
             whose pixels hold paper and ink.
+        own_std: standard deviation relative to the reflectance, as far as it is known beforehand.
     """
 
     element: Int[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
     reflectance: Float[np.ndarray, "m bands"]
     tells_light: Bool[np.ndarray, "m"]
+    own_std: Float[np.ndarray, "m"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +62,7 @@ class TurningElements:
     Attributes:
         positions: relative to the point at which the white reference was captured; metres, object frame.
         normals: outward unit normals, object frame.
+        on_object: which of them belong to the object.
         transfer: how light reaches them.
         directions: of the transfer's open weights, evenly spread, object frame.
         rotations: camera-to-object rotation of each frame.
@@ -63,6 +70,7 @@ class TurningElements:
 
     positions: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
+    on_object: Bool[np.ndarray, "n"]
     transfer: Transfer
     directions: Float[np.ndarray, "directions 3"]
     rotations: Float[np.ndarray, "frames 3 3"]
@@ -110,8 +118,24 @@ class TurningElements:
         return LampUnits(irradiance, by_direction, irradiance * units[:, 3 * lamps :])
 
     @cached_property
+    def cells(self) -> Int[np.ndarray, "n"]:
+        """The cell that each element lies in."""
+        side = np.cbrt(np.ptp(self.positions[self.on_object], axis=0).prod()) / CELLS_ACROSS
+        return _numbered(self.positions / side)
+
+    def facing(self, views: Views) -> Int[np.ndarray, "m"]:
+        """The cell of normals in the camera's frame that each measurement lies in."""
+        normals = np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
+        return _numbered(normals / FACING_SIDE)
+
+    @cached_property
     def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:
         return [harmonics(self.directions @ rotation, DEGREE).astype(np.float32) for rotation in self.rotations]
+
+
+def _numbered(places: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """The unit cube that each place lies in."""
+    return np.unique(np.floor(places).astype(int), axis=0, return_inverse=True)[1].ravel()
 
 
 def _by_frame(views: Views) -> list[tuple[int, Int[np.ndarray, "rows"]]]:

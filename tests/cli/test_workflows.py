@@ -23,7 +23,15 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
-ALL = ["process", "train", "evaluate", "export", "traits", "report"]
+ALL = ["process", "train", "evaluate", "export", "material", "traits", "report"]
+SIZE = {"size": {"volume_l": 0.226, "height_m": 0.0666, "area_m2": 0.0186}, "watertight": True}
+SCORES = {"results": {"sam": 0.03, "rmse": 0.02, "ssim": 0.9, "psnr": 34.0}}
+LIGHT = {
+    "shaded": True,
+    "corrected": True,
+    "relative_std": 0.12,
+    "evidence": {"profile": 0.9, "profile_std": 0.1},
+}
 TRAIN = " ".join(
     (
         "--pipeline.datamanager.train-num-rays-per-batch 256 --pipeline.model.match-resolution False",
@@ -119,9 +127,8 @@ def test_a_second_call_does_nothing_and_a_removed_result_is_made_again(whole, ru
 
 
 def test_at_the_end_stand_results_warnings_and_the_file_to_open(tmp_path, capsys):
-    write_json(tmp_path / "eval.json", {"results": {"sam": 0.03, "rmse": 0.02, "ssim": 0.9, "psnr": 34.0}})
-    size = {"volume_l": 0.226, "height_m": 0.0666, "area_m2": 0.0186}
-    write_json(tmp_path / "traits" / "traits.json", {"size": size, "watertight": True})
+    write_json(tmp_path / "eval.json", SCORES)
+    write_json(tmp_path / "traits" / "traits.json", SIZE)
     findings = [
         {"name": "frames", "level": "green", "sentence": "12 frames."},
         {"name": "focus", "level": "amber", "sentence": "Frame [7] is blurred."},
@@ -137,6 +144,43 @@ def test_at_the_end_stand_results_warnings_and_the_file_to_open(tmp_path, capsys
         "traits: Warning: it has holes.",
         f"Open {tmp_path / 'report.html'} in a browser.",
     ]
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_a_run_says_what_it_decided_of_the_light_and_does_without(tmp_path, capsys, found):
+    session, out = tmp_path / "session", tmp_path / "out"
+    session.mkdir()
+    results = {
+        "process": ["data/transforms.json"],
+        "train": ["training/hsi-sc-nerf/run/config.yml"],
+        "evaluate": ["eval.json"],
+        "export": ["point_cloud.ply"],
+        "material": ["point_cloud-material.ply", "point_cloud-material.json"],
+        "traits": ["traits/traits.json"],
+        "report": ["report.html"],
+    }
+
+    def run_step(name, argv, log):
+        for path in results[name]:
+            content = SCORES if name == "evaluate" else SIZE if name == "traits" else LIGHT
+            write_json(out / path, content)
+        if name == "material" and not found:
+            raise InputError("it failed.")
+        return own_cost(name, time.perf_counter())
+
+    RunCommand(session, out, material="--white-azimuth-deg -35").main(run_step)
+    printed = capsys.readouterr().out
+    assert "--white-azimuth-deg -35" in printed
+    assert ("\nLight: " in printed) == found
+    assert ("it failed." in printed) == (not found)
+    # What failed left half of its results.
+    assert (out / "point_cloud-material.ply").is_file() == found
+    assert done_steps(out) == (set(ALL) if found else set(ALL) - {"material"})
+
+
+def done_steps(out):
+    steps = json.loads((out / STEPS_NAME).read_text())
+    return {name for name, entry in steps.items() if entry["finished"]}
 
 
 def test_a_step_depends_on_its_words_and_files(tmp_path):

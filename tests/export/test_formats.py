@@ -8,7 +8,7 @@ from random_cloud import BAND_NAMES, WAVELENGTHS_NM, random_cloud
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream, stream
-from hsi_sc_nerf.export.formats import require_format, write_cloud
+from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
 
 COUNT = 50
 
@@ -104,3 +104,14 @@ def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cloud\.zarr: is no Zarr folder"):
         write_cloud(tmp_path / "cloud", stream(random_cloud()), "zarr")
     assert (tmp_path / "cloud.zarr" / "notes.txt").read_text() == "mine"
+
+
+def test_the_name_of_a_file_tells_its_format() -> None:
+    assert [format_of(Path(name)) for name in ("a.ply", "b.LAS", "c.d.nc", "e.zarr")] == [
+        "ply",
+        "las",
+        "netcdf",
+        "zarr",
+    ]
+    with pytest.raises(InputError):
+        format_of(Path("cloud.csv"))

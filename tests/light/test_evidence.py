@@ -8,7 +8,6 @@ from light_on_a_ball import FACING, measured, turning_ball
 
 from hsi_sc_nerf.light.evidence import shading_evidence
 from hsi_sc_nerf.light.fit import fit_light
-from hsi_sc_nerf.light.views import Views
 
 
 def shaded_ball():
@@ -27,7 +26,7 @@ def test_the_profile_tells_of_light_that_does_not_change_with_the_turn(shade):
     kinds = np.array([[0.2, 0.5], [0.3, 0.3], [0.5, 0.2]])[np.arange(len(visible)) % 3]
     noise = 1.0 + 0.01 * np.random.default_rng(0).standard_normal((len(views.element), 1))
     shown = kinds[views.element] * noise * (visible[views.element, None] if shade else 1.0)
-    views = Views(views.element, views.frame, shown, views.tells_light)
+    views = replace(views, reflectance=shown)
     found = shading_evidence(ball, views, fit_light(ball, views, FACING))
     assert found.profile == pytest.approx(1.0 if shade else 0.0, abs=0.1)
     assert found.shaded == shade

@@ -1,11 +1,12 @@
 """Light and materials against a closed form: a ball in even light with a lamp."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from light_on_a_ball import FACING, measured, turning_ball
 
 from hsi_sc_nerf.light.fit import fit_light
-from hsi_sc_nerf.light.views import Views
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_a_lamp_is_told_apart_from_the_material(ball, lamp):
 def test_gloss_in_a_few_views_does_not_matter(ball):
     views, _, material = measured(ball, 0.3)
     shiny = np.random.default_rng(1).random(len(views.element)) < 0.08
-    glossy = Views(views.element, views.frame, views.reflectance + 0.4 * shiny[:, None], views.tells_light)
+    glossy = replace(views, reflectance=views.reflectance + 0.4 * shiny[:, None])
     found = fit_light(ball, glossy, FACING)
     seen = seen_rows(views, ball)
     assert np.quantile(np.abs((found.material / material)[seen] - 1.0), 0.9) < 0.05

@@ -5,10 +5,12 @@ import capture_factory as factory
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.cli.light import bands_of, summary, with_material
+from hsi_sc_nerf.cli.light import bands_of, sentences, summary, with_material
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.export.cloud import SpectralCloud, stream
+from hsi_sc_nerf.export.formats import write_cloud
+from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.of_run import light_of_run
 from hsi_sc_nerf.models.trained_run import open_run
@@ -90,7 +92,46 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     np.testing.assert_allclose(corrected.extra["irradiance_std"], std, rtol=1e-4)
     assert (std > 0.0).all()
     np.testing.assert_array_equal(corrected.spectra, cloud.spectra)
-    assert summary(lit, corrected=True)["shaded"] is True
+    told = summary(lit, corrected, corrected=True)
+    assert told["shaded"] is True
+    assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
+
+
+@pytest.mark.parametrize("file_format", ["ply", "netcdf"])
+def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, file_format):
+    cloud = upper_cloud(lit, lit=True)
+    corrected = with_material(cloud, lit, np.arange(factory.BANDS), corrected=True)
+    path = write_cloud(tmp_path / "cloud", stream(corrected), file_format)
+    if file_format == "ply":
+        read = read_spectral_ply(path)
+        measured, columns = read.spectra, read.extra
+        material = np.stack([columns[f"material_{nm:.2f}nm"] for nm in factory.WAVELENGTHS_NM], axis=-1)
+    else:
+        table = pytest.importorskip("h5netcdf").File(path)
+        measured, material = table["reflectance"][:], table["material"][:]
+        assert table["material"].dimensions == ("point", "wavelength")
+        assert not any(name.startswith("material_") for name in table.variables)
+        columns = {name: table[name][:] for name in ("irradiance", "irradiance_std")}
+    np.testing.assert_array_equal(measured, cloud.spectra)
+    by_band, std = lit.irradiance(cloud.points.astype(float))
+    np.testing.assert_allclose(material * by_band, measured, rtol=1e-4)
+    np.testing.assert_allclose(columns["irradiance"], by_band.mean(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(columns["irradiance_std"], std, rtol=1e-4)
+
+
+def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
+    same = with_material(upper_cloud(lit, lit=True), lit, np.arange(factory.BANDS), corrected=False)
+    assert np.isnan(same.extra["irradiance_std"]).all()
+    assert summary(lit, same, corrected=False)["relative_std"] is None
+
+
+@pytest.mark.parametrize(
+    ("std", "corrected", "warned"), [(0.12, True, True), (0.02, True, False), (None, False, False)]
+)
+def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
+    evidence = {"profile": 0.7, "profile_std": 0.1}
+    told = {"evidence": evidence, "shaded": True, "corrected": corrected, "relative_std": std}
+    assert any(line.startswith("Warning") for line in sentences(told)) == warned
 
 
 def test_even_light_is_left_alone(even):
@@ -99,6 +140,8 @@ def test_even_light_is_left_alone(even):
     same = with_material(cloud, even, np.arange(factory.BANDS), corrected=False)
     np.testing.assert_array_equal(same.extra["material_400.00nm"], cloud.spectra[:, 0])
     np.testing.assert_array_equal(same.extra["irradiance"], 1.0)
+    # That of the white reference.
+    np.testing.assert_allclose(same.extra["irradiance_std"], 0.01)
 
 
 def test_a_cloud_of_other_bands_is_refused(tmp_path):

@@ -6,7 +6,7 @@ import trimesh
 
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.directions import even_directions
-from hsi_sc_nerf.light.elements import Elements, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import Elements, shown_points, spread_elements, support_mesh
 from hsi_sc_nerf.light.transfer import Transfer, transfer
 
 RADIUS_M = 0.03
@@ -60,3 +60,34 @@ def test_the_support_points_outwards_and_has_the_area_of_a_drum_on_a_disc():
     assert (normals[:, :2] * middles[:, :2]).sum(axis=1).min() > -1e-9
     assert mesh.area_m2() == pytest.approx(np.pi * 0.1**2 + np.pi * 0.08 * 0.06, rel=0.01)
     assert not len(support_mesh(None, 0.0).triangles)
+
+
+def test_pixels_show_points_around_each_element_and_the_support_as_it_is():
+    elements, _ = ball_over(0.1, height_m=RADIUS_M)
+    points, normals, shares = shown_points(elements, 0.006, 1e-4)
+    ball, shown = elements.on_object, np.diff(shares.indptr)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    assert np.median(shown[ball]) > 3
+    assert np.linalg.norm(shares @ points - elements.positions, axis=1).max() < 0.006
+    assert np.einsum("nk,nk->n", shares @ normals, elements.normals).min() > 0.9
+    np.testing.assert_array_equal(shown[~ball], 1)
+    np.testing.assert_allclose((shares @ points)[~ball], elements.positions[~ball])
+
+
+def test_pixels_do_not_show_what_lies_in_a_groove():
+    """A comb of upright plates, 1 mm wide and apart, 4 mm high."""
+    profile = [(x, z) for at in np.arange(0.0, 0.02, 0.002) for x, z in ((at, 0), (at, 0.004), (at + 0.001, 0.004))]
+    profile = [pair for x, z in profile for pair in ([(x, z), (x + 1e-9, 0)] if z and x % 0.002 > 5e-4 else [(x, z)])]
+    vertices = np.array([[x, y, z] for x, z in profile for y in (0.0, 0.02)])
+    first = np.arange(0, len(vertices) - 2, 2)
+    triangles = np.stack([[first, first + 2, first + 1], [first + 1, first + 2, first + 3]]).transpose(0, 2, 1)
+    comb = Mesh(vertices, triangles.reshape(-1, 3))
+    assert comb.facet_normals()[:, 2].min() > -1e-6
+    x = np.linspace(0.006, 0.014, 50)
+    positions = np.stack([x, np.full(50, 0.01), np.full(50, 0.004)], axis=1)
+    elements = Elements(
+        positions, np.tile([0.0, 0.0, 1.0], (50, 1)), np.ones(50, bool), comb, np.zeros(len(comb.triangles), int)
+    )
+    points, _, shares = shown_points(elements, 0.006, 1e-5)
+    on_side = (points[:, 2] > 1e-4) & (points[:, 2] < 0.0039)
+    assert (shares @ on_side.astype(float)).max() < 0.01
