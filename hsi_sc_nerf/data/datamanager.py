@@ -102,7 +102,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_train(self) -> None:
         """Open the training cubes."""
         self.train_pixel_sampler = self._pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = CameraRays(self.train_dataset.cameras.to(self.device))
+        self._train_rays = CameraRays(self.train_dataset.cameras.to(self.device))
         self._held: DevicePixels | None = None
         if self.config.hold_on_gpu and fits_on_gpu(self.train_dataset.frames, torch.device(self.device)):
             masks, flagged = self.train_pixel_sampler.masks, self.train_dataset.has_flagged
@@ -111,7 +111,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_eval(self) -> None:
         """Open the held-out cubes."""
         self.eval_pixel_sampler = self._pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
-        self.eval_ray_generator = CameraRays(self.eval_dataset.cameras.to(self.device))
+        self._eval_rays = CameraRays(self.eval_dataset.cameras.to(self.device))
         # A view without an object in its mask would score as perfect.
         with_object = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
@@ -135,14 +135,14 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         if self._held is not None:
             pixels = self.train_pixel_sampler.draw(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
             indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)
-            return self.train_ray_generator(indices), self._held(indices)
+            return self._train_rays(indices), self._held(indices)
         batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
-        return self._with_rays(batch, self.train_ray_generator)
+        return self._with_rays(batch, self._train_rays)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Random pixels of held-out views."""
         self.eval_count += 1
-        return self._with_rays(self.eval_pixel_sampler.sample(step), self.eval_ray_generator)
+        return self._with_rays(self.eval_pixel_sampler.sample(step), self._eval_rays)
 
     def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         return PixelSampler(
