@@ -149,7 +149,7 @@ def test_at_the_end_stand_results_warnings_and_the_file_to_open(tmp_path, capsys
 @pytest.mark.parametrize("found", [True, False])
 def test_a_run_says_what_it_decided_of_the_light_and_does_without(tmp_path, capsys, found):
     session, out = tmp_path / "session", tmp_path / "out"
-    session.mkdir()
+    (session / "a" / "capture").mkdir(parents=True)  # by its names a session; nothing is read
     results = {
         "process": ["data/transforms.json"],
         "train": ["training/hsi-sc-nerf/run/config.yml"],
