@@ -52,7 +52,8 @@ class ExportAndEvaluation:
 
     def main(self) -> None:
         """Measure what is asked for, print the table, write it."""
-        session, data = self.output_dir / "session", self.output_dir / "data"
+        output_dir = self.output_dir.resolve()
+        session, data = output_dir / "session", output_dir / "data"
         if not session.exists():
             scene = override(load_scene(self.scene), frames=self.frames, size_px=self.size)
             simulate_session(scene, session)
@@ -74,7 +75,7 @@ class ExportAndEvaluation:
 
     def _costs(self, version: str, tree: Path, data: Path) -> dict[str, tuple[float, float]]:
         """Processor seconds and memory of the steps of one version, by the step's name."""
-        folder = self.output_dir / version
+        folder = self.output_dir.resolve() / version
         run = folder / "run" / "hsi-sc-nerf" / "run"
         training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "run"]
         training += ["--timestamp", "run", "--max-num-iterations", self.iterations, "--vis", "tensorboard"]
@@ -96,8 +97,9 @@ def _run(tree: Path, words: Sequence[object], log: Path) -> tuple[float, float]:
     one_core = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONPATH": str(tree), "PYTHONWARNINGS": "ignore"}
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as output:
+        # Python looks for the package in the current folder first.
         process = subprocess.Popen(
-            typed_command(words), stdout=output, stderr=subprocess.STDOUT, env=os.environ | one_core
+            typed_command(words), stdout=output, stderr=subprocess.STDOUT, env=os.environ | one_core, cwd=tree
         )
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
