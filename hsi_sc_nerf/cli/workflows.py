@@ -264,7 +264,7 @@ class DemoCommand:
     """Folder for all results; an earlier demo there is replaced."""
     scene: str = "pear"
     """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
-    iterations: int = 600
+    iterations: int = 800
     """Training steps of both stages together."""
     points: int = 60_000
     """Number of points of the cloud."""
