@@ -159,7 +159,7 @@ def bounds_from_masks(
     below = z_m < low_m[2] + 2.0 * HULL_MARGIN_M
     if dataset.container is not None:
         radius_m, height_m = dataset.container.diameter_m / 2.0, dataset.container.height_m
-        below &= (from_axis_m < radius_m + HULL_MARGIN_M) | (z_m < HULL_MARGIN_M)
+        below &= (from_axis_m < radius_m + HULL_MARGIN_M) & (z_m < height_m + 0.5 * cell_m) | (z_m < HULL_MARGIN_M)
         solid |= ((from_axis_m < radius_m) & (z_m < height_m) | (z_m < 0.0)).reshape(shape)
     matter |= below.reshape(shape)
     return matter, solid & matter

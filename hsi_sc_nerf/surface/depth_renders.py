@@ -113,9 +113,14 @@ class DepthRenders:
         return torch.where(balance < 0, -1, frames), xy_px, best
 
     def depth_at(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Distances of points from a frame's camera, and the depth map at them; NaN where no ray was rendered."""
+        """Distances of points from a frame's camera, and the depth map at them.
+
+        The depth is NaN where no ray was rendered, and behind what is seen beside the mask: that is not the object.
+        """
         to_point, _, inside, pixels = self._project(frame, points)
-        return to_point.norm(dim=-1), torch.where(inside, self._depth_of(frame, pixels), torch.nan)
+        distances, depths = to_point.norm(dim=-1), self._depth_of(frame, pixels)
+        in_mask = self.masks[frame, pixels[:, 1], pixels[:, 0]]
+        return distances, torch.where(inside & (in_mask | (distances < depths)), depths, torch.nan)
 
     def pixels_of(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Int[Tensor, "n 2"]]:
         """Which points lie in a frame's picture, hidden or not, and their pixels (sample, line); else (0, 0)."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
@@ -191,7 +192,12 @@ def surface_mesh(
         return None
     vertices, kept = mesh.vertices.copy(), np.zeros(len(mesh.vertices), bool)
     normals = mesh.normals_at(mesh.vertices)
-    density_fn = partial(rendered_density, model)
+    floor = float(box[0][2])
+
+    def density_fn(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
+        # Rays that touch the object's base would end in what it stands on.
+        return rendered_density(model, points) * (points[..., 2:] >= floor)
+
     with progress_bar("finding the surface", "points", len(vertices)) as update:
         for start in range(0, len(vertices), points_per_batch):
             rows = slice(start, start + points_per_batch)

@@ -1,5 +1,7 @@
 """The occupancy grid begins as the hull of a known ball, and follows a field's density."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from hsi_sc_nerf.fields.occupancy_grid import (
     grid_over,
     pixels_of_cells,
 )
-from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.packed.dataset import Container, open_packed
 
 SHAPE, CELL_M = (40, 40, 54), 0.003
 
@@ -51,6 +53,22 @@ def test_matter_holds_the_ball_and_solid_is_within_it(ball):
     assert not matter[at_height & (from_centre_m > SPHERE_RADIUS_M + 6 * HULL_MARGIN_M)].any()
     assert not solid[at_height & (from_centre_m > SPHERE_RADIUS_M + 2 * CELL_M)].any()
     assert matter[height_m < ball.object_box_m[0, 2] - CELL_M].all()
+
+
+def test_nothing_lies_on_a_container_of_known_height_but_the_object(ball):
+    # Two millimetres below the middles of the next layer of cells.
+    height_m = CELL_M * (np.floor(ball.object_box_m[0, 2] / CELL_M) + 0.5) - 0.002
+    stands_on = replace(ball, container=Container(diameter_m=0.12, height_m=height_m))
+    lower_m = ball.scene_box_m[0]
+    centres = centres_m(lower_m).reshape(*SHAPE, 3)
+    z_m = centres[..., 2]
+    # Outside the hull of the ball, whose margin is two cells and more.
+    beside = np.hypot(centres[..., 0], centres[..., 1]) < 0.06
+    beside &= np.linalg.norm(centres - SPHERE_CENTRE_M, axis=-1) > SPHERE_RADIUS_M + 3 * HULL_MARGIN_M + 2 * CELL_M
+    matter, _ = bounds_from_masks(stands_on, ball.frames, SHAPE, lower_m, CELL_M)
+    assert beside.any()
+    assert matter[beside & (z_m < height_m)].all()
+    assert not matter[beside & (z_m > height_m + CELL_M / 2) & (z_m < height_m + HULL_MARGIN_M + CELL_M)].any()
 
 
 def test_masks_that_miss_the_object_in_a_few_frames_cut_nothing_off(ball):

@@ -133,6 +133,21 @@ def test_points_that_most_frames_see_beside_the_mask_are_not_the_objects(device:
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_beside_the_mask_only_the_space_before_the_support_is_known(device: str) -> None:
+    """A ball on another one, which is what it stands on: the depth of the second says nothing of the first."""
+    renders = ball_renders(device, [(np.zeros(3), 1.0), (SECOND_BALL, 0.3)])
+    eye = torch.from_numpy(POSES[0, :3, 3]).float().to(device)
+    towards = torch.nn.functional.normalize(torch.from_numpy(SECOND_BALL).float().to(device) - eye, dim=0)
+    support = float(np.linalg.norm(SECOND_BALL - POSES[0, :3, 3]) - 0.3)
+    points = eye + towards * torch.tensor([[support - 0.1], [support + 0.1]], device=device)
+    assert torch.isfinite(renders.depth_at(0, points)[1]).all()
+    renders.masks[0] = False
+    distances, depths = renders.depth_at(0, points)
+    np.testing.assert_allclose(distances.cpu(), [support - 0.1, support + 0.1], rtol=1e-4)
+    np.testing.assert_allclose(depths.cpu(), [support, np.nan], atol=0.02)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_points_beside_the_object_in_some_frames_are_outside_the_visual_hull(device: str) -> None:
     renders = ball_renders(device, [(np.zeros(3), 1.0)])
     renders.masks[:] = torch.isfinite(renders.depths)

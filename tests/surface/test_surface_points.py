@@ -1,9 +1,14 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.surface import surface_points
+from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import EVERYWHERE, box_region
-from hsi_sc_nerf.surface.surface_points import SurfaceMesh, SurfacePoints, even_points
+from hsi_sc_nerf.surface.surface_points import SurfaceMesh, SurfacePoints, even_points, surface_mesh
 
 
 def at(points: np.ndarray) -> SurfacePoints:
@@ -85,3 +90,44 @@ def test_candidates_are_in_proportion_to_the_fraction_kept() -> None:
 
     even_points(VERTICES, TRIANGLES, 5000, keep)
     assert sum(tried) < 1.1 * 50_000
+
+
+RADIUS = 0.3
+BALL_LENS = PinholeIntrinsics(96, 96, 150.0, 150.0, 48.0, 48.0)
+
+
+def ball_from_all_sides() -> DepthRenders:
+    """Depth maps of a ball around the origin, from eight cameras that look down on it."""
+    pose = look_at(np.array([1.2, 0.0, 0.4]), np.zeros(3))
+    poses = np.stack([turntable_camera_to_world(pose, angle) for angle in range(0, 360, 45)])
+    lines, samples = np.indices((BALL_LENS.h, BALL_LENS.w))
+    depths, points = [], []
+    for frame in poses:
+        eye, rays = pixel_rays(BALL_LENS, frame, np.stack([samples, lines], axis=-1) + 0.5)
+        along = -(rays * eye).sum(axis=-1)
+        inside = along**2 - (eye**2).sum() + RADIUS**2
+        depths.append(np.where(inside > 0.0, along - np.sqrt(np.maximum(inside, 0.0)), np.inf))
+        points.append((eye + rays * depths[-1][..., None])[inside > 0.0])
+    maps = torch.from_numpy(np.stack(depths)).float()
+    turned = torch.from_numpy(poses).float()
+    return DepthRenders(turned, BALL_LENS, (0.0,) * 4, maps, 1, torch.isfinite(maps), np.concatenate(points))
+
+
+def test_the_base_is_found_down_to_what_the_object_stands_on() -> None:
+    """A ball sunk in a dense support, whose top is the floor of the object's box."""
+    floor = -0.22
+
+    def density_fn(points: torch.Tensor) -> torch.Tensor:
+        outside = points.norm(dim=-1, keepdim=True) - RADIUS
+        return 10.0 * torch.exp(-outside / 0.003).clamp(max=40.0) + 40.0 * (points[..., 2:] < floor)
+
+    model = SimpleNamespace(field=SimpleNamespace(density_fn=density_fn), occupancy=None, device="cpu")
+    box = np.array([[-0.4, -0.4, floor], [0.4, 0.4, 0.4]])
+    mesh = surface_mesh(model, ball_from_all_sides(), box, 4096)
+    vertices = mesh.vertices[np.unique(mesh.triangles)]
+    above = vertices[:, 2] - floor
+    radii = np.linalg.norm(vertices, axis=1)
+    lowest = (above > 0.0) & (above < 0.005)
+    assert lowest.sum() > 300
+    assert np.median(radii[lowest]) == pytest.approx(RADIUS, abs=0.006)
+    assert np.quantile(abs(radii[above > 0.02] - RADIUS), 0.999) < 0.005
