@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, cKDTree
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
+from hsi_sc_nerf.analysis.base import Base, find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.settings_file import between
@@ -26,8 +25,6 @@ NEIGHBOURS = 48
 _CHUNK_POINTS = 1 << 14
 # Added to the normal equations, so that few or collinear neighbours give a plane.
 _RIDGE = 1e-6
-SPREAD_DEPTH = 6
-"""Octree depth of the meshes of half-samples, which is enough for their spread and saves two thirds of the time."""
 LITRES_PER_M3 = 1000.0
 
 
@@ -50,6 +47,22 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
     The points are thinned, the lower rim (half a smoothing radius) is removed, the rest is smoothed, and the unseen
     base is closed (`find_base`). Screened Poisson reconstruction (Kazhdan and Hoppe 2013; Open3D) gives the mesh;
     small pieces are removed.
+
+    Args:
+        points_m: the seen surface, z up.
+        normals: mostly outward; single ones may be wrong.
+        config: settings.
+
+    Raises:
+        InputError: as `surface_and_base`.
+    """
+    return closed(*surface_and_base(points_m, normals, config), config)
+
+
+def surface_and_base(
+    points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], config: MeshConfig
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Base]:
+    """The thinned and smoothed points of the seen surface, their outward unit normals, and the base that closes it.
 
     Args:
         points_m: the seen surface, z up.
@@ -85,10 +98,16 @@ def closed_mesh(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "
     if not np.einsum("pi,pi->", from_foot, facing) > 0.0:
         raise InputError("the cloud's normals do not point out of the object; flip them, or export the cloud again.")
     points, outward = smoothed(points, facing, config.smoothing_radius_m)
-    base_points, base_normals = find_base(points, outward, base_height_m).points(spacing_m)
-    return solid_pieces(
-        _poisson(np.concatenate([points, base_points]), np.concatenate([outward, base_normals]), config.octree_depth)
-    )
+    return points, outward, find_base(points, outward, base_height_m)
+
+
+def closed(
+    points_m: Float[np.ndarray, "n 3"], outward: Float[np.ndarray, "n 3"], base: Base, config: MeshConfig
+) -> Mesh:
+    """The closed surface of the seen points and a base, as `surface_and_base` gives them."""
+    base_points, base_normals = base.points(config.smoothing_radius_m / _THINNING)
+    points, normals = np.concatenate([points_m, base_points]), np.concatenate([outward, base_normals])
+    return solid_pieces(_poisson(points, normals, config.octree_depth))
 
 
 def _poisson(points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: int) -> Mesh:
@@ -248,31 +267,3 @@ def feret_diameters(outline: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
     widths = np.ptp(corners @ across.T, axis=0)
     distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
     return float(distances.max()), float(widths.min())
-
-
-def size_spread(
-    points_m: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    config: MeshConfig,
-    splits: int,
-    done: Callable[[int], None] | None = None,
-) -> Size:
-    """Standard deviation of each size, from random halves of the points (half-samples, McCarthy 1969).
-
-    The two halves of a split are meshed separately at octree depth `SPREAD_DEPTH` at most. Half of the root mean
-    square of their differences is the standard deviation for all points. (A bootstrap would underestimate it, because
-    thinning merges repeated points.) Errors that points have in common, such as those of the scale, the poses or the
-    surface's depth, are not included.
-
-    ``done`` is called with the number of finished splits, for a progress bar.
-    """
-    rng = np.random.default_rng(0)
-    config = replace(config, octree_depth=min(config.octree_depth, SPREAD_DEPTH))
-    differences = []
-    for number in range(splits):
-        halves = np.array_split(rng.permutation(len(points_m)), 2)
-        one, other = (astuple(size_of(closed_mesh(points_m[half], normals[half], config))) for half in halves)
-        differences.append(np.subtract(one, other))
-        if done is not None:
-            done(number + 1)
-    return Size(*(np.sqrt(np.mean(np.square(differences), axis=0)) / 2.0).tolist())

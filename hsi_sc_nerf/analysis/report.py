@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.closed_mesh import Size
-from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, Traits
+from hsi_sc_nerf.analysis.size_uncertainty import combined
+from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.terminal import markdown_table
 
@@ -26,6 +27,14 @@ _SIZES = {
     "smallest_diameter_m": ("smallest diameter", "mm", 1e3),
     "equivalent_diameter_m": ("diameter of the sphere of equal volume", "mm", 1e3),
 }
+_CAUSES = {
+    "points": "the scatter of the points",
+    "base": "the unseen base",
+    "detail": "detail finer than the smoothing",
+    "scale": "the scale",
+    "surface": "the place of the surface",
+}
+"""Words for the causes of `size_uncertainty`."""
 _CM2_PER_M2 = 1e4
 _LISTED_REGIONS = 20
 
@@ -40,13 +49,13 @@ class TraitTable(NamedTuple):
 
 
 def trait_content(
-    size: Size, spread: Size | None, watertight: bool, traits: Traits, settings: Mapping[str, Any]
+    size: Size, uncertainty: Mapping[str, Size], watertight: bool, traits: Traits, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """``traits.json``: everything but spectra, in metres, square metres and litres; NaN is null.
 
     Args:
         size: of the object.
-        spread: standard deviation of each size; None if it was not determined.
+        uncertainty: standard deviation of each size by its cause; empty if it was not determined.
         watertight: whether the mesh encloses a volume.
         traits: from the spectra.
         settings: of the command.
@@ -55,7 +64,8 @@ def trait_content(
     return {
         "settings": dict(settings),
         "size": asdict(size),
-        "size_sd": asdict(spread) if spread else None,
+        "size_sd": asdict(combined(uncertainty)) if uncertainty else None,
+        "size_sd_by_cause": {cause: asdict(part) for cause, part in uncertainty.items()},
         "watertight": watertight,
         "seen_area_m2": traits.seen_m2,
         "classes": None
@@ -72,6 +82,7 @@ def trait_content(
             region.name: {
                 "area_m2": region.area_m2,
                 "indices": {name: _plain(value) for name, value in region.indices.items()},
+                "light": None if region.light is None else _plain_light(region),
             }
             for region in traits.regions
         },
@@ -89,10 +100,10 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     closed_cm2 = _CM2_PER_M2 * (size["area_m2"] - seen_m2)
     note = f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
     if spread:
-        note += (
-            " ± is the standard deviation from random halves of the cloud. It does not include errors that points "
-            "have in common, such as those of scale, poses or training."
-        )
+        note += f" ± is the standard deviation by {_listed(content['size_sd_by_cause'])}."
+        missing = [words for cause, words in _CAUSES.items() if cause not in content["size_sd_by_cause"]]
+        if missing:
+            note += f" Not known, and not in it: {', '.join(missing)}."
     rows = [
         [name, _with_sd(factor * size[key], factor * spread[key]) if spread else f"{factor * size[key]:.4g}", unit]
         for key, (name, unit, factor) in _SIZES.items()
@@ -100,6 +111,9 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
     if content["classes"]:
         tables += _class_tables(content["classes"], seen_m2)
+    lights = {name: region["light"] for name, region in content["regions"].items() if region.get("light")}
+    if lights:
+        tables.append(_light_table(lights))
     regions = {name: region["indices"] for name, region in content["regions"].items()}
     names = list(regions[WHOLE])
     if names:
@@ -107,6 +121,27 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
         note = "Mean ± standard deviation over the surface, weighted by area."
         tables.append(TraitTable("Indices", note, ["region", *names], rows))
     return tables
+
+
+def _listed(causes: Iterable[str]) -> str:
+    *rest, last = (_CAUSES[cause] for cause in causes)
+    return f"{', '.join(rest)} and {last}" if rest else last
+
+
+def _light_table(lights: Mapping[str, Mapping[str, float | None]]) -> TraitTable:
+    """The light on each region, and its brightness as measured and without the light."""
+    note = (
+        "Irradiance is relative to that on the white reference; ± is its standard deviation, which the material's "
+        "brightness shares. Spectra, indices and classes are the material's; spectra.csv has those measured as well."
+    )
+    rows = []
+    for region, light in lights.items():
+        known = {name: math.nan if value is None else value for name, value in light.items()}
+        std = known["irradiance_std"]
+        irradiance = f"{known['irradiance']:.3f} ± {std:.3f}" if math.isfinite(std) else f"{known['irradiance']:.3f}"
+        both = (f"{known[name]:.3f}" for name in ("measured_reflectance", "material_reflectance"))
+        rows.append([region, irradiance, *both])
+    return TraitTable("Light", note, ["region", "irradiance", "reflectance as measured", "of the material"], rows)
 
 
 def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable]:
@@ -149,13 +184,34 @@ def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Map
 
 
 def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
-    """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface."""
-    titles = [title for region in traits.regions for title in (f"{region.name} mean", f"{region.name} SD")]
-    columns = [column for region in traits.regions for column in (region.spectrum.mean, region.spectrum.sd)]
+    """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface.
+
+    Where material and light are told apart, both the material's and those as measured.
+    """
+    titles, columns = [], []
+    for region in traits.regions:
+        kinds = {"": region.spectrum}
+        if region.light is not None:
+            kinds = {" material": region.spectrum, " measured": region.light.measured}
+        for kind, spectrum in kinds.items():
+            titles += [f"{region.name}{kind} mean", f"{region.name}{kind} SD"]
+            columns += [spectrum.mean, spectrum.sd]
     with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["wavelength_nm", *titles])
         writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
+
+
+def _plain_light(region: RegionTraits) -> dict[str, float | None]:
+    """Irradiance, its uncertainty, and the brightness (mean over bands) with and without the light."""
+    assert region.light is not None
+    values = {
+        "irradiance": region.light.irradiance.mean,
+        "irradiance_std": region.light.irradiance_std,
+        "measured_reflectance": region.light.measured.mean.mean(),
+        "material_reflectance": region.spectrum.mean.mean(),
+    }
+    return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 
 def _plain(value: MeanAndSd) -> dict[str, float | None]:

@@ -7,13 +7,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
-from hsi_sc_nerf.export.ply import write_spectral_ply
+from hsi_sc_nerf.export.cloud import INCIDENCE, LIGHT_COLUMNS, SpectralCloud
+from hsi_sc_nerf.export.ply import band_property_names, material_spectra, write_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
@@ -22,20 +22,38 @@ _CHUNK_VERTICES = 1 << 13
 
 
 @dataclass(frozen=True)
+class LitSpectra:
+    """Reflectance as measured, and the light on the vertices.
+
+    Attributes:
+        measured: relative to the white reference at its place.
+        irradiance: relative to that on the white reference, mean over bands.
+        irradiance_std: its standard deviation; NaN where it is not known.
+    """
+
+    measured: Float[np.ndarray, "v bands"]
+    irradiance: Float[np.ndarray, "v"]
+    irradiance_std: Float[np.ndarray, "v"]
+
+
+@dataclass(frozen=True)
 class SpectralMesh:
     """A closed mesh with spectra on its vertices.
 
     Attributes:
         mesh: metres, object frame.
-        spectra: reflectance; unseen vertices have that of the nearest seen points.
+        spectra: reflectance, of the material where the cloud has it; unseen vertices have that of the nearest seen
+            points.
         wavelengths_nm: band centres.
         seen: vertices with points of the cloud nearby; False on the closed base.
+        lit: reflectance as measured and the light that it was measured in, where the cloud tells the two apart.
     """
 
     mesh: Mesh
     spectra: Float[np.ndarray, "v bands"]
     wavelengths_nm: Float[np.ndarray, "bands"]
     seen: Bool[np.ndarray, "v"]
+    lit: LitSpectra | None = None
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
@@ -49,7 +67,8 @@ def with_spectra(
 ) -> SpectralMesh:
     """Give each vertex the distance-weighted mean spectrum of the `NEIGHBOURS` nearest points.
 
-    Points whose spectrum is not finite are ignored; `hsi-sc-nerf sample` writes NaN where no view sees a point.
+    Points whose spectrum is not finite are ignored; `hsi-sc-nerf sample` writes NaN where no view sees a point. A
+    cloud by `hsi-sc-nerf material` gives the material's spectra, and those measured beside them.
 
     Args:
         mesh: in the frame of the cloud.
@@ -69,31 +88,49 @@ def with_spectra(
             f"no point of the cloud is seen at {max_incidence_deg:g} degrees or less from the front; raise "
             "--max-incidence-deg."
         )
-    tree = cKDTree(cloud.points[used])
-    spectra = np.empty((len(mesh.vertices), cloud.spectra.shape[1]), np.float32)
-    seen = np.empty(len(mesh.vertices), bool)
-    count = min(NEIGHBOURS, len(used))
-    for start in range(0, len(spectra), _CHUNK_VERTICES):
-        chunk = slice(start, start + _CHUNK_VERTICES)
-        distance_m, neighbour = tree.query(mesh.vertices[chunk], np.arange(1, count + 1), workers=-1)
-        weight = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
-        weight /= weight.sum(axis=1, keepdims=True)
-        spectra[chunk] = np.einsum("vk,vkb->vb", weight, cloud.spectra[used[neighbour]])
-        seen[chunk] = distance_m[:, 0] <= seen_within_m
-    return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen)
+    neighbours, weights, seen = _neighbours(mesh.vertices, cloud.points[used], seen_within_m)
+
+    def mean(values: Float[np.ndarray, "n columns"]) -> Float[np.ndarray, "v columns"]:
+        found = np.empty((len(neighbours), values.shape[1]), np.float32)
+        for start in range(0, len(found), _CHUNK_VERTICES):
+            chunk = slice(start, start + _CHUNK_VERTICES)
+            found[chunk] = np.einsum("vk,vkb->vb", weights[chunk], values[used[neighbours[chunk]]])
+        return found
+
+    measured, material = mean(cloud.spectra), material_spectra(cloud)
+    if material is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):
+        return SpectralMesh(mesh, measured, cloud.wavelengths_nm, seen)
+    light = mean(np.stack([cloud.extra[name] for name in LIGHT_COLUMNS], axis=1))
+    return SpectralMesh(mesh, mean(material), cloud.wavelengths_nm, seen, LitSpectra(measured, *light.T))
+
+
+def _neighbours(
+    vertices: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "n 3"], seen_within_m: float
+) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"], Bool[np.ndarray, "v"]]:
+    """The nearest points of each vertex, their weights, and whether the first is within ``seen_within_m``."""
+    count = min(NEIGHBOURS, len(points))
+    distance_m, neighbours = cKDTree(points).query(vertices, np.arange(1, count + 1), workers=-1)
+    weights = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
+    return neighbours, weights / weights.sum(axis=1, keepdims=True), distance_m[:, 0] <= seen_within_m
 
 
 def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
     """Write a spectral PLY whose points are the vertices, with triangles.
 
-    Columns beside the bands: ``seen`` (1 where spectra were measured, 0 on the closed base) and those in ``extra``.
+    Columns beside the bands: ``seen`` (1 where spectra were measured, 0 on the closed base), those in ``extra``, and,
+    where they are told apart, those of material and light.
 
     Raises:
         InputError: the file cannot be written.
     """
-    mesh = surface.mesh
-    colours = to_8_bit(surface.spectra[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
+    mesh, measured = surface.mesh, surface.spectra
+    if surface.lit is not None:
+        measured = surface.lit.measured
+        names = [*band_property_names(surface.wavelengths_nm, "material"), *LIGHT_COLUMNS]
+        columns = [*surface.spectra.T, surface.lit.irradiance, surface.lit.irradiance_std]
+        extra = extra | dict(zip(names, columns, strict=True))
+    colours = to_8_bit(measured[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
     points, normals = mesh.vertices.astype(np.float32), mesh.vertex_normals().astype(np.float32)
     columns = {"seen": surface.seen.astype(np.float32), **extra}
-    cloud = SpectralCloud(points, normals, colours, surface.spectra, surface.wavelengths_nm, columns)
+    cloud = SpectralCloud(points, normals, colours, measured, surface.wavelengths_nm, columns)
     write_spectral_ply(path, cloud, mesh.triangles)

@@ -96,20 +96,37 @@ class MeanAndSd:
 
 
 @dataclass(frozen=True)
+class RegionLight:
+    """What a part of the surface reflects as measured, and the light on it.
+
+    Attributes:
+        measured: reflectance of each band relative to the white reference at its place.
+        irradiance: relative to that on the white reference.
+        irradiance_std: standard deviation of its mean; the part's points share the error. NaN where it is not known.
+    """
+
+    measured: MeanAndSd
+    irradiance: MeanAndSd
+    irradiance_std: float
+
+
+@dataclass(frozen=True)
 class RegionTraits:
     """Traits of a part of the surface: all that was seen, a class, or a region of interest.
 
     Attributes:
         name: of the part.
         area_m2: on the surface.
-        spectrum: reflectance of each band.
+        spectrum: reflectance of each band, of the material where it is told apart from the light.
         indices: spectral indices by name.
+        light: where the two are told apart.
     """
 
     name: str
     area_m2: float
     spectrum: MeanAndSd
     indices: Mapping[str, MeanAndSd]
+    light: RegionLight | None = None
 
 
 @dataclass(frozen=True)
@@ -153,6 +170,7 @@ def analyse(
                 float(surface.areas_m2[where].sum()),
                 region_spectrum(surface, where),
                 {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in indices.items()},
+                _light(surface, where),
             )
             for name, where in chosen.items()
         ],
@@ -163,6 +181,17 @@ def analyse(
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
     """Mean and standard deviation of the chosen vertices' spectra, weighted by their area."""
     return mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
+
+
+def _light(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionLight | None:
+    if surface.lit is None:
+        return None
+    areas_m2, lit = surface.areas_m2[chosen], surface.lit
+    return RegionLight(
+        mean_and_sd(lit.measured[chosen], areas_m2),
+        mean_and_sd(lit.irradiance[chosen], areas_m2),
+        float((areas_m2 @ lit.irradiance_std[chosen]) / areas_m2.sum()),
+    )
 
 
 def mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray, "n"]) -> MeanAndSd:

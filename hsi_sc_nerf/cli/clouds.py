@@ -24,6 +24,7 @@ from hsi_sc_nerf.terminal import screen_table
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.analysis.closed_mesh import Size
+    from hsi_sc_nerf.analysis.size_uncertainty import SharedErrors
     from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
     from hsi_sc_nerf.analysis.traits import Traits
 
@@ -79,17 +80,18 @@ class TraitsCommand:
     """
 
     cloud: tyro.conf.Positional[Path]
-    """Spectral point cloud (PLY, metres), as `ns-export pointcloud` writes it."""
+    """Spectral point cloud (PLY, metres), as `ns-export pointcloud` writes it. One by `hsi-sc-nerf material` gives
+    the traits of the material, and the spectra as measured beside them."""
     output_dir: Path
     """Folder to write the results to."""
     data: Path | None = None
     """The dataset that the cloud was reconstructed from. The height of its container is the default of
-    --mesh.base-height-m."""
+    --mesh.base-height-m, and the uncertainty of the sizes counts scale and pixels."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """Settings of the mesh."""
     splits: int = between(0, math.inf, default=6)
     """Number of random splits of the cloud into halves, which are meshed separately for the uncertainty of the sizes;
-    0 for none."""
+    0 for sizes without uncertainty."""
     max_incidence_deg: float = MAX_INCIDENCE_DEG
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees, because
     oblique pixels are mixed. Sizes come from all points."""
@@ -112,8 +114,9 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
-        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh, size_of, size_spread
+        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh, size_of
         from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.size_uncertainty import size_uncertainty, sizes_to_find
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
@@ -135,16 +138,19 @@ class TraitsCommand:
         console = Console(stderr=True)
         with console.status("closing the surface"):
             mesh = closed_mesh(cloud.points, cloud.normals, config)
-        size, spread = size_of(mesh), None
+        size, uncertainty = size_of(mesh), {}
         if self.splits:
-            with progress_bar("uncertainty", "splits", self.splits) as done:
-                spread = size_spread(cloud.points, cloud.normals, config, self.splits, done=done)
+            shared = self._shared_errors(config)
+            with progress_bar("uncertainty", "meshes", sizes_to_find(self.splits, shared)) as done:
+                uncertainty = size_uncertainty(
+                    cloud.points, cloud.normals, mesh, config, self.splits, shared, done=done
+                )
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
             traits = analyse(surface, picked, found)
         with console.status("tables and pictures"):
-            self._write(surface, size, spread, traits, config)
+            self._write(surface, size, uncertainty, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
 
     def _base_height_m(self) -> float | None:
@@ -156,8 +162,22 @@ class TraitsCommand:
         container = open_packed(self.data).container
         return container.height_m if container else None
 
+    def _shared_errors(self, config: MeshConfig) -> SharedErrors | None:
+        """What the points have in common, if the dataset is given."""
+        if self.data is None:
+            return None
+        from hsi_sc_nerf.analysis.size_uncertainty import shared_errors
+        from hsi_sc_nerf.packed.dataset import open_packed
+
+        return shared_errors(open_packed(self.data), base_known=config.base_height_m is not None)
+
     def _write(
-        self, surface: SpectralMesh, size: Size, spread: Size | None, traits: Traits, config: MeshConfig
+        self,
+        surface: SpectralMesh,
+        size: Size,
+        uncertainty: dict[str, Size],
+        traits: Traits,
+        config: MeshConfig,
     ) -> None:
         """Write pictures, mesh and tables, and last the page that links them."""
         from hsi_sc_nerf.analysis import pictures, report
@@ -187,6 +207,6 @@ class TraitsCommand:
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
         settings = {"cloud": self.cloud.name, **asdict(config), **options}
-        content = report.trait_content(size, spread, open_edges(surface.mesh) == 0, traits, settings)
+        content = report.trait_content(size, uncertainty, open_edges(surface.mesh) == 0, traits, settings)
         write_json(self.output_dir / "traits.json", content)
         report.write_page(self.output_dir / "traits.md", self.cloud.name, content, drawn)

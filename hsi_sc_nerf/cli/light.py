@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS
 from hsi_sc_nerf.settings_file import between, check_options
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.export.cloud import SpectralCloud
     from hsi_sc_nerf.light.of_run import RunLight
 
-COLUMNS = ("irradiance", "irradiance_std")
 UNCERTAIN = 0.05
 """Irradiance that is more uncertain than this, relative to it, is warned of."""
 
@@ -66,7 +66,7 @@ class MaterialCommand:
         require_writable(output.parent)
         file_format, stem = format_of(output), output.with_suffix("")
         cloud = read_spectral_ply(self.cloud)
-        extra = {*cloud.extra, *COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
+        extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
         run = open_run(self.load_config)
         bands = bands_of(cloud.wavelengths_nm, run.model.wavelengths_nm, self.cloud)
@@ -127,14 +127,14 @@ def with_material(cloud: SpectralCloud, found: RunLight, bands: np.ndarray, *, c
         by_band, std = found.irradiance(cloud.points.astype(float))
         material, irradiance = cloud.spectra / by_band[:, bands], by_band.mean(axis=1)
     names = band_property_names(cloud.wavelengths_nm, "material")
-    columns = dict(zip([*names, *COLUMNS], [*material.T, irradiance, std], strict=True))
+    columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True))
     extra = {name: column for name, column in cloud.extra.items() if name not in columns}
     return replace(cloud, extra=extra | {name: column.astype(np.float32) for name, column in columns.items()})
 
 
 def summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
     """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON."""
-    light, (irradiance, std) = found.light.fit.light, (cloud.extra[name] for name in COLUMNS)
+    light, (irradiance, std) = found.light.fit.light, (cloud.extra[name] for name in LIGHT_COLUMNS)
     return {
         "corrected": corrected,
         "shaded": found.evidence.shaded,

@@ -83,7 +83,7 @@ class RunCommand:
     """Process a session, train, evaluate, export the cloud, tell material and light apart, measure traits, report.
 
     Where the light on the object is uneven beyond noise, point_cloud-material.ply holds the reflectance of the
-    material beside that measured; the last lines say so. Traits and report are those of the cloud as measured.
+    material beside that measured, and so do the traits; the last lines say so.
 
     Each step is a command of its own, which is printed as it starts. A step is skipped while its inputs, its words
     and its results are unchanged. A run that was stopped goes on where it stopped, also within the training.
@@ -126,9 +126,11 @@ class RunCommand:
             raise InputError(f"{self.session}: holds no captures; give the folder of a capture session.")
         make_folder(out)
         console = Console(highlight=False, soft_wrap=True)
-        steps = self._steps()
-        for number, step in enumerate(steps, start=1):
-            title = f"[bold]{number}/{len(steps)} {step.name}[/bold]"
+        count = len(self._steps())
+        for number in range(1, count + 1):
+            # The traits are of the cloud that the material's step leaves, or not.
+            step = self._steps()[number - 1]
+            title = f"[bold]{number}/{count} {step.name}[/bold]"
             self._bring_up_to_date(step, console, title, run_step)
         _show_results(out, console)
 
@@ -136,6 +138,8 @@ class RunCommand:
         """The commands, in order."""
         out = self.output_dir
         data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
+        material = out / "point_cloud-material.ply"
+        with_material = material if material.is_file() else cloud
         run = out / "training" / "hsi-sc-nerf" / "run"
         config, weights = run / "config.yml", run / "nerfstudio_models"
         packed = data / "transforms.json"
@@ -159,12 +163,12 @@ class RunCommand:
                 "material",
                 ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(self.material)],
                 (packed, weights, cloud),
-                (out / "point_cloud-material.ply", out / MATERIAL_NAME),
+                (material, out / MATERIAL_NAME),
             ),
             (
                 "traits",
-                ["hsi-sc-nerf", "traits", cloud, "--data", data, "--output-dir", traits],
-                (cloud,),
+                ["hsi-sc-nerf", "traits", with_material, "--data", data, "--output-dir", traits],
+                (packed, with_material),
                 (traits / "traits.json",),
             ),
             (

@@ -19,6 +19,8 @@ CHUNK_POINTS = 1 << 15
 """Points of a chunk: 27 MB at 204 bands."""
 INCIDENCE = "incidence_deg"
 """Column: the angle between a point's normal and the ray that gave its spectrum."""
+LIGHT_COLUMNS = ("irradiance", "irradiance_std")
+"""Columns of the light on a point, which `hsi-sc-nerf material` adds."""
 MAX_INCIDENCE_DEG = 70.0
 """At larger angles of incidence a pixel also covers what lies beside the surface (docs/how-to/traits.md)."""
 OUTLIER_NEIGHBOURS = 20

@@ -98,6 +98,14 @@ def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"], kind: str = 
     raise ValueError("two bands have the same wavelength")
 
 
+def material_spectra(cloud: SpectralCloud) -> Float[np.ndarray, "n bands"] | None:
+    """Reflectance of the material, from the columns that `hsi-sc-nerf material` adds; None without all of them."""
+    names = band_property_names(cloud.wavelengths_nm, "material")
+    if not set(names) <= set(cloud.extra):
+        return None
+    return np.stack([cloud.extra[name] for name in names], axis=1)
+
+
 def read_spectral_ply(path: Path | str) -> SpectralCloud:
     """Read a cloud that `write_spectral_ply` wrote, its properties in any order (CloudCompare reorders them).
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from standing_sphere import RADIUS_M, STAND_M, sphere_points
 
 from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.analysis.closed_mesh import (
@@ -10,7 +11,6 @@ from hsi_sc_nerf.analysis.closed_mesh import (
     feret_diameters,
     open_edges,
     size_of,
-    size_spread,
     smoothed,
     solid_pieces,
     thinned,
@@ -19,20 +19,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder
 
-RADIUS_M = 0.03
-STAND_M = 0.07
 SPECK = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 """A tetrahedron."""
-
-
-def sphere_points(count, seed=0, noise_m=0.0, above=-1.0):
-    """Even on a sphere that stands at z = 0.07; its lower part, below a share of the radius, is not seen."""
-    rng = np.random.default_rng(seed)
-    normals = rng.standard_normal((count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals[normals[:, 2] > above]
-    points = RADIUS_M * normals + [0.0, 0.0, STAND_M + RADIUS_M]
-    return points + noise_m * rng.standard_normal(points.shape), normals
 
 
 def test_thinning_leaves_one_mean_a_cell():
@@ -168,18 +156,6 @@ def test_feret_diameters_of_a_turned_rectangle():
     largest, smallest = feret_diameters(corners @ turn.T)
     assert largest == pytest.approx(0.05)
     assert smallest == pytest.approx(0.03)
-
-
-@pytest.mark.slow
-def test_spread_from_halves_is_that_of_independent_clouds():
-    config = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
-    clouds = [sphere_points(3000, seed, 0.0005, above=-0.93) for seed in range(11)]
-    volumes = [size_of(closed_mesh(*cloud, config)).volume_l for cloud in clouds[1:]]
-    told = []
-    spread = size_spread(*clouds[0], config, splits=5, done=told.append)
-    assert told == list(range(1, 6))
-    # The ratio of a spread from five differences to one of ten clouds is 0.4 to 1.9 nineteen times in twenty.
-    assert 0.35 < spread.volume_l / np.std(volumes, ddof=1) < 2.2
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
     content = {
         "size": dict.fromkeys(SIZES, height_m),
         "size_sd": None if sd_m is None else dict.fromkeys(SIZES, sd_m),
+        "size_sd_by_cause": {} if sd_m is None else {"base": dict.fromkeys(SIZES, sd_m)},
         "seen_area_m2": 0.01,
         "watertight": True,
         "classes": None,
@@ -28,3 +29,21 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
     }
     (sizes,) = trait_tables(content)
     assert ["height", shown, "mm"] in sizes.rows
+    assert ("the unseen base" in sizes.note) == (sd_m is not None)
+    assert ("the scale" in sizes.note) == (sd_m is not None)
+
+
+@pytest.mark.parametrize(("std", "shown"), [(0.021, "0.530 ± 0.021"), (None, "0.530")])
+def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
+    light = {"irradiance": 0.53, "irradiance_std": std, "measured_reflectance": 0.2, "material_reflectance": 0.377}
+    content = {
+        "size": dict.fromkeys(SIZES, 0.07),
+        "size_sd": None,
+        "size_sd_by_cause": {},
+        "seen_area_m2": 0.01,
+        "watertight": True,
+        "classes": None,
+        "regions": {WHOLE: {"indices": {}, "light": light}, "spot": {"indices": {}, "light": light}},
+    }
+    _, lights = trait_tables(content)
+    assert lights.rows == [[WHOLE, shown, "0.200", "0.377"], ["spot", shown, "0.200", "0.377"]]

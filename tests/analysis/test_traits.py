@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis import report
 from hsi_sc_nerf.analysis.classes import (
     UNCLASSIFIED,
     classify,
@@ -23,7 +24,7 @@ from hsi_sc_nerf.analysis.traits import (
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.ply import band_property_names, material_spectra, read_spectral_ply
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
@@ -131,6 +132,39 @@ def test_vertices_take_the_spectra_of_points_near_them():
     assert not found.seen[surface.mesh.vertices[:, 2] < 0.003].any()
     inside = chosen & (np.abs(surface.mesh.vertices[:, 1]) > 0.005) & (surface.mesh.vertices[:, 2] < 0.039)
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
+
+
+def shaded_cloud(surface):
+    """A cloud whose lower half is lit by half, with the columns of `hsi-sc-nerf material`."""
+    points = surface.mesh.vertices
+    irradiance = np.where(points[:, 2] < 0.02, 0.5, 1.0).astype(np.float32)
+    extra = dict(zip(band_property_names(NM, "material"), surface.spectra.T, strict=True))
+    extra |= {"irradiance": irradiance, "irradiance_std": np.full(len(points), 0.03, np.float32)}
+    colours = np.zeros((len(points), 3), np.uint8)
+    return SpectralCloud(points, points, colours, surface.spectra * irradiance[:, None], NM, extra)
+
+
+def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
+    surface = two_halves()
+    found = with_spectra(surface.mesh, shaded_cloud(surface), seen_within_m=0.001)
+    inside = (np.abs(surface.mesh.vertices[:, 1]) > 0.005) & (np.abs(surface.mesh.vertices[:, 2] - 0.02) > 0.003)
+    np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-4)
+    spots = [RegionOfInterest(name, (0.0, 0.02, z_m), 0.004) for name, z_m in (("low", 0.01), ("high", 0.03))]
+    _, low, high = analyse(found, spots).regions
+    np.testing.assert_allclose(low.spectrum.mean, GREEN, rtol=1e-3)
+    np.testing.assert_allclose(low.light.measured.mean, GREEN / 2, rtol=1e-3)
+    np.testing.assert_allclose(high.light.measured.mean, GREEN, rtol=1e-3)
+    assert low.light.irradiance.mean == pytest.approx(0.5, abs=1e-3)
+    # What the region's points share does not shrink with their number.
+    assert low.light.irradiance_std == pytest.approx(0.03)
+    assert low.indices.keys() == high.indices.keys()
+    write_mesh(tmp_path / "mesh.ply", found, {})
+    read = read_spectral_ply(tmp_path / "mesh.ply")
+    np.testing.assert_allclose(read.spectra, found.lit.measured)
+    np.testing.assert_allclose(material_spectra(read), found.spectra)
+    report.write_spectra(tmp_path / "spectra.csv", NM, analyse(found, spots))
+    titles = (tmp_path / "spectra.csv").read_text().splitlines()[0].split(",")
+    assert titles[5:9] == ["low material mean", "low material SD", "low measured mean", "low measured SD"]
 
 
 @pytest.mark.parametrize(("spectrum", "incidence_deg"), [(9.0, 71.0), (np.nan, 0.0)])
