@@ -82,7 +82,7 @@ def trait_content(
             region.name: {
                 "area_m2": region.area_m2,
                 "indices": {name: _plain(value) for name, value in region.indices.items()},
-                "light": None if region.light is None else _plain_light(region),
+                "reflectance": _plain_reflectance(region),
             }
             for region in traits.regions
         },
@@ -111,9 +111,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
     if content["classes"]:
         tables += _class_tables(content["classes"], seen_m2)
-    lights = {name: region["light"] for name, region in content["regions"].items() if region.get("light")}
-    if lights:
-        tables.append(_light_table(lights))
+    tables.append(_reflectance_table({name: region["reflectance"] for name, region in content["regions"].items()}))
     regions = {name: region["indices"] for name, region in content["regions"].items()}
     names = list(regions[WHOLE])
     if names:
@@ -128,20 +126,31 @@ def _listed(causes: Iterable[str]) -> str:
     return f"{', '.join(rest)} and {last}" if rest else last
 
 
-def _light_table(lights: Mapping[str, Mapping[str, float | None]]) -> TraitTable:
-    """The light on each region, and its brightness as measured and without the light."""
-    note = (
-        "Irradiance is relative to that on the white reference; ± is its standard deviation, which the material's "
-        "brightness shares. Spectra, indices and classes are the material's; spectra.csv has those measured as well."
-    )
+def _reflectance_table(regions: Mapping[str, Mapping[str, float | None]]) -> TraitTable:
+    """Brightness of each region with its uncertainty, and the light on it where it is known."""
+    header = ["region", "reflectance"]
+    note = "Mean over the bands; ± is its standard deviation"
+    told = all(value["std"] is not None for value in regions.values())
+    note += "." if told else ", which is left out where the dataset (--data) or the number of views is not known."
+    lit = "irradiance" in regions[WHOLE]
+    if lit:
+        header += ["as measured", "irradiance"]
+        note += (
+            " The reflectance is the material's, and so are spectra, indices and classes; spectra.csv has the "
+            "measured spectra as well. Irradiance is relative to that on the white reference."
+        )
     rows = []
-    for region, light in lights.items():
-        known = {name: math.nan if value is None else value for name, value in light.items()}
-        std = known["irradiance_std"]
-        irradiance = f"{known['irradiance']:.3f} ± {std:.3f}" if math.isfinite(std) else f"{known['irradiance']:.3f}"
-        both = (f"{known[name]:.3f}" for name in ("measured_reflectance", "material_reflectance"))
-        rows.append([region, irradiance, *both])
-    return TraitTable("Light", note, ["region", "irradiance", "reflectance as measured", "of the material"], rows)
+    for name, value in regions.items():
+        row = [name, _with_std(value["mean"], value["std"])]
+        if lit:
+            row += [f"{value['measured']:.3f}", _with_std(value["irradiance"], value["irradiance_std"])]
+        rows.append(row)
+    return TraitTable("Reflectance", note, header, rows)
+
+
+def _with_std(value: float | None, std: float | None) -> str:
+    shown = f"{math.nan if value is None else value:.3f}"
+    return shown if std is None else f"{shown} ± {std:.3f}"
 
 
 def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable]:
@@ -202,15 +211,12 @@ def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits
         writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
 
 
-def _plain_light(region: RegionTraits) -> dict[str, float | None]:
-    """Irradiance, its uncertainty, and the brightness (mean over bands) with and without the light."""
-    assert region.light is not None
-    values = {
-        "irradiance": region.light.irradiance.mean,
-        "irradiance_std": region.light.irradiance_std,
-        "measured_reflectance": region.light.measured.mean.mean(),
-        "material_reflectance": region.spectrum.mean.mean(),
-    }
+def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
+    """Mean over the bands and its uncertainty; where light is told apart, the same as measured, and the light."""
+    values = {"mean": region.spectrum.mean.mean(), "std": region.reflectance_std}
+    if (light := region.light) is not None:
+        values |= {"measured": light.measured.mean.mean(), "irradiance": light.irradiance.mean}
+        values["irradiance_std"] = light.irradiance_std
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 

@@ -122,14 +122,19 @@ def shared_errors(dataset: PackedDataset, *, base_known: bool) -> SharedErrors:
         dataset: its ``poses.json`` gives the uncertainty of the scale; without it the scale is taken for exact.
         base_known: whether the height that the object stands on is known.
     """
-    centre_m = dataset.object_box_m.mean(axis=0)
-    eyes_m = np.stack([frame.camera_to_world[:3, 3] for frame in dataset.frames])
-    pixel_m = float(np.linalg.norm(eyes_m - centre_m, axis=1).mean()) / dataset.intrinsics.fl_x
+    pixel_m = pixel_on_object_m(dataset)
     return SharedErrors(
         scale=_scale_uncertainty(dataset.root / "poses.json"),
         surface_m=SURFACE_PX * pixel_m,
         base_m=0.0 if base_known else UNKNOWN_BASE_PX * pixel_m,
     )
+
+
+def pixel_on_object_m(dataset: PackedDataset) -> float:
+    """Side of a pixel in the middle of the object, as the mean of all frames."""
+    centre_m = dataset.object_box_m.mean(axis=0)
+    eyes_m = np.stack([frame.camera_to_world[:3, 3] for frame in dataset.frames])
+    return float(np.linalg.norm(eyes_m - centre_m, axis=1).mean()) / dataset.intrinsics.fl_x
 
 
 def offset(mesh: Mesh, distance_m: float) -> Mesh:

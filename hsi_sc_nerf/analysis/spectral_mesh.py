@@ -47,6 +47,8 @@ class SpectralMesh:
         wavelengths_nm: band centres.
         seen: vertices with points of the cloud nearby; False on the closed base.
         lit: reflectance as measured and the light that it was measured in, where the cloud tells the two apart.
+        scatter: standard deviation of a vertex's measured reflectance, mean over bands, by how much frames disagree;
+            NaN where fewer than two frames see it. None if the cloud does not tell.
     """
 
     mesh: Mesh
@@ -54,6 +56,7 @@ class SpectralMesh:
     wavelengths_nm: Float[np.ndarray, "bands"]
     seen: Bool[np.ndarray, "v"]
     lit: LitSpectra | None = None
+    scatter: Float[np.ndarray, "v"] | None = None
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
@@ -97,11 +100,15 @@ def with_spectra(
             found[chunk] = np.einsum("vk,vkb->vb", weights[chunk], values[used[neighbours[chunk]]])
         return found
 
-    measured, material = mean(cloud.spectra), material_spectra(cloud)
-    if material is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):
-        return SpectralMesh(mesh, measured, cloud.wavelengths_nm, seen)
-    light = mean(np.stack([cloud.extra[name] for name in LIGHT_COLUMNS], axis=1))
-    return SpectralMesh(mesh, mean(material), cloud.wavelengths_nm, seen, LitSpectra(measured, *light.T))
+    spectra, material, lit, scatter = mean(cloud.spectra), material_spectra(cloud), None, None
+    if material is not None and set(LIGHT_COLUMNS) <= set(cloud.extra):
+        light = mean(np.stack([cloud.extra[name] for name in LIGHT_COLUMNS], axis=1))
+        spectra, lit = mean(material), LitSpectra(spectra, *light.T)
+    if {"views", "spectral_std"} <= set(cloud.extra):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_points = cloud.extra["spectral_std"] / np.sqrt(cloud.extra["views"])
+        scatter = mean(of_points[:, None])[:, 0]
+    return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen, lit, scatter)
 
 
 def _neighbours(

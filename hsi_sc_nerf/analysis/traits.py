@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra import available_indices, index_values
 
 WHOLE = "whole surface"
+CORRELATED = 1.5
+"""Errors of neighbouring pixels and views are alike: a mean scatters by so much more than that of as many independent
+ones (docs/validation/traits.md)."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ class RegionTraits:
         area_m2: on the surface.
         spectrum: reflectance of each band, of the material where it is told apart from the light.
         indices: spectral indices by name.
+        reflectance_std: standard deviation of the spectrum's mean over the bands; NaN where it is not known.
         light: where the two are told apart.
     """
 
@@ -126,6 +131,7 @@ class RegionTraits:
     area_m2: float
     spectrum: MeanAndSd
     indices: Mapping[str, MeanAndSd]
+    reflectance_std: float = math.nan
     light: RegionLight | None = None
 
 
@@ -143,9 +149,18 @@ class Traits:
 
 
 def analyse(
-    surface: SpectralMesh, regions: Sequence[RegionOfInterest] = (), classes: Classes | None = None
+    surface: SpectralMesh,
+    regions: Sequence[RegionOfInterest] = (),
+    classes: Classes | None = None,
+    pixel_m: float | None = None,
 ) -> Traits:
     """Spectra and indices of the whole seen surface, its classes and the regions of interest.
+
+    Args:
+        surface: the mesh with its spectra.
+        regions: of interest.
+        classes: of its vertices.
+        pixel_m: side of a pixel on the object; None if it is not known, and with it how far means scatter.
 
     Raises:
         InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
@@ -170,6 +185,7 @@ def analyse(
                 float(surface.areas_m2[where].sum()),
                 region_spectrum(surface, where),
                 {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in indices.items()},
+                _reflectance_std(surface, where, pixel_m),
                 _light(surface, where),
             )
             for name, where in chosen.items()
@@ -181,6 +197,23 @@ def analyse(
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
     """Mean and standard deviation of the chosen vertices' spectra, weighted by their area."""
     return mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
+
+
+def _reflectance_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None) -> float:
+    """By how much frames disagree over the region's pixels, and by what is known of its light."""
+    if surface.scatter is None or pixel_m is None:
+        return math.nan
+    areas_m2, scatter = surface.areas_m2[chosen], surface.scatter[chosen]
+    known = np.isfinite(scatter)
+    if not known.any():
+        return math.nan
+    pixels = max(1.0, areas_m2.sum() / pixel_m**2)
+    variance = (CORRELATED * (areas_m2[known] @ scatter[known]) / areas_m2[known].sum()) ** 2 / pixels
+    if (light := _light(surface, chosen)) is not None:
+        spectrum = region_spectrum(surface, chosen).mean.mean()
+        variance = variance / light.irradiance.mean**2
+        variance += (spectrum * light.irradiance_std / light.irradiance.mean) ** 2
+    return float(np.sqrt(variance))
 
 
 def _light(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionLight | None:

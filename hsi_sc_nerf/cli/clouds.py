@@ -148,7 +148,7 @@ class TraitsCommand:
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
-            traits = analyse(surface, picked, found)
+            traits = analyse(surface, picked, found, self._pixel_m())
         with console.status("tables and pictures"):
             self._write(surface, size, uncertainty, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
@@ -161,6 +161,15 @@ class TraitsCommand:
 
         container = open_packed(self.data).container
         return container.height_m if container else None
+
+    def _pixel_m(self) -> float | None:
+        """Side of a pixel on the object, if the dataset is given."""
+        if self.data is None:
+            return None
+        from hsi_sc_nerf.analysis.size_uncertainty import pixel_on_object_m
+        from hsi_sc_nerf.packed.dataset import open_packed
+
+        return pixel_on_object_m(open_packed(self.data))
 
     def _shared_errors(self, config: MeshConfig) -> SharedErrors | None:
         """What the points have in common, if the dataset is given."""

@@ -25,9 +25,9 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
         "seen_area_m2": 0.01,
         "watertight": True,
         "classes": None,
-        "regions": {WHOLE: {"indices": {}}},
+        "regions": {WHOLE: {"indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
     }
-    (sizes,) = trait_tables(content)
+    sizes, _ = trait_tables(content)
     assert ["height", shown, "mm"] in sizes.rows
     assert ("the unseen base" in sizes.note) == (sd_m is not None)
     assert ("the scale" in sizes.note) == (sd_m is not None)
@@ -35,7 +35,7 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
 
 @pytest.mark.parametrize(("std", "shown"), [(0.021, "0.530 ± 0.021"), (None, "0.530")])
 def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
-    light = {"irradiance": 0.53, "irradiance_std": std, "measured_reflectance": 0.2, "material_reflectance": 0.377}
+    of_spot = {"mean": 0.377, "std": 0.004, "measured": 0.2, "irradiance": 0.53, "irradiance_std": std}
     content = {
         "size": dict.fromkeys(SIZES, 0.07),
         "size_sd": None,
@@ -43,7 +43,7 @@ def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
         "seen_area_m2": 0.01,
         "watertight": True,
         "classes": None,
-        "regions": {WHOLE: {"indices": {}, "light": light}, "spot": {"indices": {}, "light": light}},
+        "regions": {name: {"indices": {}, "reflectance": of_spot} for name in (WHOLE, "spot")},
     }
-    _, lights = trait_tables(content)
-    assert lights.rows == [[WHOLE, shown, "0.200", "0.377"], ["spot", shown, "0.200", "0.377"]]
+    _, brightness = trait_tables(content)
+    assert brightness.rows == [[name, "0.377 ± 0.004", "0.200", shown] for name in (WHOLE, "spot")]

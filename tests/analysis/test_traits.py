@@ -14,8 +14,9 @@ from hsi_sc_nerf.analysis.classes import (
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra, write_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_mesh
 from hsi_sc_nerf.analysis.traits import (
+    CORRELATED,
     WHOLE,
     RegionOfInterest,
     analyse,
@@ -132,6 +133,21 @@ def test_vertices_take_the_spectra_of_points_near_them():
     assert not found.seen[surface.mesh.vertices[:, 2] < 0.003].any()
     inside = chosen & (np.abs(surface.mesh.vertices[:, 1]) > 0.005) & (surface.mesh.vertices[:, 2] < 0.039)
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
+
+
+def test_the_mean_of_a_region_scatters_as_its_pixels_and_shares_its_light():
+    surface = replace(two_halves(), scatter=np.full(len(two_halves().seen), 0.02))
+    spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
+    (_, alone), (_, finer) = (analyse(surface, [spot], pixel_m=pixel_m).regions for pixel_m in (0.002, 0.001))
+    pixels = alone.area_m2 / 0.002**2
+    assert alone.reflectance_std == pytest.approx(CORRELATED * 0.02 / np.sqrt(pixels), rel=1e-3)
+    assert finer.reflectance_std == pytest.approx(alone.reflectance_std / 2, rel=1e-3)
+    assert np.isnan(analyse(surface, [spot]).regions[1].reflectance_std)
+    light = (np.full(len(surface.seen), value) for value in (0.5, 0.05))
+    lit = replace(surface, lit=LitSpectra(surface.spectra / 2, *light))
+    shared = 0.1 * alone.spectrum.mean.mean()
+    expected = np.hypot(alone.reflectance_std / 0.5, shared)
+    assert analyse(lit, [spot], pixel_m=0.002).regions[1].reflectance_std == pytest.approx(expected, rel=1e-3)
 
 
 def shaded_cloud(surface):

@@ -46,9 +46,14 @@ COMPARISON = {
 }
 TRAITS = trait_content(
     Size(0.0229, 0.25, 0.09, 0.07, 0.068, 0.078),
-    Size(0.0001, 0.002, 0.0001, 0.0001, 0.0001, 0.0001),
+    {"scale": Size(0.0001, 0.002, 0.0001, 0.0001, 0.0001, 0.0001)},
     True,
-    Traits([RegionTraits(name, 0.02, None, {HOSTILE: MeanAndSd(0.5, np.nan)}) for name in (WHOLE, HOSTILE)]),
+    Traits(
+        [
+            RegionTraits(name, 0.02, MeanAndSd(np.full(3, 0.4), np.zeros(3)), {HOSTILE: MeanAndSd(0.5, np.nan)})
+            for name in (WHOLE, HOSTILE)
+        ]
+    ),
     {},
 )
 
