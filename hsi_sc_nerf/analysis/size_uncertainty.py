@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 
 VARIED_DEPTH = 6
 """Octree depth of the meshes that are compared, which is enough for differences and saves two thirds of the time."""
-SURFACE_PX = 0.1
-"""Standard deviation of where training puts the surface, in pixels on the object (docs/validation/traits.md)."""
+SURFACE_PX = 0.07
+"""Standard deviation of where training puts the surface, in pixels on the object (docs/validation/surface.md)."""
 UNKNOWN_BASE_PX = 1.0
 """The same of the base, where its height is that of the cloud's edge: masks end within a pixel of the base."""
 FOOT = 0.5
@@ -86,9 +86,9 @@ def size_uncertainty(
     if splits:
         rng = np.random.default_rng(0)
         halves = (np.array_split(rng.permutation(len(points_m)), 2) for _ in range(splits))
-        sizes = [[size(closed_mesh(points_m[half], normals[half], config)) for half in pair] for pair in halves]
+        sizes = np.array([[size(closed_mesh(points_m[h], normals[h], config)) for h in pair] for pair in halves])
         # Half the difference of halves scatters as the whole. A bootstrap would scatter less: thinning merges points.
-        parts["points"] = np.sqrt(np.mean(np.square(np.subtract(*np.moveaxis(sizes, 1, 0))), axis=0)) / 2.0
+        parts["points"] = np.sqrt(np.mean(np.square(sizes[:, 0] - sizes[:, 1]), axis=0)) / 2.0
     surface = surface_and_base(points_m, normals, config)
     usual = size(closed(*surface, config))
     straight = replace(surface[2], foot_radius_m=surface[2].edge_radius_m)
@@ -110,7 +110,7 @@ def sizes_to_find(splits: int, shared: SharedErrors | None) -> int:
     return 2 * splits + 3 + (0 if shared is None else 1 + (shared.base_m > 0.0))
 
 
-def combined(parts: dict[str, Size]) -> Size:
+def combined(parts: Mapping[str, Size]) -> Size:
     """Standard deviation of each size by all causes together."""
     return Size(*np.sqrt(np.square([astuple(size) for size in parts.values()]).sum(axis=0)).tolist())
 

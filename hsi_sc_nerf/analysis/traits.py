@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.classes import (
     UNCLASSIFIED,
@@ -23,9 +24,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra import available_indices, index_values
 
 WHOLE = "whole surface"
-CORRELATED = 1.5
-"""Errors of neighbouring pixels and views are alike: a mean scatters by so much more than that of as many independent
-ones (docs/validation/traits.md)."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +198,7 @@ def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> Mea
 
 
 def _reflectance_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None) -> float:
-    """By how much frames disagree over the region's pixels, and by what is known of its light."""
+    """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
     if surface.scatter is None or pixel_m is None:
         return math.nan
     areas_m2, scatter = surface.areas_m2[chosen], surface.scatter[chosen]
@@ -208,12 +206,24 @@ def _reflectance_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel
     if not known.any():
         return math.nan
     pixels = max(1.0, areas_m2.sum() / pixel_m**2)
-    variance = (CORRELATED * (areas_m2[known] @ scatter[known]) / areas_m2[known].sum()) ** 2 / pixels
+    variance = (areas_m2[known] @ scatter[known] / areas_m2[known].sum()) ** 2 / pixels
+    variance += _mixed(surface, chosen, pixel_m) ** 2
     if (light := _light(surface, chosen)) is not None:
         spectrum = region_spectrum(surface, chosen).mean.mean()
         variance = variance / light.irradiance.mean**2
         variance += (spectrum * light.irradiance_std / light.irradiance.mean) ** 2
     return float(np.sqrt(variance))
+
+
+def _mixed(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float) -> float:
+    """Change of a region's mean reflectance by one more blur over a pixel: what pixels mixed, they mix again."""
+    brightness, areas_m2 = surface.spectra.mean(axis=1), surface.areas_m2
+    at, neighbours = (surface.mesh.vertices[where] for where in (chosen, surface.seen))
+    pairs = cKDTree(at).sparse_distance_matrix(cKDTree(neighbours), pixel_m, output_type="coo_matrix")
+    weight = areas_m2[surface.seen][pairs.col]
+    total = np.bincount(pairs.row, weight, minlength=len(at))
+    blurred = np.bincount(pairs.row, weight * brightness[surface.seen][pairs.col], minlength=len(at)) / total
+    return float(areas_m2[chosen] @ (blurred - brightness[chosen]) / areas_m2[chosen].sum())
 
 
 def _light(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionLight | None:

@@ -38,6 +38,7 @@ def test_scatter_from_halves_is_that_of_independent_clouds():
     assert 0.35 < parts["points"].volume_l / np.std(volumes, ddof=1) < 2.2
 
 
+@pytest.mark.slow
 def test_what_points_share_changes_a_sphere_as_calculus_says():
     shared = SharedErrors(scale=0.01, surface_m=0.0003, base_m=0.001)
     told = []
@@ -54,6 +55,7 @@ def test_what_points_share_changes_a_sphere_as_calculus_says():
     assert parts["base"].height_m == pytest.approx(0.001, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_more_of_the_base_is_unseen_the_less_is_known():
     seen, unseen = (uncertainty(sphere_points(6000, above=above))["base"] for above in (-0.97, -0.8))
     assert seen.volume_l < 0.3 * unseen.volume_l
@@ -61,6 +63,7 @@ def test_the_more_of_the_base_is_unseen_the_less_is_known():
     assert unseen.volume_l < 1000 * np.pi * (0.6 * RADIUS_M) ** 2 * 0.2 * RADIUS_M
 
 
+@pytest.mark.slow
 def test_detail_that_smoothing_changes_is_uncertain():
     points, normals = sphere_points(40_000, above=-0.93)
     ripples = 0.0005 * np.sin(2 * np.pi * points[:, 2] / 0.006)

@@ -16,7 +16,6 @@ from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_mesh
 from hsi_sc_nerf.analysis.traits import (
-    CORRELATED,
     WHOLE,
     RegionOfInterest,
     analyse,
@@ -135,12 +134,23 @@ def test_vertices_take_the_spectra_of_points_near_them():
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
 
 
+def test_a_region_at_the_edge_of_two_materials_is_uncertain_by_what_pixels_mix():
+    surface = replace(two_halves(), scatter=np.zeros(len(two_halves().seen)))
+    spots = [
+        RegionOfInterest(name, (x_m, y_m, 0.02), 0.003)
+        for name, x_m, y_m in (("in", 0.0, 0.02), ("edge", 0.0198, 0.003))
+    ]
+    _, inside, edge = analyse(surface, spots, pixel_m=0.002).regions
+    assert inside.reflectance_std == pytest.approx(0.0, abs=1e-6)
+    assert edge.reflectance_std > 0.02 * abs(GREEN.mean() - BROWN.mean())
+
+
 def test_the_mean_of_a_region_scatters_as_its_pixels_and_shares_its_light():
     surface = replace(two_halves(), scatter=np.full(len(two_halves().seen), 0.02))
     spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
     (_, alone), (_, finer) = (analyse(surface, [spot], pixel_m=pixel_m).regions for pixel_m in (0.002, 0.001))
     pixels = alone.area_m2 / 0.002**2
-    assert alone.reflectance_std == pytest.approx(CORRELATED * 0.02 / np.sqrt(pixels), rel=1e-3)
+    assert alone.reflectance_std == pytest.approx(0.02 / np.sqrt(pixels), rel=1e-3)
     assert finer.reflectance_std == pytest.approx(alone.reflectance_std / 2, rel=1e-3)
     assert np.isnan(analyse(surface, [spot]).regions[1].reflectance_std)
     light = (np.full(len(surface.seen), value) for value in (0.5, 0.05))

@@ -1,0 +1,138 @@
+"""How often the truth lies within the stated uncertainty of sizes and of spots' brightness, over simulated sessions.
+
+    uv run python benchmarks/trait_uncertainty.py OUTPUT_DIR
+
+Each session is simulated, processed, trained and exported by the commands that a user would type; what is there is
+not done again. Sessions have even light, photon and read noise. The object stands where the container ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+from results_table import RESULTS, write_results
+
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, size_of
+from hsi_sc_nerf.analysis.size_uncertainty import combined, pixel_on_object_m, shared_errors, size_uncertainty
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
+from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse
+from hsi_sc_nerf.benchmark.steps import run_step, typed_command
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
+from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.simulate.true_surface import TrueSurface
+from hsi_sc_nerf.simulate.truth import load_truth
+
+TRAITS = {"area_m2": "area", "volume_l": "volume", "height_m": "height", "largest_diameter_m": "largest diameter"}
+SPOTS, SPOT = 12, "brightness of spots of 10 mm"
+SPOT_RADIUS_M = 0.005
+EVERY_KTH_CAMERA = 5
+COARSE = "maize"
+"""Its kernels are finer than the pixels, so that its area is not measured: rows are also given without it."""
+COLUMNS = ("trait", "sessions", "within 1 std, %", "within 2 std, %", "median error, %", "median stated std, %")
+
+
+@dataclass(frozen=True)
+class TraitUncertainty:
+    """Options of the benchmark."""
+
+    output_dir: tyro.conf.Positional[Path]
+    """Folder of the sessions and their results."""
+    scenes: tuple[str, ...] = ("pear", "apple", "tomato", "maize", "pepper")
+    """Scenes of `hsi-sc-nerf simulate`."""
+    seeds: tuple[int, ...] = (11, 12, 13, 14)
+    """Each gives another object of its kind, and other noise."""
+    frames: int = 30
+    """Frames of a session."""
+    size: int = 128
+    """Width and height of the images, pixels."""
+    iterations: int = 700
+    """Training steps, of 1024 rays."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
+
+    def main(self) -> None:
+        """Measure all sessions, print the table, write it."""
+        found: dict[str, list[tuple[str, float, float]]] = {}
+        for seed in self.seeds:
+            for scene in self.scenes:
+                folder = self.output_dir / f"{scene}-{seed}"
+                self._reconstruct(folder, scene, seed)
+                for trait, error, std in measured(folder):
+                    print(f"{folder.name}: {trait}: error {100 * error:+.2f} %, stated {100 * std:.2f} %")
+                    found.setdefault(trait, []).append((scene, error, std))
+        rows = [_row(trait, values) for trait, values in found.items()]
+        without = {trait: [value for value in values if value[0] != COARSE] for trait, values in found.items()}
+        rows += [_row(f"{trait}, without {COARSE}", values) for trait, values in without.items()]
+        seeds = " ".join(map(str, self.seeds))
+        write_results("trait_uncertainty", COLUMNS, rows, seed=seeds, folder=self.results)
+
+    def _reconstruct(self, folder: Path, scene: str, seed: int) -> None:
+        session, data, run = folder / "session", folder / "data", folder / "run" / "hsi-sc-nerf" / "run"
+        if (folder / "export" / "point_cloud.ply").is_file():
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        simulating = ["hsi-sc-nerf", "simulate", scene, session, "--seed", seed, "--size", self.size]
+        simulating += ["--frames", self.frames, "--effects", "photon_noise", "read_noise"]
+        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "run"]
+        training += ["--timestamp", "run", "--max-num-iterations", self.iterations, "--vis", "tensorboard"]
+        training += ["--evaluate-stages", "False", "--steps-per-eval-batch", 1_000_000]
+        training += ["--steps-per-eval-image", 1_000_000, "--pipeline.datamanager.train-num-rays-per-batch", 1024]
+        exporting = [
+            "ns-export",
+            "pointcloud",
+            "--load-config",
+            run / "config.yml",
+            "--output-dir",
+            folder / "export",
+        ]
+        steps: list[Sequence[object]] = [
+            simulating,
+            ["hsi-sc-nerf", "process", session, "--output-dir", data],
+            training,
+            [*exporting, "--num-points", 60_000],
+        ]
+        for words in steps:
+            name = str(words[0] if words[0] != "hsi-sc-nerf" else words[1])
+            run_step(name, typed_command(words), folder / f"{name}.log")
+
+
+def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
+    """Trait, relative error and relative stated standard deviation of a session's sizes and spots."""
+    truth, dataset = load_truth(folder / "session"), open_packed(folder / "data")
+    true, cloud = TrueSurface.of(truth), read_spectral_ply(folder / "export" / "point_cloud.ply")
+    config = replace(MeshConfig(), base_height_m=float(true.mesh.vertices[:, 2].min()))
+    mesh = closed_mesh(cloud.points, cloud.normals, config)
+    shared = shared_errors(dataset, base_known=True)
+    std = combined(size_uncertainty(cloud.points, cloud.normals, mesh, config, splits=3, shared=shared))
+    size, exact = size_of(mesh), size_of(true.mesh)
+    for name, trait in TRAITS.items():
+        one = getattr(exact, name)
+        yield trait, getattr(size, name) / one - 1.0, getattr(std, name) / one
+    surface = with_spectra(mesh, cloud, config.smoothing_radius_m, MAX_INCIDENCE_DEG)
+    eyes_m = truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3]
+    seen = true.seen(true.mesh.vertices, eyes_m)
+    ideal = SpectralMesh(true.mesh, true.reflectance(np.ones(len(seen), bool)), true.wavelengths_nm, seen)
+    above_m = true.mesh.vertices[:, 2] - config.base_height_m
+    weights = np.where(seen & (above_m > 2.0 * SPOT_RADIUS_M), ideal.areas_m2, 0.0)
+    centres = true.mesh.vertices[np.random.default_rng(0).choice(len(weights), SPOTS, p=weights / weights.sum())]
+    spots = [RegionOfInterest(f"{number}", tuple(at.tolist()), SPOT_RADIUS_M) for number, at in enumerate(centres)]
+    regions = (analyse(one, spots, pixel_m=pixel_on_object_m(dataset)).regions[1:] for one in (surface, ideal))
+    for region, real in zip(*regions, strict=True):
+        brightness = real.spectrum.mean.mean()
+        yield SPOT, region.spectrum.mean.mean() / brightness - 1.0, region.reflectance_std / brightness
+
+
+def _row(trait: str, values: Sequence[tuple[str, float, float]]) -> list[str]:
+    sessions = len(values) // (SPOTS if trait.startswith(SPOT) else 1)
+    error, std = np.array([value[1:] for value in values]).T
+    within = (f"{100 * np.mean(abs(error) <= count * std):.0f}" for count in (1, 2))
+    return [trait, str(sessions), *within, f"{100 * np.median(abs(error)):.2f}", f"{100 * np.median(std):.2f}"]
+
+
+if __name__ == "__main__":
+    tyro.cli(TraitUncertainty, description=__doc__).main()
