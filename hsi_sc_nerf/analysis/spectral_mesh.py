@@ -134,8 +134,8 @@ def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndar
     if surface.lit is not None:
         measured = surface.lit.measured
         names = [*band_property_names(surface.wavelengths_nm, "material"), *LIGHT_COLUMNS]
-        columns = [*surface.spectra.T, surface.lit.irradiance, surface.lit.irradiance_std]
-        extra = extra | dict(zip(names, columns, strict=True))
+        values = [*surface.spectra.T, surface.lit.irradiance, surface.lit.irradiance_std]
+        extra = extra | dict(zip(names, values, strict=True))
     colours = to_8_bit(measured[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
     points, normals = mesh.vertices.astype(np.float32), mesh.vertex_normals().astype(np.float32)
     columns = {"seen": surface.seen.astype(np.float32), **extra}
