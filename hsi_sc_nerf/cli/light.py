@@ -95,10 +95,11 @@ def sentences(told: dict[str, Any]) -> list[str]:
         f"(like spectra are as bright as the light says by the factor {evidence['profile']:.2f} ± "
         f"{evidence['profile_std']:.2f}; 1 is right, 0 is even light)."
     ]
-    if told["corrected"] and std > UNCERTAIN:
+    if told["corrected"] and (std is None or std > UNCERTAIN):
+        by = "an unknown amount" if std is None else f"{100.0 * std:.0f} % (irradiance_std)"
         lines.append(
-            f"Warning: the light is uncertain by {100.0 * std:.0f} % (irradiance_std), and so is the material; "
-            "do not compare its brightness with that of other objects."
+            f"Warning: the light is uncertain by {by}, and so is the material; do not compare its brightness with "
+            "that of other objects."
         )
     return lines
 

@@ -126,7 +126,8 @@ def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
 
 
 @pytest.mark.parametrize(
-    ("std", "corrected", "warned"), [(0.12, True, True), (0.02, True, False), (None, False, False)]
+    ("std", "corrected", "warned"),
+    [(0.12, True, True), (0.02, True, False), (None, False, False), (None, True, True)],
 )
 def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
     evidence = {"profile": 0.7, "profile_std": 0.1}
