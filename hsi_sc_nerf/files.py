@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,6 +17,8 @@ from jaxtyping import UInt8
 from hsi_sc_nerf.errors import InputError
 
 TEMPORARY_PREFIX = ".partial-"
+# DEFLATE makes of one byte at most so many pixels, of one bit each.
+_LARGEST_DEFLATION = 8 * 1032
 
 
 @contextmanager
@@ -78,6 +81,29 @@ def require_writable(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written to, because {there} {why}; choose another folder.")
 
 
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Args:
+        path: the file.
+        remedy: what to do if it cannot be read, the end of the error's sentence.
+
+    Raises:
+        InputError: the file cannot be read or holds no JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        # JSON can spell halves of characters, which no file can be written with.
+        json.dumps(content, ensure_ascii=False).encode("utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON object ({error}); {remedy}.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: is no JSON object; {remedy}.")
+    return content
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` as indented JSON.
 
@@ -86,6 +112,21 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     """
     with atomic_write(path) as (temporary,):
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "h w *channels"] | None:
+    """An 8-bit picture as gray values (h, w) or RGB (h, w, 3); None where the file is none that can be read."""
+    try:
+        content = np.fromfile(path, np.uint8)
+    except OSError:
+        return None
+    # OpenCV makes room for what the head of a PNG claims, and a compressed file holds at most so much.
+    is_png = content[:4].tobytes() == b"\x89PNG" and len(content) > 24
+    claimed_px = math.prod(map(int, content[16:24].view(">u4"))) if is_png else 0
+    if len(content) == 0 or claimed_px > _LARGEST_DEFLATION * len(content):
+        return None
+    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR)
+    return None if image is None else image if channels == 1 else image[..., ::-1]
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:

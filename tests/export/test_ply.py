@@ -10,7 +10,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_spectral_ply
-from hsi_sc_nerf.geometry.mesh import ply_triangles
+from hsi_sc_nerf.geometry.ply_file import ply_triangles
 
 
 @pytest.mark.parametrize(("count", "chunk"), [(50, 7), (50, 1000), (0, 7)])

@@ -112,7 +112,8 @@ def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
 
 def test_a_cache_of_an_earlier_version_is_not_finished(cube, tmp_path):
     paths, cache = process(cube, tmp_path / "data")
-    np.savez(paths.cache, fingerprint="made", gray=cache.gray)
+    with paths.cache.open("wb") as file:
+        np.savez(file, fingerprint="made", gray=cache.gray)
     assert read_cache(paths, "made") is None
 
 

@@ -96,7 +96,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path):
         (GOOD.replace("0.07", "tall"), "object.height_m is 'tall', but must be a number"),
         (GOOD.replace("0.07", "true"), "object.height_m is True, but must be a number"),
         (GOOD.replace("0.07", "7"), "object.height_m is 7, but must lie between"),
-        (GOOD.replace("0.07", ".nan"), "object.height_m is nan, but must lie between"),
+        (GOOD.replace("0.07", ".nan"), "object.height_m is nan, but must be a number"),
         (GOOD + "sensor: {bands: 20.5}\n", "sensor.bands is 20.5, but must be a whole number"),
         (GOOD.replace("shape: apple, ", ""), "object.shape is missing"),
         (GOOD.replace("markers: {side_m: 0.036}", "markers: 3"), "markers must hold"),
