@@ -66,7 +66,7 @@ def _check_counts(path: Path) -> None:
             is_text = "ascii" in words
         elif words[:1] == ["element"]:
             if not (len(words) == 3 and words[2].isascii() and words[2].isdigit() and len(words[2]) < 16):
-                raise ValueError("the count of an element is none")
+                raise ValueError("an element does not say how many there are")
             counts.append(int(words[2]))
             row_bytes.append(0)
         elif words[:1] == ["property"] and counts and len(words) > 2:

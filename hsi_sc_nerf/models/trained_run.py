@@ -13,7 +13,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.models.checkpoints import find_checkpoint
+from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_whole
 from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -82,7 +82,7 @@ def open_run(load_config: Path) -> TrainedRun:
         raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
     from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
 
-    find_checkpoint(_relocated(config, load_config).get_checkpoint_dir())
+    require_whole(find_checkpoint(_relocated(config, load_config).get_checkpoint_dir()))
     _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _relocated(c, load_config))
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
 
