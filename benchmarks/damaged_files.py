@@ -4,8 +4,8 @@
 
 Valid files are damaged at random: bytes are changed, parts are cut out, doubled or cut off, numbers and texts are
 replaced by such as break programs, values of JSON by others. Each damaged file is read as the commands read it.
-Counted are `InputError`, reading without error, any other exception, reading for longer than `SLOW_S`, and memory
-beyond what the file could hold. Inputs that did any of the last three are kept in --keep.
+Counted are `InputError`, reading without error, any other exception, reading for more than `SLOW_S` of processor
+time, and memory beyond what a small file could hold. Inputs that did any of the last three are kept in --keep.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError
 
 COLUMNS = ["kind of file", "inputs", "refused in one sentence", "read", "other exception", "slow", "much memory"]
 SLOW_S = 2.0
-STOPPED_S = 20
+STOPPED_S = 20.0
 MUCH_MEMORY_MB = 200.0
 ROOM_BYTES = 3 * 2**30
 """Address space that reading may take beyond what the libraries have."""
@@ -213,10 +213,10 @@ def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None) -> Ou
         for number in range(inputs):
             content = damaged(valid, rng)
             kind.path.write_bytes(content)
-            before_mb, started = _peak_mb(), time.monotonic()
+            before_mb, started = _peak_mb(), time.process_time()
             said, told = _outcome(kind.read)
             outcome.counts[said] += 1
-            took_s, more_mb = time.monotonic() - started, _peak_mb() - before_mb
+            took_s, more_mb = time.process_time() - started, _peak_mb() - before_mb
             if said == "other":
                 outcome.errors[told] += 1
             for name, bad in (("slow", took_s > SLOW_S), ("memory", more_mb > MUCH_MEMORY_MB)):
@@ -235,8 +235,8 @@ def _outcome(read: Callable[[], object]) -> tuple[str, str]:
     def stop(*_: object) -> None:
         raise TooSlowError
 
-    earlier = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(STOPPED_S)
+    earlier = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, STOPPED_S)
     try:
         with _libraries_are_silent():
             read()
@@ -246,14 +246,14 @@ def _outcome(read: Callable[[], object]) -> tuple[str, str]:
         one_line = told.isprintable() and 0 < len(told) <= LONGEST_MESSAGE
         return ("refused", told) if one_line else ("other", f"message of {len(told)} characters: {told[:200]!r}")
     except TooSlowError:
-        return "other", f"not done after {STOPPED_S} s"
+        return "other", f"not done after {STOPPED_S:g} s"
     except (Exception, SystemExit) as error:
         frame = traceback.extract_tb(error.__traceback__)
         ours = next((f for f in reversed(frame) if "hsi_sc_nerf/" in f.filename), frame[-1])
         return "other", f"{type(error).__name__}: {str(error)[:100]!r} at {Path(ours.filename).name}:{ours.lineno}"
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, earlier)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, earlier)
 
 
 @contextlib.contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,8 +16,11 @@ from jaxtyping import UInt8
 from hsi_sc_nerf.errors import InputError
 
 TEMPORARY_PREFIX = ".partial-"
-# DEFLATE makes of one byte at most so many pixels, of one bit each.
-_LARGEST_DEFLATION = 8 * 1032
+# Bytes that DEFLATE makes of one byte at most.
+_LARGEST_DEFLATION = 1032
+_PNG_HEAD_BYTES = 33
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""By PNG's numbers of the kinds of colour."""
 
 
 @contextmanager
@@ -115,15 +117,17 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "h w *channels"] | None:
-    """An 8-bit picture as gray values (h, w) or RGB (h, w, 3); None where the file is none that can be read."""
+    """A PNG as 8-bit gray values (h, w) or RGB (h, w, 3); None where the file is none that can be read."""
     try:
         content = np.fromfile(path, np.uint8)
     except OSError:
         return None
-    # OpenCV makes room for what the head of a PNG claims, and a compressed file holds at most so much.
-    is_png = content[:4].tobytes() == b"\x89PNG" and len(content) > 24
-    claimed_px = math.prod(map(int, content[16:24].view(">u4"))) if is_png else 0
-    if len(content) == 0 or claimed_px > _LARGEST_DEFLATION * len(content):
+    if content[:4].tobytes() != b"\x89PNG" or len(content) < _PNG_HEAD_BYTES:
+        return None
+    # OpenCV makes room for what the head claims, and a compressed file holds at most so much.
+    width, height = map(int, content[16:24].view(">u4"))
+    bits = int(content[24]) * _PNG_CHANNELS.get(int(content[25]), 4)
+    if width * height * bits // 8 > _LARGEST_DEFLATION * len(content):
         return None
     image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR)
     return None if image is None else image if channels == 1 else image[..., ::-1]

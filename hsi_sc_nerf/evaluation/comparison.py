@@ -205,6 +205,8 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
         raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
     if not len(vertices):
         raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise InputError(f"{path}: its triangles name vertices that it has not; export it again.")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
     return vertices, triangles
