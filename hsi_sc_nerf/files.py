@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,7 +20,7 @@ from hsi_sc_nerf.errors import InputError
 TEMPORARY_PREFIX = ".partial-"
 # Bytes that DEFLATE makes of one byte at most.
 _LARGEST_DEFLATION = 1032
-_PNG_HEAD_BYTES = 33
+_MODES = {1: cv2.IMREAD_GRAYSCALE, 3: cv2.IMREAD_COLOR}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By PNG's numbers of the kinds of colour."""
 
@@ -119,18 +121,27 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def read_picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "h w *channels"] | None:
     """A PNG as 8-bit gray values (h, w) or RGB (h, w, 3); None where the file is none that can be read."""
     try:
-        content = np.fromfile(path, np.uint8)
+        content = path.read_bytes()
     except OSError:
         return None
-    if content[:4].tobytes() != b"\x89PNG" or len(content) < _PNG_HEAD_BYTES:
+    if not _is_whole_png(content):
         return None
-    # OpenCV makes room for what the head claims, and a compressed file holds at most so much.
-    width, height = map(int, content[16:24].view(">u4"))
-    bits = int(content[24]) * _PNG_CHANNELS.get(int(content[25]), 4)
-    if width * height * bits // 8 > _LARGEST_DEFLATION * len(content):
-        return None
-    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), _MODES[channels])
     return None if image is None else image if channels == 1 else image[..., ::-1]
+
+
+def _is_whole_png(content: bytes) -> bool:
+    """Whether a PNG's parts fit their checksums, and its head the file: OpenCV makes room for whatever they claim."""
+    if content[:16] != b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR":
+        return False
+    at, view = 8, memoryview(content)
+    while at < len(content):
+        end = at + 8 + int.from_bytes(view[at : at + 4], "big")
+        if zlib.crc32(view[at + 4 : end]) != int.from_bytes(view[end : end + 4], "big") or end + 4 > len(content):
+            return False
+        at = end + 4
+    width, height, depth, colour = struct.unpack(">IIBB", view[16:26])
+    return width * height * depth * _PNG_CHANNELS.get(colour, 4) // 8 <= _LARGEST_DEFLATION * len(content)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:

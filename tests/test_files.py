@@ -1,3 +1,4 @@
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +50,11 @@ def test_pictures_come_back_and_damaged_ones_are_none(tmp_path, channels, shape)
     np.testing.assert_array_equal(read_picture(path, channels), image)
     whole = path.read_bytes()
     # The head claims 65536 x 65536 pixels, for which there would be room in no such file.
-    huge = whole[:16] + b"\0\1\0\0\0\1\0\0" + whole[24:]
-    for content in (b"", whole[:20], huge, b"BM" + whole[2:], b"no picture"):
+    head = b"IHDR" + b"\0\1\0\0\0\1\0\0" + whole[24:29]
+    huge = whole[:12] + head + zlib.crc32(head).to_bytes(4, "big") + whole[33:]
+    long = whole[:33] + b"\x7f\xff\xff\xf0" + whole[37:]  # a part of 2 GB
+    flipped = whole[:-20] + bytes([whole[-20] ^ 1]) + whole[-19:]
+    for content in (b"", whole[:20], whole[:-30], huge, long, flipped, b"BM" + whole[2:], b"no picture"):
         path.write_bytes(content)
         assert read_picture(path, channels) is None
     assert read_picture(tmp_path / "missing.png", channels) is None
