@@ -42,9 +42,9 @@ class _SettingsLoader(yaml.Loader):
             found = getattr(importlib.import_module("pathlib"), name.removeprefix("pathlib."), None)
             allowed = isinstance(found, type) and issubclass(found, PurePath)
         elif name in _FUNCTIONS:
-            found, allowed = super().find_python_name(name, mark), True
+            found, allowed = super().find_python_name(name, mark), True  # type: ignore[misc]
         elif package in _PACKAGES or name.startswith(f"{_OPTIMIZERS}."):
-            found = super().find_python_name(name, mark)
+            found = super().find_python_name(name, mark)  # type: ignore[misc]
             # A module of ours may have imported something else, such as Popen.
             home = found.__module__ if isinstance(found, type) else ""
             allowed = home.partition(".")[0] in _PACKAGES or home.startswith(f"{_OPTIMIZERS}.")
@@ -69,7 +69,7 @@ class _SettingsLoader(yaml.Loader):
         made_by_call = isinstance(kind, type) and issubclass(kind, enum.Enum | PurePath)
         if not (made_by_call or (newobj and dataclasses.is_dataclass(kind))):
             raise ForeignNameError(None, None, f"it makes a {suffix}", node.start_mark)
-        return super().make_python_instance(suffix, node, args, kwds, newobj)
+        return super().make_python_instance(suffix, node, args, kwds, newobj)  # type: ignore[misc]
 
 
 def read_config(load_config: Path) -> TrainerConfig:

@@ -190,6 +190,6 @@ def _settings(folder: Path) -> Section:
 
     config = read_config(folder / "config.yml")
     # A run may have a name of its own (--method-name); then every setting is shown.
-    method = all_methods.get(config.method_name)
+    method = all_methods.get(config.method_name or "")
     defaults = {} if method is None else flat_settings(method)
     return settings_section(flat_settings(config), defaults, describe_machine())
