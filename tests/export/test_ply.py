@@ -123,13 +123,13 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, change: dict) -> Non
     ("spoil", "message"),
     [
         (lambda content: content[:-1], "early end-of-file"),
-        (lambda content: b"PK" + content, "no readable PLY"),
-        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "no readable PLY"),
+        (lambda content: b"PK" + content, "cannot be read as a PLY"),
+        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "cannot be read as a PLY"),
         (lambda content: content.replace(b"float nz", b"float curvature"), "no nz"),
         (lambda content: content.replace(b"scalar_", b"band_"), "spectral bands"),
-        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "no readable PLY"),
-        (lambda content: content.split(b"end_header")[0], "no readable PLY"),
-        (lambda content: b"", "no readable PLY"),
+        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "cannot be read as a PLY"),
+        (lambda content: content.split(b"end_header")[0], "cannot be read as a PLY"),
+        (lambda content: b"", "cannot be read as a PLY"),
         (None, "no such file"),
     ],
 )
