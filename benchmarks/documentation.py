@@ -25,7 +25,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
-from hsi_sc_nerf.cli.main import Commands
+from hsi_sc_nerf.cli.commands import Commands
 from hsi_sc_nerf.terminal import markdown_table
 
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')

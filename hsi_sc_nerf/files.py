@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,6 +18,11 @@ from jaxtyping import UInt8
 from hsi_sc_nerf.errors import InputError
 
 TEMPORARY_PREFIX = ".partial-"
+# Bytes that DEFLATE makes of one byte at most.
+_LARGEST_DEFLATION = 1032
+_MODES = {1: cv2.IMREAD_GRAYSCALE, 3: cv2.IMREAD_COLOR}
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""By PNG's numbers of the kinds of colour."""
 
 
 @contextmanager
@@ -78,6 +85,29 @@ def require_writable(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written to, because {there} {why}; choose another folder.")
 
 
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Args:
+        path: the file.
+        remedy: what to do if it cannot be read, the end of the error's sentence.
+
+    Raises:
+        InputError: the file cannot be read or holds no JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        # JSON can spell halves of characters, which no file can be written with.
+        json.dumps(content, ensure_ascii=False).encode("utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON object ({error}); {remedy}.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: is no JSON object; {remedy}.")
+    return content
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` as indented JSON.
 
@@ -86,6 +116,32 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     """
     with atomic_write(path) as (temporary,):
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "h w *channels"] | None:
+    """A PNG as 8-bit gray values (h, w) or RGB (h, w, 3); None where the file is none that can be read."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if not _is_whole_png(content):
+        return None
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), _MODES[channels])
+    return None if image is None else image if channels == 1 else image[..., ::-1]
+
+
+def _is_whole_png(content: bytes) -> bool:
+    """Whether a PNG's parts fit their checksums, and its head the file: OpenCV makes room for whatever they claim."""
+    if content[:16] != b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR":
+        return False
+    at, view = 8, memoryview(content)
+    while at < len(content):
+        end = at + 8 + int.from_bytes(view[at : at + 4], "big")
+        if zlib.crc32(view[at + 4 : end]) != int.from_bytes(view[end : end + 4], "big") or end + 4 > len(content):
+            return False
+        at = end + 4
+    width, height, depth, colour = struct.unpack(">IIBB", view[16:26])
+    return width * height * depth * _PNG_CHANNELS.get(colour, 4) // 8 <= _LARGEST_DEFLATION * len(content)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:

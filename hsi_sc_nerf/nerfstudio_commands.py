@@ -21,8 +21,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.checkpoints import find_checkpoint
+from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
-from hsi_sc_nerf.models.trained_run import read_config
 from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 
 _SCRIPTS = tuple(f"nerfstudio.scripts.{name}" for name in ("eval", "exporter", "render", "viewer.run_viewer"))

@@ -28,9 +28,9 @@ def _wider(dtype: torch.dtype) -> torch.dtype:
 
 def _within_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     """Cast to ``dtype``; finite values beyond its range become its largest number, non-finite ones stay."""
-    if values.dtype == dtype:
-        return values
     largest = torch.finfo(dtype).max
+    if torch.finfo(values.dtype).max <= largest:
+        return values.to(dtype)
     return torch.where(values.isfinite(), values.clamp(-largest, largest), values).to(dtype)
 
 

@@ -39,6 +39,8 @@ STYLE: Any = {
     "xtick.color": "0.3",
     "ytick.color": "0.3",
     "legend.frameon": False,
+    # Names from files are no formulas.
+    "text.parse_math": False,
 }
 """Settings for `matplotlib.rc_context`."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

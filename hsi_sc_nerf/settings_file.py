@@ -13,12 +13,41 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from hsi_sc_nerf.errors import InputError
+import yaml
+
+from hsi_sc_nerf.errors import InputError, shown
+
+_DEEPEST = 20
+"""Settings are nested a few times; thousands of levels are an attack or damage."""
+_LARGEST_NUMBER = {int: 2**63, float: math.inf}
 
 
 def between(low: float, high: float, **kwargs: Any) -> Any:
     """A dataclass field whose value must lie in [low, high]; ``high`` may be infinite."""
     return field(metadata={"range": (low, high)}, **kwargs)
+
+
+def read_yaml(text: str, source: str) -> Any:
+    """The content of a YAML text of plain values: no types of a program, no references, no deep nesting.
+
+    References can make a short text stand for more values than fit into memory.
+
+    Args:
+        text: YAML.
+        source: name of the text in error messages.
+
+    Raises:
+        InputError: it is no such text.
+    """
+    depth = 0
+    try:
+        for event in yaml.parse(text, yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST or isinstance(event, yaml.AliasEvent):
+                raise ValueError("it refers to its own parts" if depth <= _DEEPEST else "it is nested too deeply")
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise InputError(f"{source}: not valid YAML ({error}); correct that line.") from error
 
 
 def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
@@ -40,11 +69,12 @@ def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
     """
     where = prefix.rstrip(".") or "the file"
     if not isinstance(values, dict):
-        raise InputError(f"{source}: {where} must hold `key: value` lines, not {values!r}.")
+        raise InputError(f"{source}: {where} must hold `key: value` lines, not {shown(values)}.")
     fields = {f.name: f for f in dataclasses.fields(cls)}
     for key in values:
         if key not in fields:
-            raise InputError(f"{source}: {prefix}{key} is not a known key; known here are {', '.join(fields)}.")
+            name = key if isinstance(key, str) else shown(key)
+            raise InputError(f"{source}: {prefix}{name} is not a known key; known here are {', '.join(fields)}.")
     for key, f in fields.items():
         if key not in values and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise InputError(f"{source}: {prefix}{key} is missing; add it.")
@@ -61,12 +91,14 @@ def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
     if dataclasses.is_dataclass(expected):
         return read_dataclass(expected, value, source, key + ".")
     if get_origin(expected) is Literal:
-        if value not in get_args(expected):
-            raise InputError(f"{source}: {key} is {value!r}, but must be one of {', '.join(get_args(expected))}.")
+        if not isinstance(value, str) or value not in get_args(expected):
+            raise InputError(
+                f"{source}: {key} is {shown(value)}, but must be one of {', '.join(get_args(expected))}."
+            )
         return value
     if get_origin(expected) is tuple:
         if not isinstance(value, list):
-            raise InputError(f"{source}: {key} is {value!r}, but must be a list.")
+            raise InputError(f"{source}: {key} is {shown(value)}, but must be a list.")
         (item,) = {*get_args(expected)} - {Ellipsis}
         return tuple(
             value if item is Any else (_read_value(item, v, source, f"{key}[{i}]") for i, v in enumerate(value))
@@ -77,8 +109,10 @@ def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
         str: ("a text", (str,)),
         Path: ("a path", (str,)),
     }[expected]
-    if isinstance(value, bool) or not isinstance(value, accepted):
-        raise InputError(f"{source}: {key} is {value!r}, but must be {kind}.")
+    usable = isinstance(value, accepted) and not isinstance(value, bool)
+    # Larger integers are no floats, and larger floats are infinite.
+    if not usable or (isinstance(value, int | float) and not abs(value) < _LARGEST_NUMBER[type(value)]):
+        raise InputError(f"{source}: {key} is {shown(value)}, but must be {kind}.")
     return expected(value)
 
 

@@ -31,7 +31,18 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         | --- | --- |
         | SAM, rad | 0.046 |
     """
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
+    lines = (map(markdown_text, line) for line in (header, ["---"] * len(header), *rows))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def markdown_text(text: str) -> str:
+    """A text on one line, such as a name from a file, that makes no cells, links or HTML in a Markdown page.
+
+    Example:
+        >>> print(markdown_text("a|b<c>"))
+        a\\|b&lt;c>
+    """
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
 
 
 def screen_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> Table:

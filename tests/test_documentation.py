@@ -56,3 +56,14 @@ def test_every_setting_of_training_in_a_page_exists():
         text = page.read_text(encoding="utf-8")
         for option in re.findall(r"--(?:pipeline|full-frame|masked)\.[a-z0-9.-]+[a-z0-9]", text):
             assert f"`{option}`" in settings or option.endswith(inherited), f"{page.name}: {option}"
+
+
+def test_every_test_that_a_page_names_exists():
+    found = 0
+    for page in PAGES:
+        for file, name in re.findall(r"`([a-z_/]*test_[a-z_]+)::(test_\w+)`", page.read_text(encoding="utf-8")):
+            found += 1
+            path = ROOT / "tests" / f"{file}.py"
+            assert path.is_file(), f"{page.name}: {file}"
+            assert f"def {name}(" in path.read_text(encoding="utf-8"), f"{page.name}: {file}::{name}"
+    assert found > 40

@@ -1,5 +1,7 @@
+import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
@@ -7,7 +9,7 @@ from hsi_sc_nerf.cli.light import MaterialCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, ProcessCommand
 from hsi_sc_nerf.cli.trained_runs import RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import require_writable
+from hsi_sc_nerf.files import read_json, read_picture, require_writable, write_png
 
 NOTHING = Path("nothing")
 
@@ -38,3 +40,29 @@ def test_a_place_that_can_be_made_is_not_made_yet(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "gone")
     with pytest.raises(InputError, match="is no folder"):
         require_writable(tmp_path / "link" / "out")
+
+
+@pytest.mark.parametrize(("channels", "shape"), [(1, (5, 7)), (3, (5, 7, 3))])
+def test_pictures_come_back_and_damaged_ones_are_none(tmp_path, channels, shape):
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    path = tmp_path / "a.png"
+    write_png(path, image)
+    np.testing.assert_array_equal(read_picture(path, channels), image)
+    whole = path.read_bytes()
+    # The head claims 65536 x 65536 pixels, for which there would be room in no such file.
+    head = b"IHDR" + b"\0\1\0\0\0\1\0\0" + whole[24:29]
+    huge = whole[:12] + head + zlib.crc32(head).to_bytes(4, "big") + whole[33:]
+    long = whole[:33] + b"\x7f\xff\xff\xf0" + whole[37:]  # a part of 2 GB
+    flipped = whole[:-20] + bytes([whole[-20] ^ 1]) + whole[-19:]
+    for content in (b"", whole[:20], whole[:-30], huge, long, flipped, b"BM" + whole[2:], b"no picture"):
+        path.write_bytes(content)
+        assert read_picture(path, channels) is None
+    assert read_picture(tmp_path / "missing.png", channels) is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, f'{{"a": {"9" * 5000}}}', '{"a": "\\ud800"}', "\0"])
+def test_what_is_no_json_object_is_refused_in_a_sentence(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"a\.json: is no JSON object.*; mend it\."):
+        read_json(path, "mend it")

@@ -16,7 +16,7 @@ import torch
 import tyro
 from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.main import Commands
+from hsi_sc_nerf.cli.commands import Commands
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.export.ply import read_spectral_ply

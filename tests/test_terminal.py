@@ -4,6 +4,8 @@ import sys
 
 import pytest
 
+from hsi_sc_nerf.terminal import markdown_table
+
 DOCUMENTED = "ignore::FutureWarning:torch.jit._script"
 """PYTHONWARNINGS of docs/how-to/nerfstudio_commands.md."""
 
@@ -19,3 +21,8 @@ def test_libraries_do_not_warn_before_our_first_line(script, hidden):
     warnings = [line for line in started.stderr.splitlines() if "Warning: " in line]
     assert len(warnings) == (not hidden)
     assert all("torch.jit.script" in line for line in warnings)
+
+
+def test_names_from_files_make_no_cells_links_or_html():
+    table = markdown_table(["name"], [["a|b"], ["<img src=x>"], ["[x](http://y)"], ["two\nlines"]])
+    assert table.splitlines()[2:] == ["| a\\|b |", "| &lt;img src=x> |", "| \\[x](http://y) |", "| two lines |"]

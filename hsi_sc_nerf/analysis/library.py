@@ -120,12 +120,12 @@ def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
     if header.wavelengths_nm is None:
         raise InputError(f"{header_path}: lists no wavelengths; add them.")
     lines, samples, _ = header.shape
+    if data.stat().st_size < header.data_bytes:
+        raise InputError(f"{data}: is smaller than its header {header_path.name} says; export the library again.")
     try:
         numbers = np.fromfile(data, header.dtype, lines * samples, offset=header.offset)
     except OSError as error:
         raise InputError(f"{data}: cannot be read ({error}); check the file.") from error
-    if numbers.size != lines * samples:
-        raise InputError(f"{data}: is smaller than its header {header_path.name} says; export the library again.")
     spectra = numbers.reshape(lines, samples).astype(float)
     if header.ignore_value is not None:
         spectra[np.isclose(spectra, header.ignore_value, rtol=1e-6, atol=0.0)] = np.nan

@@ -16,7 +16,7 @@ from hsi_sc_nerf.analysis.closed_mesh import Size
 from hsi_sc_nerf.analysis.size_uncertainty import combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.terminal import markdown_table
+from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
 # Name, unit, and the unit's factor on metres, square metres or litres.
 _SIZES = {
@@ -184,7 +184,7 @@ def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable
 
 def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
     """Write ``traits.md``: the tables of ``content``, and pictures (file names by caption)."""
-    parts = [f"# Traits of {title}"]
+    parts = [f"# Traits of {markdown_text(title)}"]
     for table in trait_tables(content):
         parts += [f"## {table.heading}", markdown_table(table.header, table.rows), table.note]
     parts += ["## Pictures", *(f"{caption}:\n\n![{caption}]({name})" for caption, name in pictures.items())]

@@ -34,6 +34,8 @@ _NM_PER_UNIT = {
 _NO_LENGTHS = ("wavenumber", "ghz", "mhz", "index")
 # No imaging spectrometer measures below 100 nm or beyond 100 µm. Smaller numbers without a unit are micrometres.
 _SENSIBLE_NM = (100.0, 100_000.0)
+# No instrument or library has more bands. Lists of one value a band are made before there is a data file to compare.
+_MOST_BANDS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
         dtype = np.dtype(envi.envi_to_dtype[fields["data type"]])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
-    _check_layout(path, fields, shape, dtype, offset)
+    _check_layout(path, fields, shape, dtype, offset, library)
     is_library = "library" in str(fields.get("file type", "")).lower()
     if is_library and not library:
         raise InputError(f"{path}: describes a spectral library, not an image; give the cube's header.")
@@ -159,7 +161,7 @@ def _mended_fields(path: Path) -> dict[str, Any]:
 
 
 def _check_layout(
-    path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int
+    path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int, library: bool
 ) -> None:
     """Refuse headers whose pixels would be read wrongly."""
     if fields["interleave"] not in INTERLEAVES:
@@ -169,6 +171,8 @@ def _check_layout(
             f"{path}: {shape[0]} lines, {shape[1]} samples, {shape[2]} bands after {offset} bytes are no spectral "
             "image; correct the header."
         )
+    if max(shape[1:] if library else shape[2:]) > _MOST_BANDS:
+        raise InputError(f"{path}: describes more than {_MOST_BANDS} bands; correct the header.")
     if dtype.kind == "c":
         raise InputError(f"{path}: holds complex numbers, which are no spectral image; export real numbers.")
     if str(fields["byte order"]) not in ("0", "1"):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.files import read_json
 
 SESSION_INFO_NAME = "session.json"
 _TEXTS = ("object", "marker_dictionary", "white_reference")
@@ -64,16 +65,8 @@ def read_session_info(path: Path) -> SessionInfo:
     if not os.path.lexists(path):
         return SessionInfo()
     known = [field.name for field in fields(SessionInfo)]
-    try:
-        values = {k: v for k, v in json.loads(path.read_text(encoding="utf-8")).items() if v is not None}
-    except (ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path}: is no JSON object ({error}); write {{...}} with keys of {', '.join(known)}."
-        ) from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); put a file of JSON there, or nothing."
-        ) from error
+    content = read_json(path, f"write {{...}} with keys of {', '.join(known)}, or remove it")
+    values = {key: value for key, value in content.items() if value is not None}
     for key, value in values.items():
         if key not in known:
             raise InputError(f"{path}: does not know the key {key}; the keys are {', '.join(known)}.")
@@ -110,7 +103,7 @@ def _check_value(path: Path, key: str, value: Any) -> None:
     if key == "direction":
         valid, expected = value in ("ccw", "cw"), "ccw or cw (seen from above)"
     elif key in _FILES:
-        valid = isinstance(value, str) and (path.parent / value).is_file()
+        valid = isinstance(value, str) and os.path.isfile(path.parent / value)
         expected = f"the name of a CSV file beside {path.name}"
     elif key in _TEXTS:
         valid, expected = isinstance(value, str) and value != "", "a text"
@@ -122,8 +115,9 @@ def _check_value(path: Path, key: str, value: Any) -> None:
     else:
         valid, expected = is_number and value > 0.0, "a positive number"
     if not valid:
-        raise InputError(f"{path}: {key} is {value!r}, but must be {expected}; correct it.")
+        raise InputError(f"{path}: {key} is {shown(value)}, but must be {expected}; correct it.")
 
 
 def _is_finite_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf")
+    # Integers beyond the largest float are no numbers to compute with.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

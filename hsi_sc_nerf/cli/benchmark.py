@@ -30,7 +30,7 @@ from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock, Job
 from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, write_json
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, read_json, write_json
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -201,7 +201,7 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
     """Result of an earlier call for the same job, machine and data; None if there is none."""
     if not path.is_file():
         return None
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, "delete it to measure again")
     expected = json.loads(json.dumps({"job": asdict(job), **identity}))
     return content if expected.items() <= content.items() else None
 

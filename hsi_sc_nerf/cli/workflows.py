@@ -23,7 +23,7 @@ from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_comm
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import atomic_write, make_folder, write_json
+from hsi_sc_nerf.files import atomic_write, make_folder, read_json, write_json
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -193,7 +193,7 @@ class RunCommand:
     def _bring_up_to_date(self, step: Step, console: Console, title: str, run_step: StepRunner) -> None:
         """Run a step unless its results are those of the same command and inputs."""
         steps_path = self.output_dir / STEPS_NAME
-        done: dict[str, Any] = json.loads(steps_path.read_text(encoding="utf-8")) if steps_path.is_file() else {}
+        done = read_json(steps_path, "delete it to make all steps again") if steps_path.is_file() else {}
         fingerprint = step.fingerprint(self.output_dir)
         before = done.get(step.name, {})
         same = before.get("fingerprint") == fingerprint

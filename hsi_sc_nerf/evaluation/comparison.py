@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from plyfile import PlyData
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
@@ -22,7 +21,7 @@ from hsi_sc_nerf.evaluation.spatial import (
     sample_surface,
     threshold_curves,
 )
-from hsi_sc_nerf.geometry.mesh import ply_triangles
+from hsi_sc_nerf.geometry.ply_file import ply_triangles, read_ply
 
 Alignment = Literal["features", "icp", "none"]
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -200,10 +199,14 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
         raise InputError(f"{path}: is no file that can be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
     try:
         vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
-    except Exception as error:  # readers raise errors of many types
+    except InputError:
+        raise
+    except Exception as error:  # trimesh's readers raise errors of many types
         raise InputError(f"{path}: cannot be read ({error!r}); export it again.") from error
     if not len(vertices):
         raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise InputError(f"{path}: its triangles name vertices that it has not; export it again.")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
     return vertices, triangles
@@ -211,7 +214,7 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
 
 def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     # Memory-mapped: only three of a spectral cloud's hundreds of columns are read.
-    content = PlyData.read(path)
+    content = read_ply(path)
     vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
     return vertices, ply_triangles(content)
 

@@ -17,9 +17,9 @@ from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.evaluation.comparison import Comparison
 from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
-from hsi_sc_nerf.geometry.mesh import ply_vertices
+from hsi_sc_nerf.geometry.ply_file import ply_vertices
 from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
-from hsi_sc_nerf.terminal import markdown_table
+from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
 _SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _STATISTICS = {
@@ -149,7 +149,7 @@ def _page(
         for percent in _REACHED_PERCENT
     )
     scores, distances = comparison_tables(figures)
-    return f"""# {cloud_name} against {reference_name}
+    return f"""# {markdown_text(cloud_name)} against {markdown_text(reference_name)}
 
 {markdown_table(*scores)}
 

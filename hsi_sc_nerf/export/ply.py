@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.lib.recfunctions import structured_to_unstructured
-from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import CloudStream, SpectralCloud, comment_lines, stream
 from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.geometry.ply_file import read_ply
 
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
@@ -118,20 +118,13 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
         204
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; give the PLY file of an exported point cloud.")
-    try:
-        vertices = _read(path)["vertex"].data
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: is no readable PLY point cloud ({error}); export it again.") from error
+    vertices = read_ply(path)["vertex"].data
     names = vertices.dtype.names
     bands = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
     missing = [name for name in (*_GEOMETRY, *_COLOUR) if name not in names]
     if missing or not bands:
         lacking = ", ".join(missing) or "spectral bands (scalar_...nm)"
         raise InputError(f"{path}: has no {lacking}; give a cloud that ns-export wrote from an hsi-sc-nerf run.")
-    if vertices.dtype.hasobject:
-        raise InputError(f"{path}: its points hold lists; export the cloud again.")
 
     def columns(group: tuple[str, ...], dtype: type) -> np.ndarray:
         # A copy, in one pass: where it can, NumPy gives a view of the file.
@@ -149,11 +142,3 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
             if name not in bands and name not in (*_GEOMETRY, *_COLOUR)
         },
     )
-
-
-def _read(path: Path) -> PlyData:
-    try:
-        # Triangles of known length are mapped into memory; others take plyfile seconds.
-        return PlyData.read(str(path), known_list_len={"face": {"vertex_indices": 3}})
-    except PlyElementParseError:
-        return PlyData.read(str(path))

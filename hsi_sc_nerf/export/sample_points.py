@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
-from plyfile import PlyData, PlyListProperty
+from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
@@ -25,7 +25,8 @@ from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, comment_lines, estimate_
 from hsi_sc_nerf.export.ply import band_property_names
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
-from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.ply_file import ply_vertices, read_ply
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
@@ -232,11 +233,7 @@ def read_points(path: Path) -> PlyPoints:
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: is no PLY file; export the cloud or mesh as PLY.")
     positions, triangles = read_surface(path)
-    content = PlyData.read(str(path))
-    lists = [column.name for column in content["vertex"].properties if isinstance(column, PlyListProperty)]
-    if lists:
-        raise InputError(f"{path}: its points hold lists ({', '.join(lists)}); save it without them.")
-    return PlyPoints(content, positions, triangles)
+    return PlyPoints(read_ply(path), positions, triangles)
 
 
 def write_sampled_ply(

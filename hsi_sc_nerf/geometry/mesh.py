@@ -1,14 +1,12 @@
-"""Triangle meshes as plain arrays: area, volume, normals, ray casting, and the triangles of PLY files."""
+"""Triangle meshes as plain arrays: area, volume, normals, ray casting."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from jaxtyping import Float, Int
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -72,39 +70,6 @@ class Mesh:
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return np.cross(b - a, c - a)
-
-
-def ply_vertices(columns: Mapping[str, Shaped[np.ndarray, "v"]]) -> PlyElement:
-    """The element ``vertex`` of a PLY file from its properties by name, in order; types are kept."""
-    rows = np.empty(len(next(iter(columns.values()))), [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        rows[name] = values
-    return PlyElement.describe(rows, "vertex")
-
-
-def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:
-    """Triangles of a PLY file with vertices; polygons are cut into fans, and a point cloud has no triangles.
-
-    Raises:
-        PlyParseError: the faces have no list of vertices, or refer to vertices that are not in the file.
-    """
-    if "face" not in content or not content["face"].count:
-        return np.zeros((0, 3), np.int64)
-    lists = [column.name for column in content["face"].properties if isinstance(column, PlyListProperty)]
-    name = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
-    if name is None:
-        raise PlyParseError("its faces have no vertex_indices")
-    faces = content["face"][name]
-    corners = np.array([len(face) for face in faces])
-    fans = [
-        np.stack(faces[corners == count])[:, [0, step, step + 1]]
-        for count in np.unique(corners)
-        for step in range(1, count - 1)
-    ]
-    triangles = np.concatenate(fans).astype(np.int64) if fans else np.zeros((0, 3), np.int64)
-    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < content["vertex"].count:
-        raise PlyParseError("its faces name vertices that it has not")
-    return triangles
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> RaycastingScene:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +20,7 @@ from hsi_sc_nerf.errors import InputError
 
 CHECKPOINT_KEYS = {"step", "pipeline", "optimizers", "scalers", "training"}
 """Keys of a checkpoint that a run can be resumed from."""
+_EARLIER = "take an earlier one"
 
 
 def allow_nerfstudio_checkpoints() -> None:
@@ -96,16 +100,35 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     return path
 
 
+def require_whole(path: Path) -> None:
+    """Compare a checkpoint with the checksums in it; torch does not, and fails on damage in many ways.
+
+    Raises:
+        InputError: it is damaged, missing or no checkpoint.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (
+        *(OSError, EOFError, NotImplementedError, OverflowError, RuntimeError, ValueError),
+        *(struct.error, zipfile.BadZipFile, zlib.error),
+    ) as error:
+        raise InputError(f"{path}: is no readable checkpoint ({error}); {_EARLIER}.") from error
+    if damaged is not None:
+        raise InputError(f"{path}: is no readable checkpoint (its part {damaged} is damaged); {_EARLIER}.")
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of the staged trainer to the CPU.
 
     Raises:
         InputError: the file is damaged, missing or no such checkpoint.
     """
+    require_whole(path)
     try:
         state = torch.load(path, map_location="cpu")
     except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
-        raise InputError(f"{path}: is no readable checkpoint ({error}); take an earlier one.") from error
+        raise InputError(f"{path}: is no readable checkpoint ({error}); {_EARLIER}.") from error
     if not isinstance(state, dict) or not state.keys() >= CHECKPOINT_KEYS:
         raise InputError(f"{path}: is no checkpoint that hsi-sc-nerf can go on from; train anew.")
     return state

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, NoReturn, cast
 
 import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -126,6 +127,8 @@ class StagedTrainer(Trainer):
             super().setup(test_mode)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        except KeyboardInterrupt:
+            self._tell_that_it_stopped()
         on_gpu = self.pipeline.device.type == "cuda"
         plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
         if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
@@ -167,8 +170,21 @@ class StagedTrainer(Trainer):
             raise SystemExit(f"hsi-sc-nerf: {error}. The last good checkpoint is in {self.checkpoint_dir}") from error
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        except KeyboardInterrupt:
+            self._tell_that_it_stopped()
         finally:
             flush_logs()
+
+    def _tell_that_it_stopped(self) -> NoReturn:
+        """End after Ctrl-C with one line; nerfstudio would print the stack and exit with 0.
+
+        Nothing is saved: a step may be half done, and the weights would not be those of an uninterrupted run.
+        """
+        folder = self.config.get_checkpoint_dir()
+        saved = any(folder.glob("step-*.ckpt"))
+        hint = f"; --load-dir {folder} goes on from the last checkpoint" if saved else ""
+        print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
+        raise SystemExit(130) from None
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step of its stage."""

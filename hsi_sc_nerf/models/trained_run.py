@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.models.checkpoints import find_checkpoint
+from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_whole
+from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
@@ -83,40 +82,9 @@ def open_run(load_config: Path) -> TrainedRun:
         raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
     from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
 
-    find_checkpoint(_relocated(config, load_config).get_checkpoint_dir())
+    require_whole(find_checkpoint(_relocated(config, load_config).get_checkpoint_dir()))
     _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _relocated(c, load_config))
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
-
-
-def read_config(load_config: Path) -> TrainerConfig:
-    """The settings of a run, of any method.
-
-    Raises:
-        InputError: there is no such file, or it is not one that this version can read.
-    """
-    if not load_config.is_file():
-        raise InputError(f"{load_config}: there is no such file; give the config.yml of a trained run.")
-    reason: Exception | None = None
-    try:
-        config = yaml.load(load_config.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    # Old files name modules and classes that are gone, which fails in as many ways as they can be missing.
-    except (yaml.YAMLError, UnicodeDecodeError, AttributeError, ImportError, TypeError) as error:
-        config, reason = None, error
-    if not isinstance(config, TrainerConfig) or _missing_settings(config):
-        raise InputError(
-            f"{load_config}: cannot be read; give the config.yml of a run that this version of hsi-sc-nerf trained."
-        ) from reason
-    return config
-
-
-def _missing_settings(value: object) -> bool:
-    """Whether a dataclass of this package, anywhere in the settings, lacks a field that an older version had not."""
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return False
-    own = type(value).__module__.startswith("hsi_sc_nerf")
-    names = [field.name for field in dataclasses.fields(value)]
-    missing = own and not all(hasattr(value, name) for name in names)
-    return missing or any(_missing_settings(getattr(value, name, None)) for name in names)
 
 
 def _relocated(config: TrainerConfig, load_config: Path) -> TrainerConfig:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.files import read_json, read_picture, write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
+from hsi_sc_nerf.settings_file import read_dataclass
 
 TRANSFORMS_NAME = "transforms.json"
 _DISTORTION = ("k1", "k2", "p1", "p2")
@@ -26,6 +26,7 @@ _FRAME_FILES = {
     "cube_path": "cube_path",
     "flags_path": "flags_path",
 }
+_AGAIN = "process the session again"
 _MAY_BE_UNKNOWN = ("fwhm_nm", "typical_uncertainty")
 
 
@@ -74,22 +75,22 @@ class PackedFrame:
 
     def mask(self) -> Bool[np.ndarray, "lines samples"]:
         """True on the object."""
-        return _read_picture(self.mask_path, cv2.IMREAD_GRAYSCALE) > 127
+        return _picture(self.mask_path, 1) > 127
 
     def flags(self) -> UInt8[np.ndarray, "lines samples"]:
         """`PixelFlag`s of each pixel."""
-        return _read_picture(self.flags_path, cv2.IMREAD_GRAYSCALE)
+        return _picture(self.flags_path, 1)
 
     def pseudo_rgb(self) -> UInt8[np.ndarray, "lines samples 3"]:
         """The pseudo-RGB picture."""
-        return _read_picture(self.image_path, cv2.IMREAD_COLOR)[..., ::-1]
+        return _picture(self.image_path, 3)
 
 
-def _read_picture(path: Path, mode: int) -> UInt8[np.ndarray, "lines samples *channels"]:
-    image = cv2.imread(str(path), mode)
+def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
+    image = read_picture(path, channels)
     if image is None:
-        raise InputError(f"{path}: is no readable picture; process the session again.")
-    return image.astype(np.uint8, copy=False)
+        raise InputError(f"{path}: is no readable picture; {_AGAIN}.")
+    return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +152,8 @@ def transforms_path(path: Path) -> Path:
 def is_packed(path: Path) -> bool:
     """Whether ``path`` is the folder (or the ``transforms.json``) of a packed hyperspectral dataset."""
     try:
-        return "wavelengths_nm" in json.loads(transforms_path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return "wavelengths_nm" in read_json(transforms_path(path), _AGAIN)
+    except InputError:
         return False
 
 
@@ -170,18 +171,18 @@ def open_packed(path: Path) -> PackedDataset:
     path = transforms_path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no packed dataset here; make one with `hsi-sc-nerf process`.")
+    content = read_json(path, _AGAIN)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        dataset = _parse_transforms(path.parent, content)
+        dataset = _parse_transforms(path.parent, content, str(path))
     except KeyError as error:
         raise InputError(f"{path}: lacks the key {error}; process the session again.") from error
-    except (TypeError, ValueError) as error:
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); process the session again.") from error
     if not dataset.frames:
         raise InputError(f"{path}: lists no frames; process the session again.")
     for frame in dataset.frames:
         for file in (getattr(frame, name) for name in _FRAME_FILES):
-            if not file.is_file():
+            if not os.path.isfile(file):
                 raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
     return dataset
 
@@ -242,14 +243,21 @@ def _numbers(content: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.nd
     if content[key] is None and key in _MAY_BE_UNKNOWN:
         return None
     try:
-        return np.array(content[key], dtype=float).reshape(shape)
-    except (TypeError, ValueError) as error:
+        array = np.array(content[key], dtype=float).reshape(shape)
+        if not np.isfinite(array).all():
+            raise ValueError
+        return array
+    except (OverflowError, TypeError, ValueError) as error:
         expected = " x ".join(str(size) for size in shape if size >= 0)
         raise ValueError(f"{key} is no list of {expected} numbers".replace("  ", " ")) from error
 
 
-def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
+def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> PackedDataset:
     container, uncertainty = content["container"], content["uncertainty"]
+    lens = {field.name: content[field.name] for field in fields(PinholeIntrinsics)}
+    intrinsics = read_dataclass(PinholeIntrinsics, lens, source, "")
+    if min(intrinsics.w, intrinsics.h, intrinsics.fl_x, intrinsics.fl_y) <= 0:
+        raise ValueError("its pictures have no size or no focal length")
     bands = len(content["wavelengths_nm"])
     arrays: dict[str, Any] = {key: _numbers(content, key, shape) for key, shape in _shapes(bands).items()}
     terms: dict[str, Any] = {}
@@ -257,10 +265,10 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
         terms = {field.name: _numbers(uncertainty, field.name, (bands,)) for field in fields(ReflectanceUncertainty)}
     return PackedDataset(
         root=root,
-        intrinsics=PinholeIntrinsics(**{field.name: content[field.name] for field in fields(PinholeIntrinsics)}),
+        intrinsics=intrinsics,
         distortion=np.array([content[key] for key in _DISTORTION], dtype=float),
         object_name=str(content["object"]),
-        container=None if container is None else Container(container["diameter_m"], container["height_m"]),
+        container=None if container is None else read_dataclass(Container, container, source, "container."),
         flagged_values=int(content["flagged_values"]),
         uncertainty=ReflectanceUncertainty(**terms) if terms else None,
         frames=tuple(_parse_frame(root, frame) for frame in content["frames"]),
@@ -273,10 +281,16 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
     error_px, pose = frame["reprojection_error_px"], _numbers(frame, "transform_matrix", (4, 4))
     assert pose is not None
+    capture, files = frame["capture"], {name: PurePosixPath(frame[key]) for name, key in _FRAME_FILES.items()}
+    # A dataset may come from somebody else: what it names lies inside of it, as do files that are named after it.
+    if any(file.is_absolute() or ".." in file.parts for file in files.values()):
+        raise ValueError("a frame names a file outside of the dataset")
+    if not isinstance(capture, str) or capture in ("", ".", "..") or {*capture} & {"/", "\\", "\0"}:
+        raise ValueError("the name of a frame's capture is none of a file")
     return PackedFrame(
-        capture=str(frame["capture"]),
+        capture=capture,
         angle_deg=float(frame["angle_deg"]),
         reprojection_error_px=None if error_px is None else float(error_px),
         camera_to_world=pose,
-        **{name: root / frame[key] for name, key in _FRAME_FILES.items()},
+        **{name: root / file for name, file in files.items()},
     )

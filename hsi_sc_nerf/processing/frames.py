@@ -7,8 +7,9 @@ cache is deleted before the first of its files is replaced: it would vouch for a
 from __future__ import annotations
 
 import hashlib
+import io
+import math
 import threading
-import zipfile
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
@@ -30,6 +31,7 @@ from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_
 from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.terminal import progress_bar
 
+_DIGEST_BYTES = hashlib.sha256().digest_size
 MARKER_RANGE_NM = (450.0, 700.0)
 """Markers are detected in the mean image of these bands: many inks are transparent beyond 700 nm."""
 
@@ -53,8 +55,8 @@ class FramePaths:
             cube=root / "cubes" / f"{capture}.hdr",
             flags=root / "flags" / f"{capture}.png",
             mask=root / "masks" / f"{capture}.png",
-            bins=root / ".cache" / f"{capture}_bins.npy",
-            cache=root / ".cache" / f"{capture}.npz",
+            bins=root / ".cache" / f"{capture}.bins",
+            cache=root / ".cache" / f"{capture}.note",
         )
 
 
@@ -183,26 +185,45 @@ def process_frame(
     write_packed_cube(paths.cube, upright(frame.packed), wavelengths_nm, widths_nm)
     write_png(paths.flags, upright(frame.flags))
     write_png(paths.image, upright(to_8_bit(np.moveaxis(frame.rgb, 0, -1))))
+    bins = np.ascontiguousarray(np.rot90(smoothed_bins(frame.binned), calibration.quarter_turns, axes=(1, 2)))
     with atomic_write(paths.bins) as (temporary,):
-        np.save(temporary, np.rot90(smoothed_bins(frame.binned), calibration.quarter_turns, axes=(1, 2)))
+        bins.tofile(temporary)
     gray = upright(to_8_bit(frame.gray))
+    note = io.BytesIO()
+    np.savez(note, fingerprint=fingerprint, gray=gray, shape_of_bins=bins.shape, **vars(frame.pixel_counts))
     with atomic_write(paths.cache) as (temporary,):
-        np.savez(temporary, fingerprint=fingerprint, gray=gray, **vars(frame.pixel_counts))
-    return FrameCache(fingerprint, gray, np.load(paths.bins, mmap_mode="r"), frame.pixel_counts)
+        temporary.write_bytes(hashlib.sha256(note.getvalue()).digest() + note.getvalue())
+    return FrameCache(fingerprint, gray, _mapped(paths.bins, bins.shape), frame.pixel_counts)
 
 
 def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
     """The cache of a frame that was finished from the same files with the same settings, or None."""
     try:
-        with np.load(paths.cache) as stored:
+        content = paths.cache.read_bytes()
+        digest, note = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        # What is damaged is never parsed: NumPy's reader would fail in many ways.
+        if hashlib.sha256(note).digest() != digest:
+            return None
+        with np.load(io.BytesIO(note)) as stored:
             pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
-            bins = np.load(paths.bins, mmap_mode="r")
+            bins = _mapped(paths.bins, tuple(stored["shape_of_bins"]))
             cache = FrameCache(str(stored["fingerprint"]), stored["gray"], bins, pixel_counts)
         open_cube(paths.cube)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, InputError):
+    except (OSError, ValueError, KeyError, InputError):
         return None
     complete = paths.image.is_file() and paths.flags.is_file()
     return cache if complete and cache.fingerprint == fingerprint else None
+
+
+def _mapped(path: Path, shape: tuple[int, ...]) -> Float16[np.ndarray, "bins lines samples"]:
+    """A file of 16-bit floats, in memory where it is used.
+
+    Raises:
+        ValueError: the file has another size.
+    """
+    if path.stat().st_size != np.dtype(np.float16).itemsize * math.prod(map(int, shape)):
+        raise ValueError(f"{path} has another size")
+    return np.memmap(path, np.float16, "r", shape=shape)
 
 
 def _digest(calibration: FrameCalibration) -> str:

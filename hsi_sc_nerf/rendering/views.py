@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import pinhole_cameras
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -27,6 +27,8 @@ from hsi_sc_nerf.spectra import nearest_bands
 from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
 
 CubeType = Literal["float32", "uint16"]
+_LARGEST_PX = 2**14
+"""Side of the largest picture that a camera path may ask for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +90,15 @@ def views_of_path(path: Path) -> Views:
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; export a camera path from ns-viewer.")
+    content = read_json(path, "export a camera path from ns-viewer")
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        for key in ("render_width", "render_height"):
+            if not 1 <= content[key] <= _LARGEST_PX:
+                raise ValueError(f"{key} is not between 1 and {_LARGEST_PX}")
         cameras = get_path_from_json(content)
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        if not cameras.camera_to_worlds.isfinite().all():
+            raise ValueError("a camera is at no finite place")
+    except (AttributeError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
         raise InputError(f"{path}: is no camera path ({error!r}); export one from ns-viewer.") from error
     return Views("path", cameras, [f"path_{i:03d}" for i in range(len(cameras))])
 

@@ -21,7 +21,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     inspection_section,
     masks_section,
     poses_section,
-    read_json,
+    read_known,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
 from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
@@ -82,7 +82,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     # Before the slow rendering, so that unusable files are refused at once.
     comparison_path = _given_or_beside(sources.comparison, folder / "comparison.json", "hsi-sc-nerf compare")
     traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
-    comparison, traits = read_json(comparison_path), read_json(traits_path)
+    comparison, traits = read_known(comparison_path), read_known(traits_path)
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
 
     from hsi_sc_nerf.models.trained_run import open_run
@@ -183,13 +183,13 @@ def _reprojection_error(dataset: PackedDataset) -> dict[str, str]:
 
 
 def _settings(folder: Path) -> Section:
-    import yaml
     from nerfstudio.configs.method_configs import all_methods
 
     from hsi_sc_nerf.benchmark.steps import describe_machine
+    from hsi_sc_nerf.models.run_settings import read_config
 
-    config = yaml.load((folder / "config.yml").read_text(encoding="utf-8"), Loader=yaml.Loader)
+    config = read_config(folder / "config.yml")
     # A run may have a name of its own (--method-name); then every setting is shown.
-    method = all_methods.get(config.method_name)
+    method = all_methods.get(config.method_name or "")
     defaults = {} if method is None else flat_settings(method)
     return settings_section(flat_settings(config), defaults, describe_machine())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.charts import Curve, line_chart
@@ -27,27 +27,22 @@ _FLAGGED = {
     "no_data": "no data",
 }
 _FLAGGED_FRACTION = (0.01, 0.05)
+_AGAIN = "make it again"
+# What reading figures from another content, however damaged, ends in.
+_WRONG_CONTENT = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError)
 # The outline of a convex object changes by a few per cent from frame to frame.
 _MASK_JUMP = 0.1
 # The paper's target.
 _REPROJECTION_PX = 1.0
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
+def read_known(path: Path) -> dict[str, Any] | None:
     """Content of a JSON file; None if it does not exist.
 
     Raises:
         InputError: it is no JSON object.
     """
-    if not path.is_file():
-        return None
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no readable JSON ({error}); make it again.") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no JSON object; make it again.")
-    return content
+    return read_json(path, _AGAIN) if path.is_file() else None
 
 
 def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
@@ -63,7 +58,7 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
         InputError: that file holds no findings.
     """
     path = dataset.root / "report" / "inspection.json"
-    content = read_json(path)
+    content = read_known(path)
     if content is None:
         return []
     try:
@@ -79,8 +74,20 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
 
 
 def calibration_section(dataset: PackedDataset) -> Section:
-    """Calibration from counts to reflectance, and the uncertainty of reflectance."""
-    found = read_json(dataset.root / "calibration.json")
+    """Calibration from counts to reflectance, and the uncertainty of reflectance.
+
+    Raises:
+        InputError: ``calibration.json`` does not hold what `process` wrote there.
+    """
+    path = dataset.root / "calibration.json"
+    found = read_known(path)
+    try:
+        return _calibration_section(dataset, found)
+    except _WRONG_CONTENT as error:
+        raise InputError(f"{path}: holds no calibration ({error}); {_AGAIN}.") from error
+
+
+def _calibration_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:
     if found is None:
         missing = Missing("The dataset has no calibration.json, so nothing is known of its calibration.", _PROCESS)
         blocks: list[Block] = [missing]
@@ -207,8 +214,20 @@ def judge_masks(areas_px: Int[np.ndarray, "frames"], captures: Sequence[str]) ->
 
 
 def poses_section(dataset: PackedDataset) -> Section:
-    """Poses of the camera and their uncertainty."""
-    found = read_json(dataset.root / "poses.json")
+    """Poses of the camera and their uncertainty.
+
+    Raises:
+        InputError: ``poses.json`` does not hold what `process` wrote there.
+    """
+    path = dataset.root / "poses.json"
+    found = read_known(path)
+    try:
+        return _poses_section(dataset, found)
+    except _WRONG_CONTENT as error:
+        raise InputError(f"{path}: holds no poses ({error}); {_AGAIN}.") from error
+
+
+def _poses_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:
     if found is None:
         missing = Missing("The dataset has no poses.json, so nothing is known of how its poses were found.", _PROCESS)
         return Section("poses", "Poses", [missing])

@@ -17,7 +17,8 @@ from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Tab
 
 _MM_PER_M = 1000.0
 _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
-_WRONG_CONTENT = (AttributeError, KeyError, TypeError, ValueError)
+# What reading figures from another content, however damaged, ends in.
+_WRONG_CONTENT = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError)
 _F_SCORE_MISSING_PERCENT = (10.0, 30.0)
 _UNSEEN_FRACTION = 0.15
 _DRAWN_THRESHOLDS = 2.0
@@ -40,13 +41,14 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Se
         return Section("comparison", title, [Missing("The geometry was not compared with a reference.", command)])
     try:
         blocks += _comparison_blocks(comparison)
+        findings = judge_comparison(comparison)
     except _WRONG_CONTENT as error:
         raise InputError(f"{source}: is no comparison ({error}); make one with `hsi-sc-nerf compare`.") from error
     picture = source.with_name("distances.png")
     if picture.is_file():
         alt = "The cloud and the reference, coloured by the distance to the other"
         blocks.append(Folded("Where the distances are", [Figure([embedded_file(picture, alt)], f"{alt}.")]))
-    return Section("comparison", title, blocks, judge_comparison(comparison))
+    return Section("comparison", title, blocks, findings)
 
 
 def judge_comparison(comparison: Mapping[str, Any]) -> list[Finding]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 
 Spectrum = Float[np.ndarray, "bands"]
@@ -172,20 +172,20 @@ def read_materials(values: Any, source: str, folder: Path) -> dict[str, Material
         InputError: not such a mapping; an unknown, missing, mistyped or out-of-range value; see `read_spectrum`.
     """
     if not isinstance(values, dict):
-        raise InputError(f"{source}: materials must hold `name: definition` lines, not {values!r}.")
+        raise InputError(f"{source}: materials must hold `name: definition` lines, not {shown(values)}.")
     return {str(name): _read_material(value, source, f"materials.{name}", folder) for name, value in values.items()}
 
 
 def _read_material(value: Any, source: str, where: str, folder: Path) -> Material:
     if not isinstance(value, dict) or len(value) != 1 or not {*value} <= {*KINDS, "csv"}:
         raise InputError(
-            f"{source}: {where} is {value!r}, but must be one of `plant: {{plateau: ...}}`, `plain: {{level: ...}}` "
-            "and `csv: FILE`."
+            f"{source}: {where} is {shown(value)}, but must be one of `plant: {{plateau: ...}}`, "
+            "`plain: {level: ...}` and `csv: FILE`."
         )
     ((kind, content),) = value.items()
     if kind == "csv":
         if not isinstance(content, str):
-            raise InputError(f"{source}: {where}.csv is {content!r}, but must be the path of a CSV file.")
+            raise InputError(f"{source}: {where}.csv is {shown(content)}, but must be the path of a CSV file.")
         return read_spectrum(folder / content)
     material = read_dataclass(KINDS[kind], content, source, f"{where}.{kind}.")
     check_ranges(material, source, f"{where}.{kind}.")

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.ply_file import read_ply
 from hsi_sc_nerf.simulate.mesh import snapped, welded
 from hsi_sc_nerf.simulate.scene import OwnMesh
 
@@ -70,6 +70,8 @@ def _read_mesh_file(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | No
         raise InputError(f"{path}: there is no such file; give the path of the mesh, relative to the scene file.")
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: is not a mesh format that can be read; give one of {', '.join(FORMATS)}.")
+    if path.suffix.lower() == ".ply":
+        read_ply(path)  # trimesh believes what a header claims
     try:
         # UVs of PLY faces would split vertices, which then no longer match the file's vertex properties.
         read = trimesh.load_scene(path, process=False, fix_texture=False).dump()
@@ -83,6 +85,8 @@ def _read_mesh_file(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | No
         raise InputError(f"{path}: some vertices are not finite; export it again.")
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = np.concatenate([np.asarray(part.faces) + offset for part, offset in zip(parts, first, strict=False)])
+    if not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise InputError(f"{path}: its triangles name vertices that it has not; export it again.")
     colours = [of_part for part in parts if (of_part := _colours(part)) is not None]
     return vertices, triangles, np.concatenate(colours) if len(colours) == len(parts) else None
 
@@ -121,7 +125,7 @@ def _vertex_weights(settings: OwnMesh) -> Float[np.ndarray, "v materials"] | Non
     """Vertex properties ``weight_NAME`` of a PLY file; None if it has none of them."""
     if settings.mesh_file.suffix.lower() != ".ply":
         return None
-    table = PlyData.read(settings.mesh_file)["vertex"].data
+    table = read_ply(settings.mesh_file)["vertex"].data
     names = [f"weight_{name}" for name in settings.materials]
     missing = [name for name in names if name not in table.dtype.names]
     if len(missing) == len(names):

@@ -13,11 +13,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-import yaml
-
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
+from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass, read_yaml
 from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.effects import detector, image, light, motion
 from hsi_sc_nerf.simulate.effects.detector import SensorSettings
@@ -212,11 +210,7 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
     Raises:
         InputError: see `load_scene`.
     """
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
-        raise InputError(f"{source}: not valid YAML ({problem}); correct that line.") from error
+    values = read_yaml(text, source)
     if isinstance(values, dict):
         values.setdefault("name", name)
         values["materials"] = read_materials(values.get("materials", {}), source, folder)
@@ -286,7 +280,7 @@ def override(
     if seed is not None:
         scene = replace(scene, seed=seed)
     if effects is not None:
-        scene = replace(scene, effects=read_effects([yaml.safe_load(text) for text in effects], "--effects"))
+        scene = replace(scene, effects=read_effects([read_yaml(text, "--effects") for text in effects], "--effects"))
     check_ranges(scene, scene.name, "")
     return scene
 
@@ -313,7 +307,7 @@ def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
         elif isinstance(value, dict) and len(value) == 1:
             ((name, settings),) = value.items()
         else:
-            raise InputError(f"{source}: effect {value!r} is neither a name nor `name: {{setting: value}}`.")
+            raise InputError(f"{source}: effect {shown(value)} is neither a name nor `name: {{setting: value}}`.")
         if name not in EFFECTS:
             raise InputError(f"{source}: effect {name!r} is unknown; known are {', '.join(EFFECTS)}.")
         if name in found:

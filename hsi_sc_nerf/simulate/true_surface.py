@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from plyfile import PlyData
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
@@ -19,6 +18,7 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.ply_file import read_ply
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 from hsi_sc_nerf.spectra import composite, to_8_bit
 
@@ -150,7 +150,7 @@ class TrueSurface:
     @classmethod
     def of(cls, truth: Truth) -> TrueSurface:
         """The true surface of a simulated session."""
-        vertex = PlyData.read(str(truth.mesh_path))["vertex"]
+        vertex = read_ply(truth.mesh_path)["vertex"]
         columns = {p.name.removeprefix("weight_"): vertex[p.name] for p in vertex.properties if "weight_" in p.name}
         endmembers = truth.endmembers[[truth.materials.index(name) for name in columns]]
         return cls(

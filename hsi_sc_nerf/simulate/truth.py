@@ -15,8 +15,10 @@ from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.mesh import Mesh, ply_vertices
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.geometry.ply_file import ply_vertices
 from hsi_sc_nerf.simulate.assemble import MarkerLayout, marker_layout
 from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
@@ -108,8 +110,10 @@ def load_truth(session_dir: str | Path) -> Truth:
     """
     session_dir = Path(session_dir)
     path = session_dir / "truth" / "truth.json"
+    if not path.is_file():
+        raise InputError(f"{session_dir}: has no truth ({path.name} is missing); simulate the session.")
+    values = read_json(path, "simulate the session again")
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
         with (session_dir / "truth" / "endmembers.csv").open(encoding="utf-8", newline="") as file:
             table = np.array(list(csv.reader(file))[1:], float)
         return Truth(
@@ -128,9 +132,7 @@ def load_truth(session_dir: str | Path) -> Truth:
             effects=values["effects"],
             distortion=tuple(values.get("distortion", (0.0,) * 4)),
         )
-    except FileNotFoundError as error:
-        raise InputError(f"{session_dir}: has no truth ({path.name} is missing); simulate the session.") from error
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: cannot be read ({error!r}); simulate the session again.") from error
 
 

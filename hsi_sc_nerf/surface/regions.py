@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +13,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_picture
 from hsi_sc_nerf.geometry.visual_hull import silhouette_counts
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
@@ -122,7 +122,7 @@ def read_roi_masks(
         path = folder / frame.mask_path.name
         if not path.is_file():
             continue
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        picture = read_picture(path, 1)
         if picture is None or picture.shape != shape:
             raise InputError(f"{path}: is no picture of {shape[1]} x {shape[0]} pixels; paint on a copy of the mask.")
         masks[index] = picture > 127

@@ -97,6 +97,8 @@ def test_a_spectrum_is_refused_only_where_what_it_lacks_is_needed(tmp_path):
         ("ENVI Spectral Library", "ENVI Standard", "its file type is no spectral library"),
         ("{ green , brown }", "{ green }", "holds 2 spectra and names 1"),
         ("lines = 2", "lines = 3", r"library\.sli: is smaller than its header"),
+        ("lines = 2", "lines = 5000000000", r"library\.sli: is smaller than its header"),
+        ("samples = ", "samples = 999999", "more than 100000 bands"),
     ],
 )
 def test_envi_libraries_that_cannot_be_used_are_refused(tmp_path, old, new, says):

@@ -1,4 +1,5 @@
 import errno
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -192,3 +193,16 @@ def test_full_disk_leaves_the_old_cube(header, monkeypatch):
 def test_one_wavelength_a_band(tmp_path):
     with pytest.raises(ValueError, match="4 wavelengths for 3 bands"):
         write_cube(tmp_path / "c.hdr", some_cube(shape=(2, 2, 3)), wavelengths_nm=WAVELENGTHS_NM)
+
+
+@pytest.mark.parametrize("bands", ["4294967296", "9" * 14, "9" * 5000])
+def test_a_header_that_claims_more_than_there_can_be_takes_no_memory(header, bands):
+    edit(header, "bands = 4", f"bands = {bands}")
+    header.write_text(header.read_text().split("wavelength")[0])
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"cube\.hdr"):
+            open_cube(header)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()

@@ -259,6 +259,13 @@ def test_something_else_in_the_place_of_session_info_is_not_taken_for_none(tmp_p
         ('{"panel_reflectance": "."}', "panel_reflectance is '.', but must be the name of a CSV file beside"),
         ('{"panel_reflectance": 0.98}', "panel_reflectance is 0.98, but must be the name of a CSV file beside"),
         ('{"container_height_m": 0.07}', "one dimension of the container"),
+        (f'{{"marker_side_m": 1{"0" * 400}}}', "must be a positive number"),
+        (f'{{"marker_side_m": {"9" * 5000}}}', "no JSON object"),
+        (f'{{"frame_angles_deg": [0, 1{"0" * 400}]}}', "a list with one number a frame"),
+        (f'{{"band_centres": "{"a" * 5000}"}}', "the name of a CSV file beside"),
+        (f'{{"object": {"[" * 900}{"]" * 900}}}', "must be a text"),
+        ('{"object": "\\ud800"}', "no JSON object"),
+        ("[" * 100_000, "no JSON object"),
     ],
 )
 def test_bad_session_info(tmp_path, text, message):

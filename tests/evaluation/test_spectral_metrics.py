@@ -115,8 +115,11 @@ def test_identical_images_score_full_marks(mask: torch.Tensor | None) -> None:
     )
 
 
-def test_an_empty_mask_scores_like_identical_images() -> None:
-    predicted, target = pair()
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
+def test_an_empty_mask_scores_like_identical_images(dtype: torch.dtype) -> None:
+    predicted, target = (image.to(dtype) for image in pair())
+    for metric in IMAGE_METRICS:
+        assert metric(predicted, target, torch.zeros(H, W, dtype=torch.bool)).isfinite()
     assert metrics.spectral_metrics(predicted, target, torch.zeros(H, W, dtype=torch.bool)) == pytest.approx(
         {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
     )

@@ -10,7 +10,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_spectral_ply
-from hsi_sc_nerf.geometry.mesh import ply_triangles
+from hsi_sc_nerf.geometry.ply_file import ply_triangles
 
 
 @pytest.mark.parametrize(("count", "chunk"), [(50, 7), (50, 1000), (0, 7)])
@@ -123,13 +123,13 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path: Path, change: dict) -> Non
     ("spoil", "message"),
     [
         (lambda content: content[:-1], "early end-of-file"),
-        (lambda content: b"PK" + content, "no readable PLY"),
-        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "no readable PLY"),
+        (lambda content: b"PK" + content, "cannot be read as a PLY"),
+        (lambda content: content.replace(b"binary_little_endian", b"ascii"), "cannot be read as a PLY"),
         (lambda content: content.replace(b"float nz", b"float curvature"), "no nz"),
         (lambda content: content.replace(b"scalar_", b"band_"), "spectral bands"),
-        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "no readable PLY"),
-        (lambda content: content.split(b"end_header")[0], "no readable PLY"),
-        (lambda content: b"", "no readable PLY"),
+        (lambda content: content.replace(b"float nx", b"list uchar int nx"), "cannot be read as a PLY"),
+        (lambda content: content.split(b"end_header")[0], "cannot be read as a PLY"),
+        (lambda content: b"", "cannot be read as a PLY"),
         (None, "no such file"),
     ],
 )

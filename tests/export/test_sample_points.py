@@ -168,7 +168,7 @@ FACES = TRIANGLE + "element face 1\nproperty {}\nend_header\n0 0 0\n1 0 0\n0 1 0
     [
         (None, "there is no such file"),
         ("x y z\n0 0 0\n", "cannot be read"),
-        ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "cannot be read"),
+        ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "has no points"),
         (TRIANGLE + "property list uchar int near\nend_header\n" + 3 * "0 0 0 1 1\n", r"hold lists \(near\)"),
         (TRIANGLE + "end_header\n0 0 0\n1 nan 0\n0 1 0\n", "finite"),
     ],

@@ -142,6 +142,25 @@ def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset,
 
 
 @pytest.mark.slow
+def test_ctrl_c_is_one_line_and_names_the_last_checkpoint(tiny_dataset, tmp_path, capsys):
+    made = trainer(tiny_dataset, tmp_path, steps_per_save=2)
+    original = made.train_iteration
+
+    def interrupted(step):
+        if step == 3:
+            raise KeyboardInterrupt
+        return original(step)
+
+    made.train_iteration = interrupted
+    with pytest.raises(SystemExit) as ended:
+        made.train()
+    assert ended.value.code == 130
+    told = [line for line in capsys.readouterr().err.splitlines() if "stopped" in line]
+    assert told == [f"hsi-sc-nerf: stopped; --load-dir {made.checkpoint_dir} goes on from the last checkpoint."]
+    assert [path.name for path in made.checkpoint_dir.iterdir()] == ["step-000000002.ckpt"]
+
+
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monkeypatch):
     made = trainer(tiny_dataset, tmp_path)
     made.save_checkpoint(0)

@@ -112,8 +112,23 @@ def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
 
 def test_a_cache_of_an_earlier_version_is_not_finished(cube, tmp_path):
     paths, cache = process(cube, tmp_path / "data")
-    np.savez(paths.cache, fingerprint="made", gray=cache.gray)
+    with paths.cache.open("wb") as file:
+        np.savez(file, fingerprint="made", gray=cache.gray)
     assert read_cache(paths, "made") is None
+
+
+@pytest.mark.parametrize("kind", ["cache", "bins"])
+def test_a_damaged_note_is_not_believed(cube, tmp_path, kind):
+    paths, _ = process(cube, tmp_path / "data")
+    whole = getattr(paths, kind).read_bytes()
+    for at in range(0, len(whole), len(whole) // 60) if kind == "cache" else ():
+        getattr(paths, kind).write_bytes(whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :])
+        assert read_cache(paths, "made") is None
+    for damaged in (b"", whole[:-1], whole + b"0"):
+        getattr(paths, kind).write_bytes(damaged)
+        assert read_cache(paths, "made") is None
+    getattr(paths, kind).write_bytes(whole)
+    assert read_cache(paths, "made") is not None
 
 
 def test_a_frame_whose_pictures_cannot_be_written_has_no_cache(cube, tmp_path):

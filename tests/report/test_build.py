@@ -159,13 +159,24 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     (tmp_path / "report" / "inspection.json").write_text('{"findings": ["white"]}')
     with pytest.raises(InputError, match=r"inspection\.json: holds no findings"):
         inspection_section(SimpleNamespace(root=tmp_path))
+    dataset = open_packed(ball_run.write_ball_dataset(tmp_path / "ball"))
+    for name, content, section in (
+        ("calibration", {"dead": [[1], [1, 2]]}, calibration_section),
+        ("calibration", {"noise": {"read_noise_counts": [10**400]}}, calibration_section),
+        ("calibration", {"lamp_drift": [1]}, calibration_section),
+        ("poses", {"reprojection_error_px": {"overall": "1"}}, poses_section),
+        ("poses", {"frames": 3}, poses_section),
+    ):
+        write_json(dataset.root / f"{name}.json", content)
+        with pytest.raises(InputError, match=rf"{name}\.json: holds no"):
+            section(dataset)
     with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
         traits_section({"settings": {}}, run / "traits.json")
     (tmp_path / "broken.json").write_text("{")
     for sources, sentence in (
-        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no readable JSON"),
+        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no JSON object"),
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
     ):

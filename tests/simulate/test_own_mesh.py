@@ -186,7 +186,7 @@ def test_bad_meshes_get_one_sentence(tmp_path):
     refused(tmp_path, "not a mesh format", "ball.stl")
     for suffix in own_mesh.FORMATS:
         (tmp_path / f"broken{suffix}").write_bytes(b"ply\nnonsense\x00\xff")
-        with pytest.raises(InputError, match=r"cannot be read as a mesh|has no triangles"):
+        with pytest.raises(InputError, match=r"cannot be read as|has no triangles"):
             own_mesh.load(OwnMesh("mesh", tmp_path / f"broken{suffix}", ("a",)))
     save_ply(tmp_path / "ball.ply", vertices, triangles[:0], {})
     refused(tmp_path, "has no triangles")

@@ -1,0 +1,403 @@
+"""Damaged files of every kind that this package reads: each must be refused in one sentence, or be read.
+
+    uv run python benchmarks/damaged_files.py --inputs 100000
+
+Valid files are damaged at random: bytes are changed, parts are cut out, doubled or cut off, numbers and texts are
+replaced by such as break programs, values of JSON by others. Each damaged file is read as the commands read it.
+Counted are `InputError`, reading without error, any other exception, reading for more than `SLOW_S` of processor
+time, and memory beyond what a small file could hold. Inputs that did any of the last three are kept in --keep.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import json
+import os
+import random
+import re
+import resource
+import signal
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+from results_table import RESULTS, write_results
+from valid_files import write_valid_files
+
+from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError
+
+COLUMNS = ["kind of file", "inputs", "refused in one sentence", "read", "other exception", "slow", "much memory"]
+SLOW_S = 2.0
+STOPPED_S = 20.0
+MUCH_MEMORY_MB = 200.0
+ROOM_BYTES = 3 * 2**30
+"""Address space that reading may take beyond what the libraries have."""
+HOSTILE_TEXTS = (
+    *("", "0", "-1", "1", "2", "3", "255", "65536", "2147483648", "4294967296", "9" * 14, "9" * 20, "1" + "0" * 400),
+    *(
+        "9" * 5000,
+        "0.5",
+        "-0.0",
+        "1e-320",
+        "1e308",
+        "1e400",
+        "-1e400",
+        "nan",
+        "inf",
+        "1_000",
+        "0x" + "f" * 400,
+        "true",
+    ),
+    *("null", "None", "~", "[]", "{}", "{", "}", "[", "[[[[[[[[", "[" * 3000, "{" * 3000, "{1, 2}", "*a", "&a [*a]"),
+    *("<<: *a", "!!python/name:os.system", "a" * 5000, "../../../../etc/passwd", "/", ".", "..", "a/b", "a|b", "<b>"),
+    *(
+        "\0",
+        "\n",
+        "\r\n",
+        "\t",
+        "\x1b[31m",
+        "\ufeff",
+        "\u2028",
+        "\ud83d",
+        "\u0661\u0662",
+        "é",
+        "%s",
+        "{0}",
+        "$x$",
+        "°",
+        "end_header",
+    ),
+    *(
+        "element vertex 7",
+        "property float x",
+        "property list uchar int vertex_indices",
+        "lines = 7",
+        "&x;",
+        "<a>",
+        "</a>",
+    ),
+)
+HOSTILE_VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, -1, 1, 2, 7, 0.5, -0.0, 1e-320, 1e308, float("nan"), float("inf"), 2**31, 2**63, 10**400),
+    *(
+        "",
+        "a",
+        "1",
+        "nan",
+        "../a",
+        "/etc/passwd",
+        "a\0b",
+        "a\n|b<c>",
+        "\ud800",
+        "a" * 5000,
+        [],
+        {},
+        [[]],
+        [None],
+        [0],
+    ),
+    *([1, [2]], [[1, 2], [3]], {"a": 1}, [{}], [1e308] * 4, ["x"] * 5, {"": None}),
+)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes:
+        name: in the table.
+        path: a valid file, which is damaged.
+        read: reads it as a command does.
+        share: of all inputs, relative to others: slow readers get fewer.
+    """
+
+    name: str
+    path: Path
+    read: Callable[[], object]
+    share: float = 1.0
+
+
+@dataclass
+class Outcome:
+    """What became of the inputs of one kind."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    errors: Counter[str] = field(default_factory=Counter)
+
+    def row(self, name: str) -> list[str]:
+        """The line of the table."""
+        shown = [str(self.counts[key]) for key in ("refused", "read", "other", "slow", "memory")]
+        return [name, str(self.counts.total() - self.counts["slow"] - self.counts["memory"]), *shown]
+
+
+class TooSlowError(BaseException):
+    """Reading was stopped; no handler of exceptions takes it for one of its own."""
+
+
+def damaged(content: bytes, rng: random.Random) -> bytes:
+    """Content with one to four damages."""
+    for _ in range(rng.choice((1, 1, 1, 2, 2, 4))):
+        if content[:1] == b"{" and rng.random() < 0.6:
+            content = _damaged_json(content, rng)
+        elif b"\0" not in content[:2000] and rng.random() < 0.7:
+            content = _damaged_text(content, rng)
+        else:
+            content = _damaged_bytes(content, rng)
+    return content
+
+
+def _damaged_bytes(content: bytes, rng: random.Random) -> bytes:
+    # Headers are at the beginning, and break more.
+    start = rng.randrange(min(len(content), rng.choice((64, 512, len(content) + 1))) + 1)
+    end = min(len(content), start + rng.choice((1, 1, 2, 4, 8, 64, 1000)))
+    some = rng.choice((rng.randbytes(end - start), b"\0" * (end - start), b"\xff" * (end - start), b""))
+    doubled = content[start:end] * rng.choice((2, 2, 3, 50))
+    return rng.choice(
+        (content[:start] + some + content[end:], content[:start] + doubled + content[end:], content[:start])
+    )
+
+
+def _damaged_text(content: bytes, rng: random.Random) -> bytes:
+    """A word, a number or a line replaced by a hostile one, by another of the same text, or by nothing."""
+    pieces = re.split(rb"(\n)" if rng.random() < 0.25 else rb"([\s,=:<>{}\[\]\"]+)", content)
+    at = rng.randrange(len(pieces))
+    by = rng.choice((*HOSTILE_TEXTS, *("",) * 5)).encode("utf-8", "surrogatepass")
+    pieces[at] = by if rng.random() < 0.7 else rng.choice(pieces)
+    return b"".join(pieces)
+
+
+def _damaged_json(content: bytes, rng: random.Random) -> bytes:
+    try:
+        values = json.loads(content)
+    except (ValueError, RecursionError):
+        return _damaged_text(content, rng)
+    holders = [(at, key) for at in _containers(values) for key in (at if isinstance(at, dict) else range(len(at)))]
+    if not holders:
+        return _damaged_text(content, rng)
+    # Keys of the first levels break more than the numbers in long lists.
+    holder, key = rng.choice(holders[: rng.choice((10, 100, len(holders)))])
+    deed = rng.randrange(6)
+    if deed == 0:
+        del holder[key]
+    elif deed == 1 and isinstance(holder, list):
+        holder.insert(key, copy.deepcopy(holder[key]))
+    elif deed == 2:
+        holder[key] = [holder[key]]
+    else:
+        holder[key] = rng.choice(HOSTILE_VALUES)
+    return json.dumps(values).encode("utf-8", "surrogatepass")
+
+
+def _containers(values: Any) -> Iterator[Any]:
+    """All objects and lists that hold something, the outermost first."""
+    waiting = [values]
+    while waiting:
+        one = waiting.pop(0)
+        if isinstance(one, dict | list) and one:
+            yield one
+            waiting += one.values() if isinstance(one, dict) else one
+
+
+def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None) -> Outcome:
+    """Damage a kind's file ``inputs`` times, read it, and leave the valid file."""
+    outcome, valid = Outcome(), kind.path.read_bytes()
+    rng = random.Random(f"{seed} {kind.name}")
+    try:
+        for number in range(inputs):
+            content = damaged(valid, rng)
+            kind.path.write_bytes(content)
+            before_mb, started = _peak_mb(), time.process_time()
+            said, told = _outcome(kind.read)
+            outcome.counts[said] += 1
+            took_s, more_mb = time.process_time() - started, _peak_mb() - before_mb
+            if said == "other":
+                outcome.errors[told] += 1
+            for name, bad in (("slow", took_s > SLOW_S), ("memory", more_mb > MUCH_MEMORY_MB)):
+                if bad:
+                    outcome.counts[name] += 1
+                    outcome.errors[f"{name}: {took_s:.1f} s, {more_mb:.0f} MB ({said} {told[:80]})"] += 1
+            if keep is not None and (said == "other" or took_s > SLOW_S or more_mb > MUCH_MEMORY_MB):
+                keep.mkdir(parents=True, exist_ok=True)
+                (keep / f"{kind.name.replace(' ', '_')}-{number}{kind.path.suffix}").write_bytes(content)
+    finally:
+        kind.path.write_bytes(valid)
+    return outcome
+
+
+def _outcome(read: Callable[[], object]) -> tuple[str, str]:
+    def stop(*_: object) -> None:
+        raise TooSlowError
+
+    earlier = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, STOPPED_S)
+    try:
+        with _libraries_are_silent():
+            read()
+        return "read", ""
+    except InputError as error:
+        told = str(error)
+        one_line = told.isprintable() and 0 < len(told) <= LONGEST_MESSAGE
+        return ("refused", told) if one_line else ("other", f"message of {len(told)} characters: {told[:200]!r}")
+    except TooSlowError:
+        return "other", f"not done after {STOPPED_S:g} s"
+    except (Exception, SystemExit) as error:
+        frame = traceback.extract_tb(error.__traceback__)
+        ours = next((f for f in reversed(frame) if "hsi_sc_nerf/" in f.filename), frame[-1])
+        return "other", f"{type(error).__name__}: {str(error)[:100]!r} at {Path(ours.filename).name}:{ours.lineno}"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, earlier)
+
+
+@contextlib.contextmanager
+def _libraries_are_silent() -> Iterator[None]:
+    """Standard error into nothing, where libpng writes past Python."""
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def kinds(folder: Path) -> list[Kind]:
+    """Valid files of every kind under ``folder``, and how each is read."""
+    from hsi_sc_nerf.analysis.library import read_library
+    from hsi_sc_nerf.calibration.panel import read_panel
+    from hsi_sc_nerf.capture.envi import CubeLines, open_cube
+    from hsi_sc_nerf.capture.instrument import read_metadata
+    from hsi_sc_nerf.capture.session import open_session
+    from hsi_sc_nerf.capture.session_info import read_band_centres
+    from hsi_sc_nerf.evaluation.comparison import read_surface
+    from hsi_sc_nerf.export.ply import read_spectral_ply
+    from hsi_sc_nerf.export.sample_points import read_points
+    from hsi_sc_nerf.models.checkpoints import read_checkpoint
+    from hsi_sc_nerf.models.run_settings import read_config
+    from hsi_sc_nerf.packed.dataset import open_packed
+    from hsi_sc_nerf.processing.frames import FramePaths, read_cache
+    from hsi_sc_nerf.rendering.views import views_of_path
+    from hsi_sc_nerf.report.dataset_sections import calibration_section, inspection_section, poses_section
+    from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
+    from hsi_sc_nerf.settings_file import read_yaml
+    from hsi_sc_nerf.simulate.own_mesh import load as load_mesh
+    from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
+    from hsi_sc_nerf.simulate.truth import load_truth
+
+    files = write_valid_files(folder)
+    session, data, run = folder / "session", folder / "data", folder / "run"
+
+    def every_line(header: Path) -> None:
+        with CubeLines(open_cube(header)) as lines:
+            for line in range(lines.shape[0]):
+                lines[line]
+
+    def frame_of(use: Callable[[Any], object]) -> Callable[[], object]:
+        return lambda: use(open_packed(data).frames[0])
+
+    def every_point(path: Path) -> None:
+        read_points(path)
+        read_surface(path)
+        read_spectral_ply(path)
+
+    def judged(section: Callable[[Any], object]) -> Callable[[], object]:
+        dataset = open_packed(data)
+        return lambda: section(dataset)
+
+    first = session / "sphere_000" / "capture" / "sphere_000.hdr"
+    nm = open_cube(first).wavelengths_nm
+    note = FramePaths.of(data, "ball_0")
+    return [
+        Kind("ENVI header", first, lambda: every_line(first), 3.0),
+        Kind("ENVI header, in a session", first, lambda: open_session(session), 1.0),
+        Kind("ENVI cube", first.with_suffix(".raw"), lambda: every_line(first)),
+        Kind("session.json", session / "session.json", lambda: open_session(session), 1.5),
+        Kind("metadata (XML)", files["xml"], lambda: read_metadata(files["xml"]), 3.0),
+        Kind("band centres (CSV)", files["bands"], lambda: read_band_centres(files["bands"]), 1.5),
+        Kind("panel (CSV)", files["panel"], lambda: read_panel(files["panel"], nm), 1.5),
+        Kind("truth.json", session / "truth" / "truth.json", lambda: load_truth(session)),
+        Kind("transforms.json", data / "transforms.json", frame_of(lambda frame: frame.cube()), 3.0),
+        Kind("picture (PNG)", data / "images" / "ball_0.png", frame_of(lambda frame: frame.pseudo_rgb())),
+        Kind("mask (PNG)", data / "masks" / "ball_0.png", frame_of(lambda frame: frame.mask())),
+        Kind("note of a resume", note.cache, lambda: read_cache(note, "made"), 2.0),
+        Kind("bins of a resume", note.bins, lambda: read_cache(note, "made"), 0.5),
+        Kind("point cloud (binary PLY)", files["binary"], lambda: every_point(files["binary"]), 3.0),
+        Kind("point cloud (ASCII PLY)", files["ascii"], lambda: every_point(files["ascii"]), 2.0),
+        *(Kind(f"mesh ({s.upper()})", files[s], lambda s=s: read_surface(files[s]), 0.5) for s in ("obj", "stl")),
+        *(
+            Kind(
+                f"own mesh ({s.upper()})", files[s], lambda s=s: load_mesh(OwnMesh("mesh", files[s], ("skin",))), 0.3
+            )
+            for s in ("ply", "glb")
+        ),
+        Kind("spectral library (header)", files["library"], lambda: read_library(files["library"]), 2.0),
+        Kind("spectral library (data)", files["sli"], lambda: read_library(files["library"]), 0.5),
+        Kind("spectral library (CSV)", files["csv"], lambda: read_library(files["csv"]).at(nm), 1.5),
+        Kind("scene (YAML)", files["scene"], lambda: load_scene(files["scene"]), 0.7),
+        Kind("effects (YAML)", files["effects"], lambda: read_yaml(files["effects"].read_text("latin-1"), "e"), 0.5),
+        Kind("config.yml", run / "config.yml", lambda: read_config(run / "config.yml"), 0.05),
+        Kind("checkpoint", files["checkpoint"], lambda: read_checkpoint(files["checkpoint"]), 0.5),
+        Kind("camera path (JSON)", files["path"], lambda: views_of_path(files["path"]), 1.5),
+        Kind("calibration.json", data / "calibration.json", judged(calibration_section), 0.02),
+        Kind("poses.json", data / "poses.json", judged(poses_section), 0.02),
+        Kind("inspection.json", data / "report" / "inspection.json", judged(inspection_section), 1.0),
+        Kind("comparison.json", files["comparison"], lambda: comparison_section(*_json(files["comparison"])), 0.02),
+        Kind("traits.json", files["traits"], lambda: traits_section(*_json(files["traits"])), 1.5),
+    ]
+
+
+def _json(path: Path) -> tuple[dict[str, Any] | None, Path]:
+    from hsi_sc_nerf.report.dataset_sections import read_known
+
+    return read_known(path), path
+
+
+def main(
+    inputs: int = 100_000, seed: int = 0, only: str = "", keep: Path | None = None, results: Path = RESULTS
+) -> None:
+    """Damage and read files of every kind, and write the table.
+
+    Args:
+        inputs: of all kinds together.
+        seed: of the damages.
+        only: part of the names of the kinds to run; then no table is written.
+        keep: folder for inputs that were neither refused nor read in time and memory.
+        results: folder of the table.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "valid"
+        found = [kind for kind in kinds(folder) if only in kind.name]
+        for kind in found:  # valid, and compiled and imported before memory is watched
+            kind.read()
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + ROOM_BYTES, resource.RLIM_INFINITY))
+        shares, rows = sum(kind.share for kind in found), []
+        for kind in found:
+            started = time.monotonic()
+            outcome = run_kind(kind, round(inputs * kind.share / shares), seed, keep)
+            rows.append(outcome.row(kind.name))
+            print(f"{kind.name}: {time.monotonic() - started:.0f} s, {dict(outcome.counts)}", flush=True)
+            for told, count in outcome.errors.most_common(12):
+                print(f"    {count} x {told}", flush=True)
+        print(f"written outside: {[path for path in folder.parent.iterdir() if path != folder] or 'nothing'}")
+        rows.append(["all", *(str(sum(int(row[i]) for row in rows)) for i in range(1, len(COLUMNS)))])
+        if not only:
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+            write_results("damaged_files", COLUMNS, rows, seed=str(seed), folder=results)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError):
+        tyro.cli(main)

@@ -1,0 +1,75 @@
+"""Whatever goes wrong that a user can mend is one line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hsi_sc_nerf.cli import main as entry
+from hsi_sc_nerf.cli.sessions import MarkersCommand
+
+MAIN = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
+
+
+def test_a_file_that_the_system_refuses_is_one_line(monkeypatch, capsys):
+    def refused(self):
+        Path("/" + "a" * 300).read_bytes()
+
+    monkeypatch.setattr(MarkersCommand, "main", refused)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith("Error: /aaa")
+    assert told.count("\n") == 1
+
+
+def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
+    def broken(self):
+        raise OSError("no file is named")
+
+    monkeypatch.setattr(MarkersCommand, "main", broken)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    with pytest.raises(OSError, match="no file is named"):
+        entry.main()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
+def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(after_s):
+    started = subprocess.Popen([*MAIN, "process", "nowhere", "--output-dir", "x"], stderr=subprocess.PIPE, text=True)
+    time.sleep(after_s)
+    started.send_signal(signal.SIGINT)
+    told = started.communicate()[1]
+    ended = started.returncode, told
+    # Where it came too late, the session that is not there is the one line.
+    assert ended in [(130, "Stopped.\n"), (130, "Stopped; the same command goes on where it stopped.\n")] or (
+        ended[0] == 2 and told.startswith("Error: nowhere")
+    )
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
+    out = tmp_path / "data"
+    words = [*MAIN, "process", str(tiny_dataset[1]), "--output-dir", str(out)]
+    started = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=os.environ | {"TERM": "dumb"})
+    while not list(out.glob(".cache/*.note")):
+        assert started.poll() is None, started.stderr.read()
+        time.sleep(0.01)
+    while started.poll() is None:  # a library's callback may swallow one
+        started.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+    told = started.communicate()[1]
+    assert started.returncode == 130
+    assert told.splitlines()[-1] == "Stopped; the same command goes on where it stopped."
+    assert "Traceback" not in told
+    assert not list(out.rglob(".partial-*"))
+    assert not Path(out / "transforms.json").exists()
+    subprocess.run(words, check=True, capture_output=True)
+    for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
+        assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()

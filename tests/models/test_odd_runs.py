@@ -1,0 +1,29 @@
+"""Some of benchmarks/odd_runs.py in a few steps: runs end with finite weights, or with one sentence."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from odd_runs import CASES, simulated, train
+
+STOPS = {"all masks empty": "the masks of all training frames are empty", "two dead bands": "free of flagged values"}
+ENDS = ["1 band", "two frames, 180 degrees apart", "loss weights 0 and 1", "learning rates times 100"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("odd"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*ENDS, *STOPS])
+def test_odd_runs_end_finite_or_with_one_sentence(scene, tmp_path, name):
+    (case,) = (case for case in CASES if case.name == name)
+    ended = train(case, scene, tmp_path, steps=8)  # raises where a weight is not finite
+    assert STOPS.get(name, "") in ended.told
+    assert bool(ended.told) == (name in STOPS)
+    assert "\n" not in ended.told
+    assert name in STOPS or np.isfinite([ended.before, ended.after]).all()
