@@ -16,6 +16,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
+from hsi_sc_nerf.packed.effects import Effect
 
 TRANSFORMS_NAME = "transforms.json"
 _DISTORTION = ("k1", "k2", "p1", "p2")
@@ -115,6 +116,7 @@ class PackedDataset:
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         fingerprint: of the session and the settings that the dataset was made from.
+        effects: that the session calls for, and those that it does not; empty in datasets of older versions.
     """
 
     root: Path
@@ -135,6 +137,7 @@ class PackedDataset:
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
     fingerprint: str | None = None
+    effects: tuple[Effect, ...] = ()
 
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
@@ -204,6 +207,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
         **{name: None if array is None else array.tolist() for name, array in arrays.items()},
         **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "fingerprint")},
+        "effects": [asdict(effect) for effect in dataset.effects],
         "frames": [
             {
                 **{
@@ -266,8 +270,17 @@ def _parse_transforms(root: Path, content: dict[str, Any]) -> PackedDataset:
         frames=tuple(_parse_frame(root, frame) for frame in content["frames"]),
         pose_method=content.get("pose_method"),
         fingerprint=content.get("fingerprint"),
+        effects=tuple(_parse_effect(effect) for effect in content.get("effects", ())),
         **arrays,
     )
+
+
+def _parse_effect(content: dict[str, Any]) -> Effect:
+    numbers = {
+        name: None if content[name] is None else float(content[name]) for name in ("evidence", "noise", "threshold")
+    }
+    words = {name: str(content[name]) for name in ("name", "unit", "sentence")}
+    return Effect(present=bool(content["present"]), **words, **numbers)
 
 
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:

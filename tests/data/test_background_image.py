@@ -10,8 +10,6 @@ from hsi_sc_nerf.data.background_image import (
     estimate_static_background,
     inpaint,
     median_over_frames,
-    turntable_cylinders,
-    turntable_silhouette,
     wiener_filter,
 )
 from hsi_sc_nerf.files import write_png

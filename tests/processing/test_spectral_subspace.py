@@ -5,7 +5,7 @@ import pytest
 from packed_frames import packed_frame
 
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.data.spectral_subspace import (
+from hsi_sc_nerf.processing.spectral_subspace import (
     SpectralSubspace,
     estimate_noise,
     find_subspace,
