@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 CERTAIN = 3.0
 """Multiple of the noise that the evidence of an effect has to exceed."""
-EFFECT_COLUMNS = ("effect", "found", "evidence", "noise", "threshold", "what it means")
+EFFECT_COLUMNS = ("effect", "found", "evidence", "noise", "threshold", "unit")
+"""Columns of a table; a sentence may follow."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,15 @@ class Effect:
 def effect_rows(effects: Sequence[Effect]) -> list[list[str]]:
     """Rows of a table under `EFFECT_COLUMNS`."""
 
-    def text(value: float | None, unit: str = "") -> str:
-        return "-" if value is None else f"{value:.3g} {unit}".strip()
+    def text(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2g}" if abs(value) >= 1e-4 else "0"
 
     return [
         [
             effect.name,
             "yes" if effect.present else "no",
-            text(effect.evidence, effect.unit),
-            text(effect.noise),
-            text(effect.threshold),
-            effect.sentence,
+            *(text(value) for value in (effect.evidence, effect.noise, effect.threshold)),
+            effect.unit,
         ]
         for effect in effects
     ]

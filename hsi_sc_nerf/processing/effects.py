@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from rich.console import Console
 
 from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import PixelFlag
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.packed.effects import CERTAIN, Effect
+from hsi_sc_nerf.packed.effects import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
 from hsi_sc_nerf.plotting import new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -24,6 +25,7 @@ from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 from hsi_sc_nerf.processing.still_chamber import background_pixels, picture_of_chamber
 from hsi_sc_nerf.processing.view_changes import Change, change_with_direction, change_with_height
 from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.terminal import screen_table
 
 LEAST_VIEW_CHANGE_PERCENT = 1.0
 LEAST_PICTURE = 0.005
@@ -123,7 +125,7 @@ def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Eff
     change = 100.0 * (drift.factor - 1.0)
     largest = float(change.flat[np.abs(change).argmax()])
     done = "corrected" if corrected else "not corrected"
-    evidence = float(-np.log10(max(drift.p_value, 1e-99)))
+    evidence = max(0.0, -float(np.log10(max(drift.p_value, 1e-99))))
     sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
     return Effect(
         "lamp_drift", corrected, evidence, _LOG_P_NOISE, float(-np.log10(SIGNIFICANCE)), "-log10 p", sentence
@@ -151,9 +153,9 @@ def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames
         int(((frame.flags() & PixelFlag.SATURATED > 0) & mask).sum())
         for frame, mask in zip(dataset.frames, masks, strict=True)
     )
-    percent = 100.0 * saturated / max(int(masks.sum()), 1)
-    return _decided(
-        *("saturated_highlights", percent, 0.0, 0.0, "% of pixels"),
+    one_percent = max(int(masks.sum()), 1) / 100.0
+    return _decided(  # one pixel is there
+        *("saturated_highlights", saturated / one_percent, 0.0, 0.5 / one_percent, "% of pixels"),
         "Some of the object's pixels are saturated, and their saturated values are left out.",
         "No pixel of the object is saturated.",
     )
@@ -182,6 +184,13 @@ def uneven_light(seen: Sightings | None) -> Effect:
         "Like spectra differ in brightness by height and slope, as in shade; `material` decides after training.",
         "Like spectra are equally bright at all heights; `material` decides after training.",
     )
+
+
+def show_effects(console: Console, effects: Sequence[Effect]) -> None:
+    """Print the effects as a table, and what they mean."""
+    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="What the session calls for"))
+    for effect in effects:
+        console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
 
 
 def draw_effects(path: Path, effects: Sequence[Effect]) -> None:

@@ -36,10 +36,9 @@ from hsi_sc_nerf.packed.dataset import (
     transforms_path,
     write_transforms,
 )
-from hsi_sc_nerf.packed.effects import EFFECT_COLUMNS, effect_rows
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.effects import draw_effects, measure_effects
+from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.mask_checks import check_masks
@@ -56,7 +55,6 @@ from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.voted_hull import VotedHull, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
-from hsi_sc_nerf.terminal import screen_table
 
 
 @dataclass(frozen=True)
@@ -207,7 +205,7 @@ def process_session(
         drift = calibration.drift, calibration.drift_corrected
         effects = measure_effects(dataset, [cache.bins for cache in caches], masks, hull, drift, poses)
         draw_effects(output_dir / "report" / "effects.png", effects)
-    Console(stderr=True, quiet=not progress).print(screen_table(EFFECT_COLUMNS, effect_rows(effects)))
+    show_effects(console, effects)
     write_transforms(replace(dataset, effects=effects))
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir
