@@ -10,6 +10,8 @@ from hsi_sc_nerf.processing.voted_hull import voted_hull
 
 LENS = PinholeIntrinsics(128, 128, 240.0, 240.0, 64.0, 64.0)
 
+MISSING = 5  # the frame whose mask lacks its right half
+
 
 def facing(pose):
     """Cosine of the angle of incidence at each pixel of the sphere; 0 beside it."""
@@ -26,7 +28,9 @@ def seen():
     poses = np.stack([true_pose(angle) for angle in np.arange(0.0, 360.0, 15.0)])
     masks = np.stack([sphere_mask(pose, LENS) for pose in poses])
     images = [np.stack([facing(pose), np.full((LENS.h, LENS.w), 0.3)]) for pose in poses]
-    return poses, sightings(images, masks, poses, LENS, np.zeros(4), voted_hull(masks, poses, LENS))
+    hull = voted_hull(masks, poses, LENS)
+    masks[MISSING, :, LENS.w // 2 :] = False
+    return poses, sightings(images, masks, poses, LENS, np.zeros(4), hull)
 
 
 def test_points_lie_on_the_sphere_with_its_normals(seen):
@@ -51,6 +55,12 @@ def test_points_are_looked_up_where_the_camera_sees_them(seen):
     to_eye = poses[found.frame, :3, 3] - SPHERE_CENTRE_M
     assert ((outwards * to_eye).sum(axis=1) > 0.0).all()
     assert len(np.unique(found.frame)) == len(poses)
+
+
+def test_points_beside_the_mask_are_left_out(seen):
+    _, found = seen
+    number = np.bincount(found.frame)
+    assert number[MISSING] < 0.6 * number[MISSING - 1]
 
 
 def test_colours_are_means_of_neighbouring_bins():
