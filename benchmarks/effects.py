@@ -79,7 +79,12 @@ CASES = (
     Case("table wobbles by 0.001 degrees", ("{wobble: {amplitude_deg: 0.001}}",)),
     Case(
         "highlights beyond the detector's range",
-        ("{lamp: {fraction: 0.5}}", "{gloss: {roughness: 0.1}}", "{tarp_exposure: {exposure_factor: 0.5}}"),
+        (
+            "{lamp: {fraction: 0.5}}",
+            "{gloss: {roughness: 0.1}}",
+            "{saturation: {exposure_factor: 1.25}}",
+            "{tarp_exposure: {exposure_factor: 0.5}}",
+        ),
         ("view_dependence", "uneven_light", "saturated_highlights"),
     ),
     Case("poses wrong by 0.05 degrees", pose_error_deg=0.05),
