@@ -29,7 +29,7 @@ from hsi_sc_nerf.models.checkpoints import (
 from hsi_sc_nerf.models.chosen_effects import effects_setting
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
@@ -129,7 +129,7 @@ class StagedTrainer(Trainer):
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         # Evaluation and export build what was trained, whatever becomes of the dataset.
-        self.config.pipeline.model.effects = effects_setting(self._model.effects)
+        self._model_config.effects = effects_setting(self._model.effects)
         self.config.save_config()
         on_gpu = self.pipeline.device.type == "cuda"
         plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
@@ -142,7 +142,7 @@ class StagedTrainer(Trainer):
         Raises:
             InputError: the settings ask for others, or the checkpoint cannot be read.
         """
-        model, path = self.config.pipeline.model, self._checkpoint_to_load()
+        model, path = self._model_config, self._checkpoint_to_load()
         trained = None if path is None else read_checkpoint(path)["training"].get("effects")
         if trained is None or model.effects == trained:
             return
@@ -166,6 +166,10 @@ class StagedTrainer(Trainer):
     @property
     def _model(self) -> SpectralModel:
         return cast(SpectralModel, self.pipeline.model)
+
+    @property
+    def _model_config(self) -> SpectralModelConfig:
+        return cast(SpectralModelConfig, self.config.pipeline.model)
 
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
@@ -323,7 +327,7 @@ class StagedTrainer(Trainer):
                 "stage": {"name": stage.config.name, "start": stage.start},
                 "completed_stage": stage.config.name if step == stage.end - 1 else None,
                 "steps_since_update": self._steps_since_update,
-                "effects": self.config.pipeline.model.effects,
+                "effects": self._model_config.effects,
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)

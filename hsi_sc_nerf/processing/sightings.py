@@ -97,8 +97,8 @@ def sightings(
         image = colours_of(bins[frame])
         values = np.stack([ndimage.map_coordinates(colour, at, order=1) for colour in image], axis=-1)
         found.append((rows, np.full(len(rows), frame), normals[rows] @ pose[:3, :3], values))
-    columns = map(np.concatenate, zip(*found, strict=True))
-    return Sightings(*columns, points, normals)
+    point, frames, normal, reflectance = map(np.concatenate, zip(*found, strict=True))
+    return Sightings(point, frames, normal, reflectance, points, normals)
 
 
 def _pixels(

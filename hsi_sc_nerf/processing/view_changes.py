@@ -125,8 +125,8 @@ def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]],
     for held in range(len(products[0])):
         covariance = 0.0
         for sectors in products:
-            square = sum(part[0] for k, part in enumerate(sectors) if k != held)
-            right = sum(part[1] for k, part in enumerate(sectors) if k != held)
+            square = np.sum([part[0] for k, part in enumerate(sectors) if k != held], axis=0)
+            right = np.sum([part[1] for k, part in enumerate(sectors) if k != held], axis=0)
             ridge = _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
             effects = np.linalg.solve(square + ridge, right)
             own_square, own_right, size = sectors[held]

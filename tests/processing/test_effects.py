@@ -1,5 +1,6 @@
 """Decisions by evidence, and that `process` keeps them."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
-from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.cli.sessions import InspectCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 from hsi_sc_nerf.packed.effects import effect_rows
 from hsi_sc_nerf.poses.result import Uncertainty
 from hsi_sc_nerf.processing.effects import (
@@ -103,3 +106,14 @@ def test_process_keeps_the_decisions(tiny_dataset):
     assert 1 < found["spectral_rank"].evidence < 12
     assert (dataset.root / "report" / "effects.png").stat().st_size > 5000
     assert [row[1] for row in effect_rows(dataset.effects)].count("yes") == sum(e.present for e in dataset.effects)
+
+
+def test_inspect_tells_them_of_a_dataset(tiny_dataset, tmp_path, capsys):
+    InspectCommand(tiny_dataset[0]).main()
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in NAMES.split())
+    old = tmp_path / "old"
+    shutil.copytree(tiny_dataset[0], old)
+    write_transforms(replace(open_packed(old), effects=()))
+    with pytest.raises(InputError, match="process"):
+        InspectCommand(old).main()
