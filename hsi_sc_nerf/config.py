@@ -106,6 +106,7 @@ hsi_sc_nerf_paper = MethodSpecification(
             ),
             model=SpectralModelConfig(
                 head="direct",
+                effects="view_dependence",
                 background="last-sample",
                 angular_loss="cosine",
                 angular_loss_mult=paper.ANGULAR_LOSS_WEIGHT,

@@ -62,7 +62,7 @@ def write_untrained_run(data: Path, output_dir: Path) -> Path:
     config = deepcopy(hsi_sc_nerf.config)
     config.output_dir, config.experiment_name, config.timestamp = output_dir, "ball", "run"
     config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = data
-    config.pipeline.model.head, config.pipeline.model.background = "direct", "spectrum"
+    config.pipeline.model.head, config.pipeline.model.effects = "direct", "view_dependence"
     torch.manual_seed(0)
     pipeline = config.pipeline.setup(device="cpu", test_mode="test")
     state = {"step": 0, "pipeline": pipeline.state_dict()}

@@ -7,7 +7,7 @@ from hsi_sc_nerf.config import hsi_sc_nerf
 STEPS = 6
 
 
-def trainer(tiny_dataset, folder, device="cpu", **changes):
+def trainer(tiny_dataset, folder, device="cpu", effects="view_dependence,still_chamber,pose_refinement", **changes):
     config = copy.deepcopy(hsi_sc_nerf.config)
     config.pipeline.datamanager.data = tiny_dataset[0]
     config.pipeline.datamanager.train_num_rays_per_batch = 64
@@ -18,8 +18,7 @@ def trainer(tiny_dataset, folder, device="cpu", **changes):
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.machine.device_type = device
     config.max_num_iterations, config.evaluate_stages = STEPS, False
-    if model.camera_optimizer.mode == "auto":  # which is off for the tiny dataset's markers
-        model.camera_optimizer.mode = "turntable"
+    model.effects = effects
     for key, value in changes.items():
         setattr(config, key, value)
     made = config.setup(local_rank=0, world_size=1)

@@ -37,8 +37,8 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
         "--pipeline.model.num-nerf-samples-per-ray 24 --pipeline.model.distortion-loss-mult 0.02",
     ),
     "ours-direct-head": (OURS, "--pipeline.model.head direct"),
-    "ours-plain-background": (OURS, "--pipeline.model.background spectrum"),
-    "ours-not-view-dependent": (OURS, "--pipeline.model.view-dependent False"),
+    "ours-plain-background": (OURS, "--pipeline.model.effects view_dependence"),
+    "ours-not-view-dependent": (OURS, "--pipeline.model.effects still_chamber"),
     "ours-cosine-loss": (OURS, "--pipeline.model.angular-loss cosine --pipeline.model.angular-loss-mult 0.25"),
     "ours-nerfacto-distortion": (OURS, "--pipeline.model.distortion-loss-mult 0.002"),
     "ours-predicted-normals": (OURS, "--pipeline.model.predict-normals True"),
@@ -51,7 +51,7 @@ CONFIGURATIONS: dict[str, tuple[str, str]] = {
     "ours-whole-frames": (OURS, "--full-frame.foreground-ray-fraction None"),
     "ours-discarded-poses": (OURS, "--pipeline.model.camera-optimizer.mode free-discarded"),
     "ours-constant-rate": (OURS, "--full-frame.lr-end 1.0 --masked.lr-start 1.0 --masked.lr-end 1.0"),
-    "ours-refined-poses": (OURS, "--pipeline.model.camera-optimizer.mode turntable"),
+    "ours-refined-poses": (OURS, "--pipeline.model.effects view_dependence,still_chamber,pose_refinement"),
 }
 
 

@@ -17,6 +17,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import require_writable, write_json
 from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, draw_inspection, inspect_session, suggestion
 from hsi_sc_nerf.inspection.watch import Watch
+from hsi_sc_nerf.packed.dataset import is_packed, open_packed
+from hsi_sc_nerf.processing.effects import show_effects
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -114,11 +116,11 @@ class InspectCommand:
     """Check a session in seconds, before anything is computed from it.
 
     Prints a table of findings: green is as it should be, amber is worth a look, red would spoil the results. Exits
-    with status 2 if something is red.
+    with status 2 if something is red. Of a processed dataset, prints the effects that the session calls for.
     """
 
     session: tyro.conf.Positional[Path]
-    """Folder of the capture session."""
+    """Folder of the capture session, or of a dataset that `process` made of it."""
     output_dir: Path | None = None
     """Folder to write inspection.json and inspection.png to."""
     exclude: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -135,6 +137,17 @@ class InspectCommand:
         console = Console()
         if self.watch:
             self._watch(console)
+            return
+        if is_packed(self.session):
+            dataset = open_packed(self.session)
+            if not dataset.effects:
+                raise InputError(
+                    f"{self.session}: was processed by an older version, which did not look for effects; process the "
+                    "session again."
+                )
+            show_effects(console, dataset.effects)
+            picture = f"{dataset.root / 'report' / 'effects.png'} shows the evidence over the thresholds."
+            console.print(picture, highlight=False, markup=False, soft_wrap=True)
             return
         if self.output_dir is not None:
             require_writable(self.output_dir)

@@ -7,7 +7,6 @@ frame, in which the field lives, the chamber moves with the camera, and no field
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,29 +19,25 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
-BackgroundKind = Literal["last-sample", "spectrum", "image"]
-
 
 def make_background(
-    kind: BackgroundKind, dataset: PackedDataset, frames: Sequence[PackedFrame], from_checkpoint: bool = False
-) -> Background | None:
-    """The background of a dataset; None for "last-sample", which has none.
+    dataset: PackedDataset, frames: Sequence[PackedFrame], *, picture: bool, from_checkpoint: bool = False
+) -> Background:
+    """The background of a dataset.
 
     Args:
-        kind: how the chamber is represented.
         dataset: camera, and the chamber's median spectrum.
         frames: training frames, from which the picture of the chamber is taken.
+        picture: whether there is one; otherwise the background is the median spectrum.
         from_checkpoint: a checkpoint replaces the picture, which is not looked for; only its size is right.
     """
-    if kind == "last-sample":
-        return None
     spectrum = torch.from_numpy(dataset.background_reflectance).float()
     image, cell_px = None, 1
-    if kind == "image" and from_checkpoint:
+    if picture and from_checkpoint:
         cell_px = background_cell_px(dataset)
         cells = (-(-side_px // cell_px) for side_px in (dataset.intrinsics.h, dataset.intrinsics.w))
         image = np.zeros((*cells, len(spectrum)), np.float32)
-    elif kind == "image":
+    elif picture:
         image, cell_px = estimate_static_background(dataset, frames)
     k1, k2, p1, p2 = dataset.distortion.tolist()
     return Background(

@@ -37,19 +37,18 @@ class PoseRefinementConfig(CameraOptimizerConfig):
     mode: Literal["auto", "off", "turntable", "free-discarded"] = "auto"  # type: ignore[assignment]
     """Degrees of freedom. turntable: the camera before the axis, and the table's angle in each frame. free-discarded:
     a rotation and a shift of each frame, reset to zero after the first stage and never applied to held-out views, as
-    in the paper's published code. off: none. auto: off for poses from markers, which training does not improve
-    (docs/concepts/poses.md), turntable for all others."""
+    in the paper's published code. off: none. auto: turntable if effects have pose_refinement, otherwise off."""
 
-    def setup(self, pose_method: str | None = None, **kwargs) -> PoseRefinement:
+    def setup(self, refine: bool = False, **kwargs) -> PoseRefinement:
         """The refinement of the selected mode.
 
         Args:
-            pose_method: how the poses were measured (``PackedDataset.pose_method``); decides mode "auto".
+            refine: whether mode "auto" refines.
             **kwargs: arguments of `PoseRefinement`.
         """
         mode = self.mode
         if mode == "auto":
-            mode = "off" if pose_method == "markers" else "turntable"
+            mode = "turntable" if refine else "off"
         kinds = {"turntable": TurntableRefinement, "free-discarded": DiscardedRefinement}
         # nerfstudio decides by the mode whether there are parameters.
         return kinds.get(mode, PoseRefinement)(replace(self, mode=mode), **kwargs)

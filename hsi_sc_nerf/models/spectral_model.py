@@ -24,7 +24,7 @@ from torch.nn import Parameter
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import FROM_CHECKPOINT
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
-from hsi_sc_nerf.data.spectral_subspace import SpectralSubspace, training_subspace
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import (
     metrics_of_regions,
     spectral_angle_map,
@@ -35,7 +35,8 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
 from hsi_sc_nerf.fields.spectral_field import SpectralField
-from hsi_sc_nerf.models.backgrounds import BackgroundKind, make_background
+from hsi_sc_nerf.models.backgrounds import make_background
+from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
@@ -45,6 +46,7 @@ from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting import ANGLE_DRAWN_RAD, ERROR_DRAWN
+from hsi_sc_nerf.processing.spectral_subspace import SpectralSubspace, training_subspace
 
 METRIC_STRIDE = 8
 """The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
@@ -58,10 +60,14 @@ class SpectralModelConfig(NerfactoModelConfig):
     head: Literal["direct", "basis"] = "basis"
     """Output of the field at a sample. direct: the reflectance in every band. basis: a few coefficients in a basis of
     spectra that is found in the training pixels; they are decoded to all bands once a pixel."""
-    background: BackgroundKind = "image"
-    """Spectrum of the light that the object lets through. image: a picture of the chamber, which stands still with
-    the camera, taken from the frames. spectrum: the chamber's median spectrum. last-sample: that of the last sample
-    of the ray, as in nerfacto."""
+    effects: str = "auto"
+    """What is simulated, joined by commas: view_dependence (a point's spectrum depends on the viewing direction, by
+    gloss or by lamps before which the object turns), still_chamber (the background is a picture of the chamber, taken
+    from the frames, instead of its median spectrum), pose_refinement (training moves the poses). none: nothing of it.
+    auto: what the dataset calls for (docs/validation/effects.md)."""
+    background: Literal["chamber", "last-sample"] = "chamber"
+    """Spectrum of the light that the object lets through. chamber: the chamber's. last-sample: that of the last
+    sample of the ray, as in nerfacto."""
     angular_loss: Literal["cosine", "angle"] = "angle"
     """Loss of the spectral angle. cosine: one minus its cosine (the paper), whose gradient vanishes at small angles.
     angle: the angle in radians, whose weight has to be about ten times smaller."""
@@ -72,9 +78,6 @@ class SpectralModelConfig(NerfactoModelConfig):
     distortion_loss_mult: float = 0.001
     """Weight of the distortion loss, which concentrates the density along a ray. Distances are scene units, or with
     proposal networks fractions of the ray (docs/notes/dead_ends.md)."""
-    view_dependent: bool = True
-    """Let a point's spectrum depend on the viewing direction, which represents gloss and the shading of lamps that
-    stand still while the object turns."""
     predict_normals: bool = False
     """Predict normals, as the paper does. Steps take half again as long, and the cloud has the density's."""
     near_plane: float = 0.01
@@ -103,6 +106,10 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Refinement of the measured poses."""
 
     def __post_init__(self) -> None:
+        try:
+            require_effects(self.effects)
+        except InputError as error:
+            raise SystemExit(f"hsi-sc-nerf: {error}") from error
         if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
             raise SystemExit(
                 "hsi-sc-nerf: an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 "
@@ -119,6 +126,9 @@ class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
     It adds the output ``spectral`` (reflectance, a value a band) to nerfacto's; ``rgb`` is three of its bands.
+
+    Attributes:
+        effects: that are simulated (`MODEL_EFFECTS`).
     """
 
     config: SpectralModelConfig
@@ -136,6 +146,7 @@ class SpectralModel(NerfactoModel):
         Model.populate_modules(self)
         config, metadata = self.config, self.kwargs["metadata"]
         dataset: PackedDataset = metadata["dataset"]
+        self.effects = chosen_effects(config.effects, dataset)
         self.wavelengths_nm = dataset.wavelengths_nm
         self.rgb_bands: list[int] = metadata["rgb_bands"]
         from_checkpoint: bool = metadata.get(FROM_CHECKPOINT, False)
@@ -154,13 +165,21 @@ class SpectralModel(NerfactoModel):
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
         self.camera_optimizer = config.camera_optimizer.setup(
-            pose_method=dataset.pose_method, num_cameras=self.num_train_data, device="cpu", **metadata["turntable"]
+            refine="pose_refinement" in self.effects,
+            num_cameras=self.num_train_data,
+            device="cpu",
+            **metadata["turntable"],
         )
         if contraction is None:
             self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane)  # type: ignore[assignment]
-        self.background = make_background(config.background, dataset, metadata["frames"], from_checkpoint)
+        picture = "still_chamber" in self.effects
+        self.background = (
+            None
+            if config.background == "last-sample"
+            else make_background(dataset, metadata["frames"], picture=picture, from_checkpoint=from_checkpoint)
+        )
 
         self.renderer_rgb = SpectralRenderer(last_sample_behind=self.background is None)
         self.renderer_accumulation = AccumulationRenderer()
@@ -188,7 +207,7 @@ class SpectralModel(NerfactoModel):
         return SpectralField(
             self.scene_box.aabb,
             num_bands=len(dataset.wavelengths_nm),
-            view_dependent=config.view_dependent,
+            view_dependent="view_dependence" in self.effects,
             skip_unseen=config.num_proposal_iterations == 0,
             spatial_distortion=contraction,
             hidden_dim=config.hidden_dim,

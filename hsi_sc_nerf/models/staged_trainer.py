@@ -27,9 +27,10 @@ from hsi_sc_nerf.models.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
+from hsi_sc_nerf.models.chosen_effects import effects_setting
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
-from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
     Stage,
     StageConfig,
@@ -124,15 +125,35 @@ class StagedTrainer(Trainer):
         self._guard = NonFiniteGuard()
         self._captured: CapturedSteps | None = None
         try:
+            self._keep_effects()
             super().setup(test_mode)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         except KeyboardInterrupt:
             self._tell_that_it_stopped()
+        # Evaluation and export build what was trained, whatever becomes of the dataset.
+        self._model_config.effects = effects_setting(self._model.effects)
+        self.config.save_config()
         on_gpu = self.pipeline.device.type == "cuda"
         plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
         if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
             self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
+
+    def _keep_effects(self) -> None:
+        """Go on with the effects of the checkpoint that is to be loaded.
+
+        Raises:
+            InputError: the settings ask for others, or the checkpoint cannot be read.
+        """
+        model, path = self._model_config, self._checkpoint_to_load()
+        trained = None if path is None else read_checkpoint(path)["training"].get("effects")
+        if trained is None or model.effects == trained:
+            return
+        if model.effects != "auto":
+            raise InputError(
+                f"{path}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."
+            )
+        model.effects = trained
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimisers that skip non-finite steps."""
@@ -148,6 +169,10 @@ class StagedTrainer(Trainer):
     @property
     def _model(self) -> SpectralModel:
         return cast(SpectralModel, self.pipeline.model)
+
+    @property
+    def _model_config(self) -> SpectralModelConfig:
+        return cast(SpectralModelConfig, self.config.pipeline.model)
 
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
@@ -318,6 +343,7 @@ class StagedTrainer(Trainer):
                 "stage": {"name": stage.config.name, "start": stage.start},
                 "completed_stage": stage.config.name if step == stage.end - 1 else None,
                 "steps_since_update": self._steps_since_update,
+                "effects": self._model_config.effects,
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
@@ -331,13 +357,15 @@ class StagedTrainer(Trainer):
                 if older != path:
                     older.unlink()
 
+    def _checkpoint_to_load(self) -> Path | None:
+        if self.config.load_dir is not None:
+            return find_checkpoint(self.config.load_dir, self.config.load_step)
+        return self.config.load_checkpoint
+
     def _load_checkpoint(self) -> None:
         """Load a checkpoint of `save_checkpoint`, with the contents of ``training``."""
-        if self.config.load_dir is not None:
-            path = find_checkpoint(self.config.load_dir, self.config.load_step)
-        elif self.config.load_checkpoint is not None:
-            path = self.config.load_checkpoint
-        else:
+        path = self._checkpoint_to_load()
+        if path is None:
             return
         state = read_checkpoint(path)
         self._start_step = state["step"] + 1

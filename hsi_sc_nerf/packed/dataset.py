@@ -15,6 +15,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json, read_picture, write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
+from hsi_sc_nerf.packed.effects import Effect
 from hsi_sc_nerf.settings_file import read_dataclass
 
 TRANSFORMS_NAME = "transforms.json"
@@ -116,6 +117,7 @@ class PackedDataset:
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         fingerprint: of the session and the settings that the dataset was made from.
+        effects: that the session calls for, and those that it does not; empty in datasets of older versions.
     """
 
     root: Path
@@ -136,6 +138,7 @@ class PackedDataset:
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
     fingerprint: str | None = None
+    effects: tuple[Effect, ...] = ()
 
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
@@ -205,6 +208,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
         **{name: None if array is None else array.tolist() for name, array in arrays.items()},
         **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "fingerprint")},
+        "effects": [asdict(effect) for effect in dataset.effects],
         "frames": [
             {
                 **{
@@ -274,8 +278,18 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
         frames=tuple(_parse_frame(root, frame) for frame in content["frames"]),
         pose_method=content.get("pose_method"),
         fingerprint=content.get("fingerprint"),
+        effects=tuple(_parse_effect(effect) for effect in content.get("effects", ())),
         **arrays,
     )
+
+
+def _parse_effect(content: dict[str, Any]) -> Effect:
+    def number(name: str) -> float | None:
+        return None if content[name] is None else float(content[name])
+
+    name, unit, sentence = (str(content[key]) for key in ("name", "unit", "sentence"))
+    evidence, noise, threshold = map(number, ("evidence", "noise", "threshold"))
+    return Effect(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
 
 
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:

@@ -267,6 +267,9 @@ class Adjusted:
     displaced_frames: Mapping[int, float] = field(default_factory=dict)
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    """How strongly the sightings call for lens_distortion and for wobble: -log10 of the probability that chance alone
+    lowers the squares as much."""
 
     @cached_property
     def cost(self) -> float:

@@ -23,13 +23,15 @@ from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
 LOSS_SIGMAS = 3.0
 """Whitened residuals beyond this many standard deviations count by their size, not its square."""
-# Strict, for errors of neighbouring corners are not quite independent.
-_LEVEL = 1e-6
+EVIDENCE_NEEDED = 6.0
+"""Least -log10 of the probability under the simpler model; strict, for errors of neighbouring corners are not quite
+independent."""
 # A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
 _FIRST_SPREAD = (0.02, 0.01)
 _LEAST_SPREAD = (1e-5, 1e-6)
 # At most this fraction of the frames, but at least one, is displaced; if more call for a motion, the table wobbles.
 _MOST_DISPLACED = 0.1
+_SMALLEST_P = 1e-99
 # Numbers that describe a frame's own motion: angle, tilts (2), shifts (3).
 _FRAME_PARAMETERS = 6
 # A marker is ignored if its corners stay this many standard deviations (RMS) away from the freely moved frame.
@@ -72,7 +74,8 @@ def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted
         return without_displaced
     for _ in range(2):
         free = FreeParameters(motion_sigmas=_motion_spread(wobbling.turntable))
-        wobbling = solve(replace(wobbling.turntable, radial=(0.0, 0.0)), free)
+        again = solve(replace(wobbling.turntable, radial=(0.0, 0.0)), free)
+        wobbling = replace(again, evidence=wobbling.evidence)
     return _with_lens(wobbling, solve)
 
 
@@ -134,7 +137,9 @@ def _steady(start: Turntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]
     steady = _with_lens(steady, solve)
     sigmas = (_FIRST_SPREAD[0], _FIRST_SPREAD[1] * steady.turntable.distance)
     wobbling = solve(steady.turntable, replace(steady.problem.free, motion_sigmas=sigmas))
-    return steady, wobbling if _is_better(wobbling, steady) else None
+    found = _evidence(wobbling, steady)
+    both = {**steady.evidence, "wobble": found}
+    return replace(steady, evidence=both), replace(wobbling, evidence=both) if found > EVIDENCE_NEEDED else None
 
 
 def _without_displaced_frames(start: Turntable, observations: MarkerObservations) -> Adjusted | None:
@@ -155,7 +160,7 @@ def _without_displaced_frames(start: Turntable, observations: MarkerObservations
     angles = start.angles_rad.copy()
     angles[np.isin(start.frames, steady.turntable.frames)] = steady.turntable.angles_rad
     judged = frame_motions(replace(steady.turntable, frames=start.frames, angles_rad=angles), observations)
-    displaced = judged.p_value < _LEVEL
+    displaced = judged.p_value < 10.0**-EVIDENCE_NEEDED
     if not 0 < displaced.sum() <= most:
         return None
     if not np.array_equal(start.frames[displaced], likeliest):
@@ -174,18 +179,21 @@ def _motion_spread(turntable: Turntable) -> tuple[float, float]:
 
 def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
     """With as many terms of radial distortion as the corners call for, one after the other."""
+    evidence = {**plain.evidence, "lens_distortion": 0.0}
     for terms in (1, 2):
         distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))
-        if not _is_better(distorted, plain):
+        found = _evidence(distorted, plain)
+        evidence["lens_distortion"] = max(found, evidence["lens_distortion"])
+        if found <= EVIDENCE_NEEDED:
             break
         plain = distorted
-    return plain
+    return replace(plain, evidence=evidence)
 
 
-def _is_better(more: Adjusted, less: Adjusted) -> bool:
-    """F-test of nested models."""
+def _evidence(more: Adjusted, less: Adjusted) -> float:
+    """F-test of nested models: -log10 of the probability under the simpler one."""
     extra = more.problem.layout.size - less.problem.layout.size
     if more.problem.numbers <= more.problem.layout.size:
-        return False
+        return 0.0
     ratio = (less.cost - more.cost) / extra / more.variance
-    return bool(f_distribution.sf(ratio, extra, more.degrees_of_freedom) < _LEVEL)
+    return float(-np.log10(max(f_distribution.sf(ratio, extra, more.degrees_of_freedom), _SMALLEST_P)))

@@ -65,6 +65,7 @@ def in_object_frame(
         disc_tilt_deg=disc_tilt_deg(turntable),
         model="turntable" if tilts is None else "free poses",
         wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
+        evidence=dict(adjusted.evidence),
         metric=source is not None,
         scale=None if source is None else _scale(adjusted, turntable, markers, uncertainty.size, source, info),
         uncertainty=replace(uncertainty, angle_deg=turntable.over_session(uncertainty.angle_deg, n)),

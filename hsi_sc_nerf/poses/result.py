@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -119,6 +120,9 @@ class TurntablePoses:
     """One axis and one angle a frame; or, for a table that wobbles, small motions of each frame beside its angle."""
     wobble_deg: float | None = None
     """Root mean square of the table's tilts off its mean axis, where the poses are free."""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    """How strongly the images call for lens_distortion and for wobble, where the method decides it: -log10 of the
+    probability that chance alone fits as well."""
     outliers: tuple[RejectedMarker, ...] = ()
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""

@@ -38,6 +38,7 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
 from hsi_sc_nerf.processing.fingerprint import session_fingerprint
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
 from hsi_sc_nerf.processing.mask_checks import check_masks
@@ -200,7 +201,12 @@ def process_session(
         pose_method=poses.method,
         fingerprint=fingerprint,
     )
-    write_transforms(dataset)
+    with console.status("looking for the effects that the session calls for"):
+        drift = calibration.drift, calibration.drift_corrected
+        effects = measure_effects(dataset, [cache.bins for cache in caches], masks, hull, drift, poses)
+        draw_effects(output_dir / "report" / "effects.png", effects)
+    show_effects(console, effects)
+    write_transforms(replace(dataset, effects=effects))
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir
 

@@ -18,6 +18,7 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
 from hsi_sc_nerf.report.dataset_sections import (
     calibration_section,
+    effects_section,
     inspection_section,
     masks_section,
     poses_section,
@@ -100,6 +101,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         *results,
         training_section(read_scalars(folder), stage_ends(folder)),
         calibration_section(dataset),
+        *effects_section(dataset),
         masks_section(dataset),
         poses_section(dataset),
         _settings(folder),

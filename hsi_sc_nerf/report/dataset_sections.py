@@ -14,6 +14,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.packed.effects import EFFECT_COLUMNS, effect_rows
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
@@ -71,6 +72,19 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
     except (AttributeError, KeyError, TypeError) as error:
         raise InputError(f"{path}: holds no findings ({error}); inspect the session again.") from error
     return [Section("inspection", "The session", [], findings)]
+
+
+def effects_section(dataset: PackedDataset) -> list[Section]:
+    """The effects that the session calls for; nothing of a dataset that does not know them."""
+    if not dataset.effects:
+        return []
+    rows = [
+        (*row, effect.sentence) for row, effect in zip(effect_rows(dataset.effects), dataset.effects, strict=True)
+    ]
+    table = Table("The effects that the session calls for.", (*EFFECT_COLUMNS, ""), rows)
+    return [
+        Section("effects", "Effects", [table, *_folded_picture(dataset, "effects.png", "Evidence over threshold")])
+    ]
 
 
 def calibration_section(dataset: PackedDataset) -> Section:

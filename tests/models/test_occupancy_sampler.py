@@ -87,13 +87,13 @@ def test_what_a_checkpoint_replaces_has_its_shape_and_is_not_looked_for(tmp_path
     dataset = open_packed(write_ball_dataset(tmp_path))
     sides = torch.from_numpy(np.ptp(dataset.scene_box_m, axis=0)).float()
     aabb = torch.stack([-sides, sides]) / sides.max()
-    found = build_occupancy(dataset, dataset.frames, aabb), make_background("image", dataset, dataset.frames)
+    found = build_occupancy(dataset, dataset.frames, aabb), make_background(dataset, dataset.frames, picture=True)
     for frame in dataset.frames:
         frame.mask_path.unlink()
         frame.cube_path.unlink()
     empty = (
         build_occupancy(dataset, dataset.frames, aabb, True),
-        make_background("image", dataset, dataset.frames, True),
+        make_background(dataset, dataset.frames, picture=True, from_checkpoint=True),
     )
     for module, replaced in zip(found, empty, strict=True):
         replaced.load_state_dict(module.state_dict())

@@ -54,9 +54,9 @@ def rays_of(poses, frame):
     return cameras.generate_rays(camera_indices=0, keep_shape=True)
 
 
-def refinement(poses, train, mode="turntable", pose_method=None):
+def refinement(poses, train, mode="turntable", refine=False):
     return PoseRefinementConfig(mode=mode).setup(
-        pose_method=pose_method,
+        refine=refine,
         num_cameras=len(train),
         device="cpu",
         camera_to_world=poses[0],
@@ -74,12 +74,9 @@ def learn_something(learned, size=0.05):
     return learned
 
 
-@pytest.mark.parametrize(
-    ("pose_method", "kind"),
-    [("markers", PoseRefinement), ("colmap", TurntableRefinement), (None, TurntableRefinement)],
-)
-def test_by_default_all_poses_but_those_from_markers_are_refined(pose_method, kind):
-    assert type(refinement(session(), TRAIN, PoseRefinementConfig().mode, pose_method)) is kind
+@pytest.mark.parametrize(("refine", "kind"), [(False, PoseRefinement), (True, TurntableRefinement)])
+def test_by_default_the_models_effects_decide(refine, kind):
+    assert type(refinement(session(), TRAIN, PoseRefinementConfig().mode, refine)) is kind
 
 
 def test_twists_that_change_no_image_are_left_out():

@@ -21,7 +21,7 @@ from hsi_sc_nerf.poses.marker_outliers import (
     without_uncertain_frames,
 )
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.model_selection import frame_motions, select_model
+from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, frame_motions, select_model
 from hsi_sc_nerf.poses.object_frame import apparent_sides
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.report import pose_report
@@ -77,6 +77,17 @@ def test_a_steady_table_and_a_straight_lens_stay_so(seed):
     found = solved(machine, marker_observations(machine, seed=seed)).turntable
     assert found.tilts_rad is None
     assert found.radial == (0.0, 0.0)
+
+
+def test_evidence_is_kept_of_what_was_decided():
+    scene = MarkerScene(size_px=256, frames=14)
+    plain, curved = (marker_turntable(scene, radial=radial) for radial in ((0.0, 0.0), (-0.15, 0.0)))
+    straight, lens = (solved(machine, marker_observations(machine)).evidence for machine in (plain, curved))
+    assert straight.keys() == lens.keys() == {"lens_distortion", "wobble"}
+    assert max(straight.values()) < EVIDENCE_NEEDED < lens["lens_distortion"]
+    assert lens["wobble"] < EVIDENCE_NEEDED
+    steady = wobbling(0.5, frames=12)
+    assert solved(steady, marker_observations(steady)).evidence["wobble"] > EVIDENCE_NEEDED
 
 
 def test_a_disc_that_sits_askew_on_a_steady_axis_is_no_wobble():

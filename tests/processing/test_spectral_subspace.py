@@ -5,16 +5,16 @@ import pytest
 from packed_frames import packed_frame
 
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.data.spectral_subspace import (
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_png
+from hsi_sc_nerf.packed.cube import FLAGGED, ReflectanceUncertainty, pack, write_packed_cube
+from hsi_sc_nerf.processing.spectral_subspace import (
     SpectralSubspace,
     estimate_noise,
     find_subspace,
     pixel_noise,
     sample_training_spectra,
 )
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.packed.cube import FLAGGED, ReflectanceUncertainty, pack, write_packed_cube
 
 BANDS = 60
 MAIZE = Path(__file__).parents[1] / "real_cubes" / "maize_kernel"

@@ -1,0 +1,239 @@
+"""The effects that a session calls for, from what is known at the end of its processing.
+
+What calibration and poses have decided is reported with their own evidence; the rest is measured here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from rich.console import Console
+
+from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.cube import PixelFlag
+from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.packed.effects import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
+from hsi_sc_nerf.plotting import new_figure, save_figure
+from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
+from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.processing.sightings import Sightings, sightings
+from hsi_sc_nerf.processing.spectral_subspace import training_subspace
+from hsi_sc_nerf.processing.still_chamber import background_pixels, picture_of_chamber
+from hsi_sc_nerf.processing.view_changes import Change, change_with_direction, change_with_height
+from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.terminal import screen_table
+
+LEAST_VIEW_CHANGE_PERCENT = 0.5
+"""Poses that are wrong by a pixel make up to 0.3 % of a bumpy object."""
+LEAST_PICTURE = 0.005
+"""Reflectance; the noise of a pixel is larger."""
+LEAST_HEIGHT_CHANGE_PERCENT = 2.0
+"""A colour that goes with the height, as an apple's, leaves a tenth of that in even light."""
+LEAST_POSE_ERROR_PX = 0.1
+"""What training corrects poses to at best; better ones it makes worse (docs/notes/dead_ends.md)."""
+FEWEST_SIGHTINGS = 500
+LARGEST_DRAWN = 100.0
+_LOG_P_NOISE = 0.43
+"""Standard deviation of -log10 of a probability that is evenly distributed."""
+
+
+def measure_effects(
+    dataset: PackedDataset,
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
+    masks: Bool[np.ndarray, "frames h w"],
+    hull: VotedHull,
+    drift: tuple[LampDriftEstimate | NotMeasurable, bool],
+    poses: TurntablePoses,
+) -> tuple[Effect, ...]:
+    """All effects, those that decide what the model simulates first.
+
+    Args:
+        dataset: whose files are written, all but ``transforms.json``.
+        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
+        masks: true on the object.
+        hull: of the masks.
+        drift: what is known of the lamps, and whether the frames are corrected.
+        poses: of the frames.
+    """
+    seen = None
+    if len(hull.core) > 0:
+        seen = sightings(bins, masks, dataset.camera_to_worlds, dataset.intrinsics, dataset.distortion, hull)
+        seen = seen if len(seen.point) >= FEWEST_SIGHTINGS else None
+    return (
+        view_dependence(None if seen is None else change_with_direction(seen)),
+        still_chamber(picture_of_chamber(*background_pixels(dataset, bins, masks))),
+        pose_refinement(poses, dataset.object_box_m),
+        lamp_drift(*drift),
+        lens_distortion(poses),
+        wobble(poses),
+        saturated_highlights(dataset, masks),
+        spectral_rank(dataset),
+        uneven_light(seen),
+    )
+
+
+def view_dependence(change: Change | None) -> Effect:
+    """Whether points look different from view to view: gloss, or lamps before which they turn."""
+    if change is None:
+        sentence = "Too little of the object is seen to tell, so that it is simulated."
+        return Effect("view_dependence", True, None, None, None, "%", sentence)
+    percent, noise = 100.0 * change.rms, 100.0 * change.noise
+    return _decided(
+        *("view_dependence", percent, noise, LEAST_VIEW_CHANGE_PERCENT, "%"),
+        "Points change their brightness with the direction that they face in the chamber, so that the field sees the "
+        "viewing direction.",
+        "Points look the same from all sides, so that the field does without the viewing direction.",
+    )
+
+
+def still_chamber(change: Change | None) -> Effect:
+    """Whether a picture of the chamber tells more than its median spectrum."""
+    if change is None:
+        sentence = "Too little of the chamber is seen to tell, so that its median spectrum is taken."
+        return Effect("still_chamber", False, None, None, None, "reflectance", sentence)
+    return _decided(
+        *("still_chamber", change.rms, change.noise, LEAST_PICTURE, "reflectance"),
+        "The chamber stands still and is uneven, so that its picture is the background.",
+        "The chamber is even or does not stand still, so that its median spectrum is the background.",
+    )
+
+
+def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"]) -> Effect:
+    """Whether the poses are so uncertain that training can improve them: what that moves the object's surface by."""
+    if poses.uncertainty is None:
+        refined = poses.method != "markers"
+        what = "training refines them" if refined else "training does not refine them"
+        sentence = f"How uncertain the poses are is not known; poses by {poses.method}: {what}."
+        return Effect("pose_refinement", refined, None, None, None, "px", sentence)
+    radius_m = float(np.abs(object_box_m[:, :2]).max())
+    distance_m = float(np.linalg.norm(poses.camera_to_world[poses.used, :2, 3], axis=1).mean())
+    error_px = poses.intrinsics.fl_x / distance_m * radius_m * np.deg2rad(poses.uncertainty.rotation_deg)
+    return _decided(
+        *("pose_refinement", float(error_px), 0.0, LEAST_POSE_ERROR_PX, "px"),
+        "The poses' own uncertainty moves the surface by more than training leaves, so that training refines them.",
+        "The poses are better than training would make them, so that they stay.",
+    )
+
+
+def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Effect:
+    """The lamps' drift as calibration has decided it."""
+    if isinstance(drift, NotMeasurable):
+        return Effect(
+            "lamp_drift", False, None, None, None, "-log10 p", f"Its drift was not measured: {drift.reason}."
+        )
+    change = 100.0 * (drift.factor - 1.0)
+    largest = float(change.flat[np.abs(change).argmax()])
+    done = "corrected" if corrected else "not corrected"
+    evidence = max(0.0, -float(np.log10(max(drift.p_value, 1e-99))))
+    sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
+    return Effect(
+        "lamp_drift", corrected, evidence, _LOG_P_NOISE, float(-np.log10(SIGNIFICANCE)), "-log10 p", sentence
+    )
+
+
+def lens_distortion(poses: TurntablePoses) -> Effect:
+    """The lens as the poses have decided it."""
+    k1, k2 = poses.distortion[:2]
+    radius = np.hypot(poses.intrinsics.w, poses.intrinsics.h) / 2.0 / poses.intrinsics.fl_x
+    shift_px = abs(k1 * radius**3 + k2 * radius**5) * poses.intrinsics.fl_x
+    return _by_poses(poses, "lens_distortion", bool(k1 or k2), f"moves the picture's corners by {shift_px:.2g} px")
+
+
+def wobble(poses: TurntablePoses) -> Effect:
+    """The table's wobble as the poses have decided it."""
+    return _by_poses(
+        poses, "wobble", poses.model == "free poses", f"tilts the table by {poses.wobble_deg or 0.0:.2g}°"
+    )
+
+
+def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames h w"]) -> Effect:
+    """Saturated pixels on the object, whose values losses and metrics leave out."""
+    saturated = sum(
+        int(((frame.flags() & PixelFlag.SATURATED > 0) & mask).sum())
+        for frame, mask in zip(dataset.frames, masks, strict=True)
+    )
+    one_percent = max(int(masks.sum()), 1) / 100.0
+    return _decided(  # one pixel is there
+        *("saturated_highlights", saturated / one_percent, 0.0, 0.5 / one_percent, "% of pixels"),
+        "Some of the object's pixels are saturated, and their saturated values are left out.",
+        "No pixel of the object is saturated.",
+    )
+
+
+def spectral_rank(dataset: PackedDataset) -> Effect:
+    """How many spectra span all others above the noise; training finds them anew in its own frames."""
+    bands = len(dataset.wavelengths_nm)
+    try:
+        rank = training_subspace(dataset, dataset.frames).basis.shape[1]
+    except InputError:
+        sentence = "Too few spectra are free of flagged values to tell."
+        return Effect("spectral_rank", False, None, None, None, "spectra", sentence)
+    sentence = f"{rank} spectra span those of all {bands} bands above the noise, and the field emits {rank} numbers."
+    return Effect("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
+
+
+def uneven_light(seen: Sightings | None) -> Effect:
+    """A hint only: `hsi-sc-nerf material` decides it after training, when the surface is known."""
+    if seen is None:
+        sentence = "Too little of the object is seen to tell; `material` decides after training."
+        return Effect("uneven_light", False, None, None, None, "%", sentence)
+    change = change_with_height(seen)
+    return _decided(
+        *("uneven_light", 100.0 * change.rms, 100.0 * change.noise, LEAST_HEIGHT_CHANGE_PERCENT, "%"),
+        "Like spectra differ in brightness by height and slope, as in shade; `material` decides after training.",
+        "Like spectra are equally bright at all heights; `material` decides after training.",
+    )
+
+
+def show_effects(console: Console, effects: Sequence[Effect]) -> None:
+    """Print the effects as a table, and what they mean."""
+    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="What the session calls for"))
+    for effect in effects:
+        console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
+
+
+def draw_effects(path: Path, effects: Sequence[Effect]) -> None:
+    """Draw the evidence of each effect as a multiple of its threshold.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    drawn = [
+        (effect, effect.evidence / effect.threshold, CERTAIN * (effect.noise or 0.0) / effect.threshold)
+        for effect in reversed(effects)
+        if effect.evidence is not None and effect.threshold
+    ]
+    figure = new_figure(9.0, 1.0 + 0.5 * len(drawn))
+    axes = figure.subplots()
+    for row, (effect, ratio, error) in enumerate(drawn):
+        at = float(np.clip(ratio, 1.0 / LARGEST_DRAWN, LARGEST_DRAWN))
+        colour = "tab:red" if effect.present else "tab:gray"
+        axes.errorbar(at, row, xerr=[[min(error, 0.99 * at)], [error]], fmt="o", capsize=3, color=colour)
+        words = f"{effect.evidence:.2g} {effect.unit}, threshold {effect.threshold:.2g}"
+        axes.annotate(words, (at, row), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8)
+    axes.axvline(1.0, color="black", linestyle="--", linewidth=1)
+    axes.set(xscale="log", xlim=(0.2 / LARGEST_DRAWN, 5.0 * LARGEST_DRAWN), ylim=(-0.6, len(drawn) - 0.2))
+    axes.set_yticks(range(len(drawn)), [effect.name for effect, _, _ in drawn])
+    axes.set(xlabel="evidence over threshold (bars: 3 standard deviations); red: the effect is there")
+    save_figure(figure, path)
+
+
+def _decided(
+    name: str, evidence: float, noise: float, least: float, unit: str, if_present: str, if_absent: str
+) -> Effect:
+    """The effect by evidence that has to exceed both a least size and its noise."""
+    threshold = max(least, CERTAIN * noise)
+    present = evidence > threshold
+    return Effect(name, present, evidence, noise, threshold, unit, if_present if present else if_absent)
+
+
+def _by_poses(poses: TurntablePoses, name: str, present: bool, does: str) -> Effect:
+    if name not in poses.evidence:
+        sentence = f"Poses by {poses.method} do not look for it{f', but it is known: it {does}' if present else ''}."
+        return Effect(name, present, None, None, None, "-log10 p", sentence)
+    sentence = f"It {does}, and the poses count it." if present else "The markers do not call for it."
+    return Effect(name, present, poses.evidence[name], _LOG_P_NOISE, EVIDENCE_NEEDED, "-log10 p", sentence)

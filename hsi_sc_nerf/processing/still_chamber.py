@@ -1,0 +1,75 @@
+"""Whether the chamber behind the turntable stands still: what a picture of it tells more than its median spectrum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.processing.sightings import colours_of
+from hsi_sc_nerf.processing.turntable_silhouette import turntable_silhouette
+from hsi_sc_nerf.processing.view_changes import Change, change_of
+
+MAX_FRAMES = 16
+"""Frames that are compared, evenly spread over the session."""
+MAX_SIDE = 64
+"""Pixels that are compared along the image's longer side."""
+OUTLINE_PX = 3
+"""Pixels within this of the object or the turntable are left out."""
+FEWEST_OTHERS = 2
+"""Other frames that have to show the chamber at a pixel."""
+FEWEST_PIXELS = 16
+TRIMMED = 0.02
+"""Fraction of the pixels that is left out: those unlike the chamber's spectrum, such as a stem on the axis that the
+masks miss."""
+
+
+def background_pixels(
+    dataset: PackedDataset,
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
+    masks: Bool[np.ndarray, "frames h w"],
+) -> tuple[Float[np.ndarray, "chosen pixels colours"], Bool[np.ndarray, "chosen pixels"]]:
+    """Reflectance of the same pixels in some frames, and which of them show the chamber.
+
+    Args:
+        dataset: its camera and what turns.
+        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
+        masks: true on the object.
+    """
+    step = -(-max(masks.shape[1:]) // MAX_SIDE)
+    spectra, free = [], []
+    count = min(len(masks), MAX_FRAMES)
+    for index in (int((i + 0.5) * len(masks) / count) for i in range(count)):
+        turning = masks[index] | turntable_silhouette(dataset, dataset.frames[index].camera_to_world)
+        free.append(~dilate(turning, 2 * OUTLINE_PX + 1)[::step, ::step].ravel())
+        colours = colours_of(bins[index][:, ::step, ::step])
+        spectra.append(colours.reshape(len(colours), -1).T)
+    return np.stack(spectra), np.stack(free)
+
+
+def picture_of_chamber(
+    spectra: Float[np.ndarray, "frames pixels colours"], free: Bool[np.ndarray, "frames pixels"]
+) -> Change | None:
+    """What the other frames' medians at a pixel predict better than the median of all, root mean square reflectance.
+
+    0 where the chamber is even, and where it moves. None where too little of it is seen.
+    """
+    shown = np.where(free[..., None], spectra, np.nan)
+    known = free & (free.sum(axis=0) > FEWEST_OTHERS)
+    frames = np.flatnonzero(known.sum(axis=1) >= FEWEST_PIXELS)
+    if len(frames) < FEWEST_OTHERS + 1:
+        return None
+    spectrum = np.nanmedian(shown.reshape(-1, shown.shape[-1]), axis=0)
+    # 0 where no frame shows the chamber, which is in no frame's pixels.
+    unlike = np.nan_to_num(((shown - spectrum) ** 2).mean(axis=-1)).max(axis=0)
+    known &= unlike <= np.quantile(unlike[free.any(axis=0)], 1.0 - TRIMMED)
+    gains = []
+    for frame in frames:
+        pixels = known[frame]
+        picture = np.nanmedian(np.delete(shown[:, pixels], frame, axis=0), axis=0)
+        seen = shown[frame, pixels]
+        gains.append(float(((seen - spectrum) ** 2 - (seen - picture) ** 2).mean()))
+    return change_of(gains, known[frames].sum(axis=1))

@@ -1,0 +1,38 @@
+"""A picture of the chamber against its median spectrum, on background pixels of a known chamber."""
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.processing.still_chamber import picture_of_chamber
+
+FRAMES, PIXELS, COLOURS = 12, 800, 3
+TEXTURE, NOISE = 0.05, 0.02
+
+
+def chamber(still=0.0, moving=0.0, stem=0.0, seed=0):
+    """Spectra of pixels with a texture that stands still, one that moves, and a few that show a stem."""
+    rng = np.random.default_rng(seed)
+    spectra = 0.8 + still * rng.choice([-1.0, 1.0], (1, PIXELS, 1)) + moving * rng.normal(size=(FRAMES, PIXELS, 1))
+    spectra = spectra + NOISE * rng.normal(size=(FRAMES, PIXELS, COLOURS))
+    spectra[:, :8] -= stem
+    return spectra, rng.random((FRAMES, PIXELS)) < 0.7
+
+
+def test_a_texture_that_stands_still_is_measured():
+    found = picture_of_chamber(*chamber(still=TEXTURE))
+    assert found.rms == pytest.approx(TEXTURE, rel=0.1)
+    assert 3.0 * found.noise < found.rms
+
+
+@pytest.mark.parametrize("departure", [{}, {"moving": TEXTURE}, {"stem": 0.5}])
+def test_an_even_or_moving_chamber_needs_no_picture(departure):
+    found = picture_of_chamber(*chamber(**departure))
+    assert found.rms < 0.005
+    assert found.noise < 0.02
+
+
+def test_a_chamber_that_is_hardly_seen_tells_nothing():
+    spectra, free = chamber()
+    assert picture_of_chamber(spectra, free & (np.arange(PIXELS) < 10)) is None
+    free[2:] = False
+    assert picture_of_chamber(spectra, free) is None
