@@ -47,6 +47,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE, ReflectanceUncertainty
 
 DEFECT_FRAMES, DEFECT_LINES, DEFECT_WHITE_LINES = 6, 4, 128
+HIGHLIGHT_BANDS = 12
 """Frames, lines of each, and largest number of lines of the white that are searched for defects and saturation."""
 
 
@@ -258,7 +259,10 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     lines, samples, _ = captures[0].cube.shape
     numbers = np.unique(np.linspace(0, len(captures) - 1, DEFECT_FRAMES).round().astype(int))
     rows = np.unique(np.linspace(0, lines - 1, DEFECT_LINES + 2).round().astype(int)[1:-1])
-    of_frames = [_readings(captures[number].cube, captures[number].dark, rows) for number in numbers]
+    of_frames = []
+    for capture in (captures[number] for number in numbers):
+        chosen = np.union1d(rows, _brightest_lines(capture.cube))
+        of_frames.append(_readings(capture.cube, capture.dark, chosen))
     good_bands = np.logical_and.reduce([capture.cube.good_bands for capture in captures])
     cube, dark = white_cubes(session, source)
     roi = None if source == "capture" else config.roi
@@ -271,6 +275,17 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     if white.counts.shape[1] != samples:
         white, of_frames = of_frames[0], of_frames[1:]
     return find_defects(white, of_frames, good_bands=good_bands)
+
+
+def _brightest_lines(cube: Cube) -> Int[np.ndarray, "rows"]:
+    """The lines of the brightest readings in some bands: highlights are small. Hot elements are hot in all lines."""
+    bands = np.unique(np.linspace(0, cube.shape[2] - 1, HIGHLIGHT_BANDS).round().astype(int))
+    counts = np.stack([np.asarray(cube.memmap()[:, :, band], np.float32) for band in bands])
+    missing = no_data(counts, cube.ignore_value)
+    if missing is not None:
+        counts = np.where(missing, 0.0, counts)
+    brighter = counts - np.median(counts, axis=1, keepdims=True)
+    return np.unique(brighter.max(axis=2).argmax(axis=1))
 
 
 def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> Readings:

@@ -181,6 +181,25 @@ def test_hot_elements_do_not_move_the_tarp(tmp_path):
     assert calibrate_session(open_session(session), CalibrationConfig()).white.roi == (8, 8, 40, 40)
 
 
+def test_a_small_saturated_highlight_is_found(tmp_path):
+    """Eight pixels of one line in each frame: none of the lines that are looked at in any case."""
+    scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=NOISE)
+    folder = simulate_session(scene, tmp_path / "session", progress=False)
+    saturated = {}
+    for capture in open_session(folder).frames:
+        counts = np.array(capture.cube.memmap())
+        counts[13, 8:16] = 4095
+        write_cube(capture.cube.header_path, counts, wavelengths_nm=capture.cube.wavelengths_nm)
+        saturated[capture.name] = counts >= 4095
+    session = open_session(folder)
+    calibration = calibrate_session(session, CalibrationConfig())
+    pack_frames(session, calibration, tmp_path / "data")
+    for capture in session.frames:
+        valid = unpack(open_cube(FramePaths.of(tmp_path / "data", capture.name).cube).memmap())[1]
+        flagged = ~np.rot90(valid, -session.quarter_turns)
+        np.testing.assert_array_equal(flagged, saturated[capture.name][..., calibration.bands])
+
+
 def own_white(session: Session, capture, lines=3):
     """A WHITEREF cube of a capture, of the session's tarp: a few of its lines."""
     tarp = session.white.cube
