@@ -23,6 +23,7 @@ from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.true_surface import TrueSurface
 from hsi_sc_nerf.simulate.truth import load_truth
@@ -62,7 +63,7 @@ class TraitUncertainty:
             for scene in self.scenes:
                 folder = self.output_dir / f"{scene}-{seed}"
                 self._reconstruct(folder, scene, seed)
-                for trait, error, std in measured(folder):
+                for trait, error, std in self._measured(folder):
                     print(f"{folder.name}: {trait}: error {100 * error:+.2f} %, stated {100 * std:.2f} %")
                     found.setdefault(trait, []).append((scene, error, std))
         rows = [_row(trait, values) for trait, values in found.items()]
@@ -70,6 +71,13 @@ class TraitUncertainty:
         rows += [_row(f"{trait}, without {COARSE}", values) for trait, values in without.items()]
         seeds = " ".join(map(str, self.seeds))
         write_results("trait_uncertainty", COLUMNS, rows, seed=seeds, folder=self.results)
+
+    def _measured(self, folder: Path) -> list[tuple[str, float, float]]:
+        """`measured`, from the file that keeps it if it is there."""
+        kept = folder / "measured.json"
+        if not kept.is_file():
+            write_json(kept, {"traits": list(measured(folder))})
+        return [tuple(one) for one in read_json(kept, "delete it")["traits"]]
 
     def _reconstruct(self, folder: Path, scene: str, seed: int) -> None:
         session, data, run = folder / "session", folder / "data", folder / "run" / "hsi-sc-nerf" / "run"
