@@ -162,6 +162,7 @@ _TRAITS = {
     "settings": {"cloud": "a.ply"},
     "size": _SIZE,
     "size_sd": _SIZE,
+    "size_sd_by_cause": {"points": _SIZE, "scale": _SIZE},
     "watertight": True,
     "seen_area_m2": 0.018,
     "classes": {
@@ -172,7 +173,13 @@ _TRAITS = {
         "mixture_unclassified_m2": 0.0,
         "regions": [{"label": "green", "area_m2": 0.01, "centre_m": [0.0, 0.0, 0.1]}],
     },
-    "regions": {"whole surface": {"area_m2": 0.02, "indices": {"NDVI": {"mean": 0.5, "sd": 0.1}}}},
+    "regions": {
+        "whole surface": {
+            "area_m2": 0.02,
+            "reflectance": {"mean": 0.4, "std": 0.01, "measured": 0.3, "irradiance": 0.8, "irradiance_std": 0.02},
+            "indices": {"NDVI": {"mean": 0.5, "sd": 0.1}},
+        }
+    },
 }
 _XML = """<?xml version="1.0" encoding="utf-8"?>
 <!DOCTYPE properties [<!ENTITY e "text">]>

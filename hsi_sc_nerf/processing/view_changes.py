@@ -23,6 +23,7 @@ MOST_CHANGE = 1.0
 ALIKE = 12
 """A point's brightness is compared with that of so many others of the most similar spectra."""
 _RIDGE = 1e-6
+_LEAST_RIDGE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]],
         for sectors in products:
             square = np.sum([part[0] for k, part in enumerate(sectors) if k != held], axis=0)
             right = np.sum([part[1] for k, part in enumerate(sectors) if k != held], axis=0)
-            ridge = _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+            # Where all points face alike in all frames there is nothing to explain.
+            ridge = max(_RIDGE * np.trace(square) / len(square), _LEAST_RIDGE) * np.eye(len(square))
             effects = np.linalg.solve(square + ridge, right)
             own_square, own_right, size = sectors[held]
             rest = own_right - own_square[:, wanted:] @ effects[wanted:]

@@ -46,10 +46,10 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(after_s):
     time.sleep(after_s)
     started.send_signal(signal.SIGINT)
     told = started.communicate()[1]
-    ended = started.returncode, told
-    # Where it came too late, the session that is not there is the one line.
-    assert ended in [(130, "Stopped.\n"), (130, "Stopped; the same command goes on where it stopped.\n")] or (
-        ended[0] == 2 and told.startswith("Error: nowhere")
+    # Where it came too late, the session that is not there is the one line; as Python ends, it ends by the signal.
+    assert started.returncode in (130, 2, -signal.SIGINT)
+    assert told in ("Stopped.\n", "Stopped; the same command goes on where it stopped.\n") or (
+        told.startswith("Error: nowhere") and told.count("\n") == 1
     )
 
 
@@ -63,7 +63,7 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
         time.sleep(0.01)
     while started.poll() is None:  # a library's callback may swallow one
         started.send_signal(signal.SIGINT)
-        time.sleep(0.3)
+        time.sleep(0.05)
     told = started.communicate()[1]
     assert started.returncode == 130
     assert told.splitlines()[-1] == "Stopped; the same command goes on where it stopped."

@@ -108,6 +108,7 @@ def test_a_session_of_finished_reflectance(tmp_path):
     for frame, angle in zip(dataset.frames, ANGLES_DEG, strict=True):
         np.testing.assert_allclose(frame.cube() / REFLECTANCE_SCALE, frame_reflectance(angle), atol=1e-4)
     assert sorted(path.name for path in (output / "report").iterdir()) == [
+        "effects.png",
         "inspection.json",
         "masks.png",
         "poses.png",

@@ -1,5 +1,7 @@
 """Changes of brightness with the direction that a point faces, and with its height, on sightings of a known ball."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -69,3 +71,9 @@ def test_change_of_independent_findings():
     nothing = change_of([0.01, -0.01, 0.01, -0.01], [1, 1, 1, 1])
     assert nothing.rms == 0.0
     assert nothing.noise == pytest.approx(np.sqrt(0.01 * np.sqrt(4 / 3) / 2.0))
+
+
+def test_points_that_face_alike_in_all_frames_show_no_change():
+    seen = ball()[0]
+    one_frame = replace(seen, frame=np.zeros_like(seen.frame), normal=np.zeros_like(seen.normal))
+    assert change_with_direction(one_frame).rms == 0.0
