@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, Size, closed, closed_mesh, size_of, surface_and_base
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
@@ -121,6 +121,9 @@ def shared_errors(dataset: PackedDataset, *, base_known: bool) -> SharedErrors:
     Args:
         dataset: its ``poses.json`` gives the uncertainty of the scale; without it the scale is taken for exact.
         base_known: whether the height that the object stands on is known.
+
+    Raises:
+        InputError: ``poses.json`` cannot be read.
     """
     pixel_m = pixel_on_object_m(dataset)
     return SharedErrors(
@@ -148,5 +151,5 @@ def _scale_uncertainty(path: Path) -> float:
     """As a fraction; 0 where it is not known."""
     if not path.is_file():
         return 0.0
-    scale = json.loads(path.read_text(encoding="utf-8")).get("scale") or {}
+    scale = read_json(path, "process the session again").get("scale") or {}
     return float(scale.get("uncertainty_percent") or 0.0) / 100.0

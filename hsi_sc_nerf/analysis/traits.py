@@ -176,20 +176,19 @@ def analyse(
     nm = surface.wavelengths_nm
     indices = {one.name: index_values(one, surface.spectra, nm) for one in available_indices(nm)}
 
-    return Traits(
-        [
-            RegionTraits(
-                name,
-                float(surface.areas_m2[where].sum()),
-                region_spectrum(surface, where),
-                {name: mean_and_sd(values[where], surface.areas_m2[where]) for name, values in indices.items()},
-                _reflectance_std(surface, where, pixel_m),
-                _light(surface, where),
-            )
-            for name, where in chosen.items()
-        ],
-        classes,
-    )
+    def of_region(name: str, where: Bool[np.ndarray, "v"]) -> RegionTraits:
+        areas_m2 = surface.areas_m2[where]
+        spectrum, light = region_spectrum(surface, where), _light(surface, where)
+        return RegionTraits(
+            name,
+            float(areas_m2.sum()),
+            spectrum,
+            {index: mean_and_sd(values[where], areas_m2) for index, values in indices.items()},
+            _reflectance_std(surface, where, pixel_m, spectrum, light),
+            light,
+        )
+
+    return Traits([of_region(name, where) for name, where in chosen.items()], classes)
 
 
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
@@ -197,7 +196,13 @@ def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> Mea
     return mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
 
 
-def _reflectance_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None) -> float:
+def _reflectance_std(
+    surface: SpectralMesh,
+    chosen: Bool[np.ndarray, "v"],
+    pixel_m: float | None,
+    spectrum: MeanAndSd,
+    light: RegionLight | None,
+) -> float:
     """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
     if surface.scatter is None or pixel_m is None:
         return math.nan
@@ -208,10 +213,9 @@ def _reflectance_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel
     pixels = max(1.0, areas_m2.sum() / pixel_m**2)
     variance = (areas_m2[known] @ scatter[known] / areas_m2[known].sum()) ** 2 / pixels
     variance += _mixed(surface, chosen, pixel_m) ** 2
-    if (light := _light(surface, chosen)) is not None:
-        spectrum = region_spectrum(surface, chosen).mean.mean()
+    if light is not None:
         variance = variance / light.irradiance.mean**2
-        variance += (spectrum * light.irradiance_std / light.irradiance.mean) ** 2
+        variance += (spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean) ** 2
     return float(np.sqrt(variance))
 
 

@@ -24,9 +24,9 @@ from hsi_sc_nerf.terminal import screen_table
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.analysis.closed_mesh import Size
-    from hsi_sc_nerf.analysis.size_uncertainty import SharedErrors
     from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
     from hsi_sc_nerf.analysis.traits import Traits
+    from hsi_sc_nerf.packed.dataset import PackedDataset
 
 
 @dataclass(frozen=True)
@@ -116,10 +116,16 @@ class TraitsCommand:
         """
         from hsi_sc_nerf.analysis.closed_mesh import closed_mesh, size_of
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.size_uncertainty import size_uncertainty, sizes_to_find
+        from hsi_sc_nerf.analysis.size_uncertainty import (
+            pixel_on_object_m,
+            shared_errors,
+            size_uncertainty,
+            sizes_to_find,
+        )
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.ply import read_spectral_ply
+        from hsi_sc_nerf.packed.dataset import open_packed
         from hsi_sc_nerf.terminal import progress_bar
 
         check_options(self)
@@ -130,7 +136,8 @@ class TraitsCommand:
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
             library = library.only(self.classes)
-        config = replace(self.mesh, base_height_m=self._base_height_m())
+        dataset = None if self.data is None else open_packed(self.data)
+        config = replace(self.mesh, base_height_m=self._base_height_m(dataset))
         cloud = read_spectral_ply(self.cloud)
         if library is not None:
             library = library.at(cloud.wavelengths_nm)
@@ -140,7 +147,9 @@ class TraitsCommand:
             mesh = closed_mesh(cloud.points, cloud.normals, config)
         size, uncertainty = size_of(mesh), {}
         if self.splits:
-            shared = self._shared_errors(config)
+            shared = None
+            if dataset is not None:
+                shared = shared_errors(dataset, base_known=config.base_height_m is not None)
             with progress_bar("uncertainty", "meshes", sizes_to_find(self.splits, shared)) as done:
                 uncertainty = size_uncertainty(
                     cloud.points, cloud.normals, mesh, config, self.splits, shared, done=done
@@ -148,37 +157,16 @@ class TraitsCommand:
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
-            traits = analyse(surface, picked, found, self._pixel_m())
+            traits = analyse(surface, picked, found, None if dataset is None else pixel_on_object_m(dataset))
         with console.status("tables and pictures"):
             self._write(surface, size, uncertainty, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
 
-    def _base_height_m(self) -> float | None:
+    def _base_height_m(self, dataset: PackedDataset | None) -> float | None:
         """Height of the object's base above the turntable, if it is known."""
-        if self.mesh.base_height_m is not None or self.data is None:
+        if self.mesh.base_height_m is not None or dataset is None or dataset.container is None:
             return self.mesh.base_height_m
-        from hsi_sc_nerf.packed.dataset import open_packed
-
-        container = open_packed(self.data).container
-        return container.height_m if container else None
-
-    def _pixel_m(self) -> float | None:
-        """Side of a pixel on the object, if the dataset is given."""
-        if self.data is None:
-            return None
-        from hsi_sc_nerf.analysis.size_uncertainty import pixel_on_object_m
-        from hsi_sc_nerf.packed.dataset import open_packed
-
-        return pixel_on_object_m(open_packed(self.data))
-
-    def _shared_errors(self, config: MeshConfig) -> SharedErrors | None:
-        """What the points have in common, if the dataset is given."""
-        if self.data is None:
-            return None
-        from hsi_sc_nerf.analysis.size_uncertainty import shared_errors
-        from hsi_sc_nerf.packed.dataset import open_packed
-
-        return shared_errors(open_packed(self.data), base_known=config.base_height_m is not None)
+        return dataset.container.height_m
 
     def _write(
         self,
