@@ -15,6 +15,17 @@ from hsi_sc_nerf.cli.sessions import MarkersCommand
 MAIN = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
 
 
+def start(words):
+    """A command that Ctrl-C reaches, also where the tests run in the background of a shell, which has it ignored."""
+    return subprocess.Popen(
+        [*MAIN, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TERM": "dumb"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
 def test_a_file_that_the_system_refuses_is_one_line(monkeypatch, capsys):
     def refused(self):
         Path("/" + "a" * 300).read_bytes()
@@ -42,7 +53,7 @@ def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
 def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(after_s):
-    started = subprocess.Popen([*MAIN, "process", "nowhere", "--output-dir", "x"], stderr=subprocess.PIPE, text=True)
+    started = start(["process", "nowhere", "--output-dir", "x"])
     time.sleep(after_s)
     started.send_signal(signal.SIGINT)
     told = started.communicate()[1]
@@ -56,8 +67,8 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(after_s):
 @pytest.mark.slow
 def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
     out = tmp_path / "data"
-    words = [*MAIN, "process", str(tiny_dataset[1]), "--output-dir", str(out)]
-    started = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=os.environ | {"TERM": "dumb"})
+    words = ["process", str(tiny_dataset[1]), "--output-dir", str(out)]
+    started = start(words)
     while not list(out.glob(".cache/*.note")):
         assert started.poll() is None, started.stderr.read()
         time.sleep(0.01)
@@ -70,6 +81,6 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
     assert "Traceback" not in told
     assert not list(out.rglob(".partial-*"))
     assert not Path(out / "transforms.json").exists()
-    subprocess.run(words, check=True, capture_output=True)
+    subprocess.run([*MAIN, *words], check=True, capture_output=True)
     for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
         assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()
