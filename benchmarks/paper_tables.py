@@ -10,8 +10,9 @@ import numpy as np
 from results_table import RESULTS
 
 from hsi_sc_nerf.benchmark.configurations import Configuration
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
+from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
+from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import EFFECTS, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session

@@ -14,8 +14,9 @@ from matplotlib import rc_context
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from rich.table import Table
 
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Clock
+from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, screen_table
 

@@ -26,11 +26,12 @@ from hsi_sc_nerf.benchmark.configurations import (
     split_words,
     training_config,
 )
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Clock, Job
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Job
 from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, read_json, write_json
+from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -57,7 +58,7 @@ class BenchmarkCommand:
     """Words for every configuration, joined to the option by an equals sign, for example
     --common="--pipeline.datamanager.train-num-rays-per-batch 1024"."""
     train_seconds: float = between(0.001, math.inf, default=600.0)
-    """Training time of each configuration; a short rehearsal determines how many iterations fit."""
+    """Training time of each configuration; stages and learning rates follow the clock."""
     clock: Clock = "wall"
     """Unit of --train-seconds and the picture: wall time, or processor time over all threads (cpu), which is fairer
     on a machine that also does other work."""

@@ -73,21 +73,25 @@ class CapturedSteps:
         """One forward and backward pass; gradients are set, not added to what was there.
 
         Args:
-            kind: what else the step's operations depend on: stage, frozen parameters, whether proposals learn. Not
-                the annealing of the proposals, which is handed over by its value.
+            kind: what else the step's operations depend on: stage, frozen parameters. Not the annealing of the
+                proposals, which is handed over by its value.
             rays: of the batch, all of them with the same parts in every call.
             batch: tensors on the device, likewise.
             seed: draws the step's random numbers anew; called before each pass.
         """
         self._load(rays, batch)
         sampler = self._model.proposals
+        proposals_learn = False
         if sampler is not None:
             anneal, counter = sampler._anneal, sampler._steps_since_update
+            # As the sampler will say itself, in the steps that are not captured.
+            proposals_learn = counter > sampler.update_sched(sampler._step) or sampler._step < 10
             self._anneal.fill_(float(anneal))
+        kind = (kind, proposals_learn)
         if kind not in self._steps:
             self._steps[kind] = self._capture(seed)
         if sampler is not None:
-            sampler._anneal, sampler._steps_since_update = anneal, counter
+            sampler._anneal, sampler._steps_since_update = anneal, 0 if proposals_learn else counter
         captured = self._steps[kind]
         seed()
         captured.graph.replay()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.checkpoints import read_checkpoint
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
 MODEL_EFFECTS = ("view_dependence", "still_chamber", "pose_refinement")
@@ -37,6 +40,20 @@ def chosen_effects(setting: str, dataset: PackedDataset) -> tuple[str, ...]:
         return MODEL_EFFECTS[:2] if dataset.pose_method == "markers" else MODEL_EFFECTS
     present = {effect.name for effect in dataset.effects if effect.present}
     return tuple(name for name in MODEL_EFFECTS if name in present)
+
+
+def resumed_effects(setting: str, checkpoint: Path) -> str:
+    """The setting of a run that goes on from a checkpoint: the effects that this was trained with.
+
+    Raises:
+        InputError: ``setting`` asks for others, or the checkpoint cannot be read.
+    """
+    trained = read_checkpoint(checkpoint)["training"].get("effects")
+    if trained is None or setting in ("auto", trained):
+        return trained or setting
+    raise InputError(
+        f"{checkpoint}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."
+    )
 
 
 def effects_setting(effects: tuple[str, ...]) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -131,3 +132,25 @@ class GuardedOptimizers(Optimizers):
         self.skipped_groups = tuple(dict.fromkeys(name.split("/")[0] for name in non_finite_names(gradients)))
         if not self.skipped_groups:
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+    def scale_learning_rates(self, factor: Callable[[str], float]) -> dict[str, float]:
+        """Set each group's learning rate to that of its settings times its factor; gives the rates."""
+        rates = {name: self.config[name]["optimizer"].lr * factor(name) for name in self.optimizers}
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = rates[name]
+        return rates
+
+    def restore(self, states: Mapping[str, Any], path: Path) -> None:
+        """Load the states of a checkpoint.
+
+        Raises:
+            InputError: it has other parameter groups.
+        """
+        different = set(states) ^ set(self.optimizers)
+        if different:
+            raise InputError(
+                f"{path}: was made with other parameter groups ({', '.join(sorted(different))}); take the settings "
+                "of the config.yml beside it."
+            )
+        self.load_optimizers(dict(states))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
+import math
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal, NoReturn, cast
+from typing import Literal, cast
 
 import torch
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -27,32 +27,35 @@ from hsi_sc_nerf.models.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from hsi_sc_nerf.models.chosen_effects import effects_setting
+from hsi_sc_nerf.models.chosen_effects import effects_setting, resumed_effects
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.schedule import Clock, Schedule
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
-    Stage,
     StageConfig,
     StagePlan,
     full_frame_stage,
     masked_stage,
+    plan_seconds,
     plan_stages,
-    resumed_plan,
     step_seed,
 )
 from hsi_sc_nerf.models.training_watch import (
     NonFiniteGuard,
     TrainingDivergedError,
+    end_stopped_run,
     flush_logs,
     non_finite_names,
     stage_summary,
     training_progress,
 )
-from hsi_sc_nerf.settings_file import check_options
+from hsi_sc_nerf.settings_file import between, check_options
 
 _GPU_PROGRESS_STEPS = 16
 """On a GPU the progress bar is brought up to date once in so many steps: each time, the GPU is waited for."""
+_NO_LIMIT = 10**9
+"""Iterations that nerfstudio may take in a timed run, which ends by the clock."""
 
 
 @dataclass
@@ -64,6 +67,11 @@ class StagedTrainerConfig(TrainerConfig):
     """First stage: whole frames, with the object and its boundary sampled more often than the rest."""
     masked: StageConfig = field(default_factory=masked_stage)
     """Second stage: the masked object, and some background rays."""
+    max_train_seconds: float | None = between(0.001, math.inf, default=None)
+    """End the run after so many seconds of training instead of --max-num-iterations; stages and learning rates follow
+    the clock. Evaluations and saving do not count. Two such runs do not have the same weights bit by bit."""
+    train_clock: Clock = "wall"
+    """Clock of --max-train-seconds: wall time, or processor time over all threads (cpu)."""
     evaluate_stages: bool = True
     """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
     capture_steps: bool = True
@@ -85,6 +93,8 @@ class StagedTrainerConfig(TrainerConfig):
                             f"the {stage.name} stage names the parameter group {group!r}; there are "
                             f"{', '.join(self.optimizers)}."
                         )
+            if self.max_train_seconds is not None:
+                return plan_seconds(stages, self.max_train_seconds)
             return plan_stages(stages, self.max_num_iterations)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
@@ -103,7 +113,7 @@ class StagedTrainer(Trainer):
     """Trains one stage after the other.
 
     A step depends on its number, the configuration and the contents of a checkpoint only, so that a run that was
-    killed and resumed ends with the same weights.
+    killed and resumed ends with the same weights. In a timed run it depends on the clock as well.
     """
 
     config: StagedTrainerConfig
@@ -115,22 +125,25 @@ class StagedTrainer(Trainer):
         if self.world_size > 1:
             # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
-        self.plan = self.config.plan()
-        self._stage: Stage | None = None
+        timed = self.config.max_train_seconds is not None
+        wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else lambda: None
+        self.schedule = Schedule(self.config.plan(), self.config.train_clock if timed else None, wait)
         self._frozen: set[str] | None = None
         self._steps_since_update = 0
         self._saved_step: int | None = None
         self._loaded: Path | None = None
-        self._completed: str | None = None
+        self._trained_step = -1
         self._guard = NonFiniteGuard()
         self._captured: CapturedSteps | None = None
         try:
-            self._keep_effects()
+            path = self._checkpoint_to_load()
+            if path is not None:
+                self._model_config.effects = resumed_effects(self._model_config.effects, path)
             super().setup(test_mode)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         except KeyboardInterrupt:
-            self._tell_that_it_stopped()
+            end_stopped_run(self.config.get_checkpoint_dir())
         # Evaluation and export build what was trained, whatever becomes of the dataset.
         self._model_config.effects = effects_setting(self._model.effects)
         self.config.save_config()
@@ -138,22 +151,6 @@ class StagedTrainer(Trainer):
         plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
         if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
             self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
-
-    def _keep_effects(self) -> None:
-        """Go on with the effects of the checkpoint that is to be loaded.
-
-        Raises:
-            InputError: the settings ask for others, or the checkpoint cannot be read.
-        """
-        model, path = self._model_config, self._checkpoint_to_load()
-        trained = None if path is None else read_checkpoint(path)["training"].get("effects")
-        if trained is None or model.effects == trained:
-            return
-        if model.effects != "auto":
-            raise InputError(
-                f"{path}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."
-            )
-        model.effects = trained
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimisers that skip non-finite steps."""
@@ -177,17 +174,18 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
+            schedule, timed = self.schedule, self.config.max_train_seconds is not None
             was_to_be_kept = self._loaded is not None and self._keep_stage_of(self._loaded)
-            left = self.plan.num_iterations - self._start_step
-            if left <= 0 and was_to_be_kept:
+            if schedule.complete and was_to_be_kept:
                 return
-            if left <= 0:
+            if schedule.complete:
+                option, unit = ("--max-train-seconds", "seconds") if timed else ("--max-num-iterations", "iterations")
                 raise InputError(
-                    f"{self._loaded}: has all {self.plan.num_iterations} iterations; raise --max-num-iterations to "
-                    "train on."
+                    f"{self._loaded}: has all its {schedule.plan.length:g} {unit}; raise {option} to train on."
                 )
+            left = _NO_LIMIT if timed else int(schedule.plan.length) - self._start_step
             self.config = dataclasses.replace(self.config, max_num_iterations=left)
-            with training_progress(self.plan.num_iterations, self._start_step) as self._show_progress:
+            with training_progress(schedule) as self._show_progress:
                 super().train()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights, so these are the last finite ones.
@@ -196,30 +194,19 @@ class StagedTrainer(Trainer):
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         except KeyboardInterrupt:
-            self._tell_that_it_stopped()
+            end_stopped_run(self.config.get_checkpoint_dir())
         finally:
             flush_logs()
 
-    def _tell_that_it_stopped(self) -> NoReturn:
-        """End after Ctrl-C with one line; nerfstudio would print the stack and exit with 0.
-
-        Nothing is saved: a step may be half done, and the weights would not be those of an uninterrupted run.
-        """
-        folder = self.config.get_checkpoint_dir()
-        saved = any(folder.glob("step-*.ckpt"))
-        hint = f"; --load-dir {folder} goes on from the last checkpoint" if saved else ""
-        print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
-        raise SystemExit(130) from None
-
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step of its stage."""
-        stage = self.plan.at(step)
-        if stage is not self._stage:
-            manager, self._stage = self.pipeline.datamanager, stage
-            manager.foreground_ray_fraction = stage.config.foreground_ray_fraction
-            manager.boundary_ray_fraction = stage.config.boundary_ray_fraction
-        self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, step)})
-        rates = self._set_learning_rates(stage, step)
+        self.schedule.begin_step(step)
+        stage, position = self.schedule.stage, self.schedule.position
+        manager = self.pipeline.datamanager
+        manager.foreground_ray_fraction = stage.config.foreground_ray_fraction
+        manager.boundary_ray_fraction = stage.config.boundary_ray_fraction
+        self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, position)})
+        rates = self.optimizers.scale_learning_rates(lambda group: stage.lr_factor(position, group))
         sampler = self._model.proposals
         if sampler is not None:
             # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
@@ -230,7 +217,7 @@ class StagedTrainer(Trainer):
         captured = self._captured
         found = super().train_iteration(step) if captured is None else self._captured_iteration(captured, step)
         loss, loss_dict, metrics_dict = found
-        if stage.learns("fields", step) and not self.optimizers.skipped_groups:
+        if stage.learns("fields", position) and not self.optimizers.skipped_groups:
             self._model.field.shrink_grid(rates["fields"] * stage.config.grid_decay)
 
         if sampler is not None:
@@ -241,30 +228,26 @@ class StagedTrainer(Trainer):
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for group, rate in rates.items():  # under the names of nerfstudio's own schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
-        if self._captured is None or step % _GPU_PROGRESS_STEPS == 0 or step == stage.end - 1:
-            self._show_progress(step, stage, float(metrics_dict["psnr"]))
+        if self._captured is None or step % _GPU_PROGRESS_STEPS == 0:
+            self._show_progress(step, float(metrics_dict["psnr"]))
+        self.schedule.end_step(step)
+        self._trained_step = step
+        if self.schedule.complete:
+            self.stop_training = True
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
         """What nerfstudio does in a step, its forward and backward pass as a graph."""
-        sampler = self._model.proposals
-        # As the sampler will say itself, in the steps that are not captured.
-        proposals_learn = sampler is not None and (
-            sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
-        )
         rays, batch = self.pipeline.datamanager.next_train(step)
-        kind = (id(self._stage), frozenset(self._frozen or ()), proposals_learn)
         seed = partial(torch.manual_seed, step_seed(self.config.machine.seed, step))
         try:
-            found = steps(kind, rays, batch, seed)
+            found = steps((self.schedule.stage.config.name, frozenset(self._frozen or ())), rays, batch, seed)
         except RuntimeError as error:
             CONSOLE.print(f"[yellow]Steps are launched one operation at a time: {escape(str(error))}")
             self._captured = None
             seed()
             return super().train_iteration(step)
         self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
-        if sampler is not None and proposals_learn:
-            sampler._steps_since_update = 0
         return found
 
     def _freeze(self, frozen: set[str]) -> None:
@@ -279,48 +262,39 @@ class StagedTrainer(Trainer):
         self._model.camera_optimizer.freeze("camera_opt" in frozen)
         self._frozen = frozen
 
-    def _set_learning_rates(self, stage: Stage, step: int) -> dict[str, float]:
-        rates = {
-            name: self.config.optimizers[name]["optimizer"].lr * stage.lr_factor(step, name)
-            for name in self.optimizers.optimizers
-        }
-        for name, optimizer in self.optimizers.optimizers.items():
-            for group in optimizer.param_groups:
-                group["lr"] = rates[name]
-        return rates
-
     def eval_iteration(self, step: int) -> None:
         """nerfstudio's evaluations; after the last step of a stage, its checkpoint and held-out metrics."""
-        super().eval_iteration(step)
-        stage = self.plan.at(step)
-        if step == stage.end - 1:
-            self._keep(stage)
+        with self.schedule.clock.paused():
+            super().eval_iteration(step)
+            if self.schedule.stage_complete:
+                self._keep(step)
 
     def _keep_stage_of(self, loaded: Path) -> bool:
         """Keep the stage that a loaded checkpoint completed; False if its run has kept it, or none was completed."""
-        stage = self.plan.at(self._start_step - 1)
-        kept = loaded.resolve().parents[1] / f"stage-{stage.config.name}" / loaded.name
-        if self._completed != stage.config.name or self._start_step != stage.end or kept.exists():
+        kept = loaded.resolve().parents[1] / f"stage-{self.schedule.stage.config.name}" / loaded.name
+        if not self.schedule.stage_complete or kept.exists():
             return False
-        self._keep(stage)
+        self._keep(self._start_step - 1)
         return True
 
-    def _keep(self, stage: Stage) -> None:
+    def _keep(self, step: int) -> None:
         """Keep the last checkpoint of a finished stage, and its metrics of the held-out views."""
-        step = stage.end - 1
-        kept = checkpoint_path(self.base_dir / f"stage-{stage.config.name}", step)
+        name = self.schedule.stage.config.name
+        kept = checkpoint_path(self.base_dir / f"stage-{name}", step)
         self.save_checkpoint(step)
         if self.config.evaluate_stages:
             metrics = self.pipeline.get_average_eval_image_metrics(step=step, get_std=True)
             writer.put_dict(name="Eval Images Metrics Dict (all images)", scalar_dict=metrics, step=step)
-            CONSOLE.print(stage_summary(stage.config.name, metrics))
-            results = {"stage": stage.config.name, "step": step, "checkpoint": kept.name, "results": metrics}
+            CONSOLE.print(stage_summary(name, metrics))
+            results = {"stage": name, "step": step, "checkpoint": kept.name, "results": metrics}
             write_json(kept.with_suffix(".json"), results)
         link_checkpoint(checkpoint_path(self.checkpoint_dir, step), kept.parent)
         flush_logs()
 
     def _after_train(self) -> None:
         """Save, then finish as nerfstudio does."""
+        # Where training is stopped, nerfstudio counts the step that it no longer takes.
+        self.step = min(self.step, self._trained_step)
         self.save_checkpoint(self.step)
         super()._after_train()
 
@@ -332,7 +306,6 @@ class StagedTrainer(Trainer):
         """
         if step == self._saved_step:
             return
-        stage = self.plan.at(step)
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -340,15 +313,15 @@ class StagedTrainer(Trainer):
             "schedulers": {},
             "scalers": self.grad_scaler.state_dict(),
             "training": {
-                "stage": {"name": stage.config.name, "start": stage.start},
-                "completed_stage": stage.config.name if step == stage.end - 1 else None,
+                **self.schedule.state(),
                 "steps_since_update": self._steps_since_update,
                 "effects": self._model_config.effects,
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
         try:
-            write_checkpoint(path, state)
+            with self.schedule.clock.paused():
+                write_checkpoint(path, state)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         self._saved_step = step
@@ -369,20 +342,12 @@ class StagedTrainer(Trainer):
             return
         state = read_checkpoint(path)
         self._start_step = state["step"] + 1
+        self._trained_step = state["step"]
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        different = set(state["optimizers"]) ^ set(self.optimizers.optimizers)
-        if different:
-            raise InputError(
-                f"{path}: was made with other parameter groups ({', '.join(sorted(different))}); take the settings "
-                "of the config.yml beside it."
-            )
-        self.optimizers.load_optimizers(state["optimizers"])
+        self.optimizers.restore(state["optimizers"], path)
         if state["scalers"]:  # empty unless training was in mixed precision
             self.grad_scaler.load_state_dict(state["scalers"])
-        training = state["training"]
-        self._steps_since_update = training["steps_since_update"]
-        self._completed = training["completed_stage"]
-        completed_at = None if self._completed is None else self._start_step
-        self.plan = resumed_plan(self.plan, **training["stage"], completed_at=completed_at)
+        self._steps_since_update = state["training"]["steps_since_update"]
+        self.schedule.resume(state["training"], self._start_step)
         self._loaded = path
         CONSOLE.print(f"Going on from {escape(str(path))}", soft_wrap=True)

@@ -89,22 +89,28 @@ def step_seed(seed: int, step: int) -> int:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of a run, which covers the steps ``start <= step < end``."""
+    """A stage of a run, which covers the positions ``start <= position < end``.
+
+    Positions are iterations, or seconds if the run is timed.
+    """
 
     config: StageConfig
-    start: int
-    end: int
+    start: float
+    end: float
+    timed: bool = False
 
-    def learns(self, group: str, step: int) -> bool:
-        """Whether the parameters of ``group`` change at ``step``."""
-        waiting = int(self.config.learn_after.get(group, 0.0) * (self.end - self.start))
-        return group not in self.config.frozen_groups and step >= self.start + waiting
+    def learns(self, group: str, position: float) -> bool:
+        """Whether the parameters of ``group`` change at ``position``."""
+        waiting = self.config.learn_after.get(group, 0.0) * (self.end - self.start)
+        return group not in self.config.frozen_groups and position >= self.start + (
+            waiting if self.timed else int(waiting)
+        )
 
-    def lr_factor(self, step: int, group: str) -> float:
-        """Factor on the learning rate of ``group`` at ``step``, exponential from the stage's start to its end."""
+    def lr_factor(self, position: float, group: str) -> float:
+        """Factor on the learning rate of ``group`` at ``position``, exponential from the stage's start to its end."""
         first, last = self.config.group_lr.get(group, (self.config.lr_start, self.config.lr_end))
-        progress = (step - self.start) / max(1, self.end - self.start - 1)
-        return first * (last / first) ** min(1.0, progress)
+        length = self.end - self.start if self.timed else max(1, self.end - self.start - 1)
+        return first * (last / first) ** min(1.0, max(0.0, (position - self.start) / length))
 
 
 @dataclass(frozen=True)
@@ -114,19 +120,19 @@ class StagePlan:
     stages: tuple[Stage, ...]
 
     @property
-    def num_iterations(self) -> int:
-        """Steps of the whole run."""
+    def length(self) -> float:
+        """Iterations or seconds of the whole run."""
         return self.stages[-1].end
 
-    def at(self, step: int) -> Stage:
-        """The stage of ``step``; after the end of the run, the last one."""
+    def at(self, position: float) -> Stage:
+        """The stage of ``position``; after the end of the run, the last one."""
         for stage in self.stages:
-            if step < stage.end:
+            if position < stage.end:
                 return stage
         return self.stages[-1]
 
 
-def resumed_plan(plan: StagePlan, name: str, start: int, completed_at: int | None = None) -> StagePlan:
+def resumed_plan(plan: StagePlan, name: str, start: float, completed_at: float | None = None) -> StagePlan:
     """The plan of a run that goes on from a checkpoint, perhaps of another run, whose stages had other lengths.
 
     The checkpoint's stage and those after it keep the lengths that they have in ``plan``; the one before them ends
@@ -135,8 +141,9 @@ def resumed_plan(plan: StagePlan, name: str, start: int, completed_at: int | Non
     Args:
         plan: by the settings.
         name: stage of the checkpoint.
-        start: step at which it began.
-        completed_at: the next step, if the checkpoint is the stage's last: the next stage of ``plan`` begins there.
+        start: position at which it began.
+        completed_at: the position after the checkpoint, if it is the stage's last: the next stage of ``plan`` begins
+            there.
     """
     names = [stage.config.name for stage in plan.stages]
     if name not in names:
@@ -147,7 +154,7 @@ def resumed_plan(plan: StagePlan, name: str, start: int, completed_at: int | Non
     shift = start - plan.stages[position].start
     if shift == 0:
         return plan
-    before = (replace(stage, start=min(stage.start, start - 1), end=start) for stage in plan.stages[:position][-1:])
+    before = (replace(stage, start=min(stage.start, start), end=start) for stage in plan.stages[:position][-1:])
     later = (replace(stage, start=stage.start + shift, end=stage.end + shift) for stage in plan.stages[position:])
     return StagePlan((*before, *later))
 
@@ -194,4 +201,28 @@ def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> Stag
         raise InputError(
             f"--max-num-iterations is {max_num_iterations}, which leaves nothing to train; give a number above 0."
         )
+    return StagePlan(tuple(stages))
+
+
+def plan_seconds(configs: Sequence[StageConfig], max_train_seconds: float) -> StagePlan:
+    """Divide a run of ``max_train_seconds`` into stages by their fractions; those of no time are left out.
+
+    Raises:
+        InputError: a stage has a number of iterations, or the fractions leave nothing to train.
+    """
+    for config in configs:
+        if config.num_iterations is not None:
+            raise InputError(
+                f"the {config.name} stage has num-iterations, and --max-train-seconds ends the run by the clock; "
+                "give the stage a fraction, or leave --max-train-seconds out."
+            )
+    weight = sum(config.fraction for config in configs)
+    if not weight > 0.0:
+        raise InputError("the stages' fractions add up to 0; give one of them a fraction above 0.")
+    stages: list[Stage] = []
+    end = 0.0
+    for config in configs:
+        if config.fraction > 0.0:
+            start, end = end, end + max_train_seconds * config.fraction / weight
+            stages.append(Stage(config, start, end, timed=True))
     return StagePlan(tuple(stages))

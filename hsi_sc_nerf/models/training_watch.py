@@ -6,15 +6,18 @@ Steps with non-finite losses or gradients are skipped; too many in a row stop th
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
 
 import torch
 from nerfstudio.utils import writer
-from rich.progress import MofNCompleteColumn, TextColumn
+from rich.progress import TextColumn
 from torch import Tensor
 
-from hsi_sc_nerf.models.stages import Stage
+from hsi_sc_nerf.models.schedule import Schedule
 from hsi_sc_nerf.terminal import timed_progress
 
 # Metrics of the paper's table.
@@ -76,22 +79,27 @@ def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
 
 
 @contextmanager
-def training_progress(total_steps: int, first_step: int) -> Iterator[Callable[[int, Stage, float], None]]:
+def training_progress(schedule: Schedule) -> Iterator[Callable[[int, float], None]]:
     """Progress bar with stage, steps, smoothed PSNR of the batches and time left.
 
-    The context gives a function that shows that a step of a stage is done, and the PSNR of its batch (dB).
+    The context gives a function that shows that a step is done, and the PSNR of its batch (dB).
     """
     smoothed_db = math.nan
+    total = schedule.plan.length
 
-    def update(step: int, stage: Stage, psnr_db: float) -> None:
+    def update(step: int, psnr_db: float) -> None:
         nonlocal smoothed_db
         if math.isfinite(psnr_db):  # not so in a skipped step
             smoothed_db = psnr_db if math.isnan(smoothed_db) else 0.95 * smoothed_db + 0.05 * psnr_db
         quality = "" if math.isnan(smoothed_db) else f"PSNR {smoothed_db:.1f} dB"
-        bar.update(task, completed=step + 1, description=f"training, {stage.config.name} stage", quality=quality)
+        stage = schedule.stage
+        steps = f"{step + 1} steps" if stage.timed else f"{step + 1}/{total:.0f}"
+        completed = schedule.position if stage.timed else step + 1
+        description = f"training, {stage.config.name} stage"
+        bar.update(task, completed=completed, description=description, steps=steps, quality=quality)
 
-    with timed_progress(MofNCompleteColumn(), TextColumn("{task.fields[quality]}")) as bar:
-        task = bar.add_task("training", total=total_steps, completed=first_step, quality="")
+    with timed_progress(TextColumn("{task.fields[steps]}"), TextColumn("{task.fields[quality]}")) as bar:
+        task = bar.add_task("training", total=total, completed=schedule.position, steps="", quality="")
         yield update
 
 
@@ -101,3 +109,14 @@ def flush_logs() -> None:
     for event_writer in writer.EVENT_WRITERS:
         if isinstance(event_writer, writer.TensorboardWriter):
             event_writer.tb_writer.flush()
+
+
+def end_stopped_run(checkpoints: Path) -> NoReturn:
+    """End after Ctrl-C with one line; nerfstudio would print the stack and exit with 0.
+
+    Nothing is saved: a step may be half done, and the weights would not be those of an uninterrupted run.
+    """
+    saved = any(checkpoints.glob("step-*.ckpt"))
+    hint = f"; --load-dir {checkpoints} goes on from the last checkpoint" if saved else ""
+    print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
+    raise SystemExit(130) from None

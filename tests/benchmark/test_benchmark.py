@@ -25,9 +25,6 @@ from hsi_sc_nerf.benchmark.run import (
     BenchmarkRun,
     Checkpoint,
     HeldOutViews,
-    TrainingClock,
-    checkpoint_iterations,
-    mean_iteration_seconds,
 )
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
@@ -43,38 +40,6 @@ TINY = " ".join(
         "--machine.device-type {device}",
     )
 )
-
-
-def test_a_run_is_evaluated_at_its_shares_and_at_the_end_of_every_stage():
-    assert checkpoint_iterations((0.1, 0.5, 1.0), (40, 100)) == (10, 40, 50, 100)
-    assert checkpoint_iterations((), (40, 100)) == (40, 100)
-    assert checkpoint_iterations((0.001, 0.5), (5, 10)) == (1, 5, 10)
-
-
-def test_mean_time_leaves_out_what_each_stage_does_once():
-    first = [9.0, 9.0] + [1.0] * 8
-    second = [7.0, 7.0] + [3.0] * 28
-    times = [0.0]
-    for seconds in first + second:
-        times.append(times[-1] + seconds)
-    assert math.isclose(mean_iteration_seconds(times, (10, 40)), (10 * 1.0 + 30 * 3.0) / 40)
-
-
-def test_mean_time_of_a_stage_of_one_step_is_that_step():
-    assert mean_iteration_seconds([0.0, 2.0, 6.0], (1, 2)) == 3.0
-
-
-def test_clock_does_not_count_pauses():
-    now = {"wall": 100.0, "cpu": 50.0}
-    waits = []
-    clock = TrainingClock(lambda: waits.append(1), lambda: now["wall"], lambda: now["cpu"])
-    now.update(wall=110.0, cpu=65.0)
-    with clock.paused() as seconds:
-        now.update(wall=1000.0, cpu=900.0)
-    assert seconds == (10.0, 15.0)
-    now.update(wall=1002.0, cpu=903.0)
-    assert clock.read() == (12.0, 18.0)
-    assert len(waits) == 3
 
 
 def test_chosen_views_are_spread_evenly_and_counted():
@@ -234,13 +199,14 @@ def test_evaluations_on_the_way_do_not_change_the_training(tiny_dataset, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["wall", "cpu"])
-def test_a_rehearsal_finds_how_many_iterations_fit(tiny_dataset, tmp_path, in_this_process, clock):
-    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=0.5, clock=clock)
+def test_a_timed_run_ends_by_its_clock(tiny_dataset, tmp_path, in_this_process, clock):
+    asked = command(tiny_dataset, tmp_path, sets=(), iterations=None, train_seconds=1.5, clock=clock)
     asked.main()
     (run,) = json.loads((tmp_path / "benchmark.json").read_text())["runs"]
-    last = run["checkpoints"][-1]
-    assert last["iteration"] >= 2
-    assert 0.1 < last["train_seconds" if clock == "wall" else "cpu_seconds"] < 3.0
+    ends = [checkpoint for checkpoint in run["checkpoints"] if checkpoint["ends_stage"]]
+    assert [checkpoint["stage"] for checkpoint in ends] == ["full-frame", "masked"]
+    seconds = [checkpoint["train_seconds" if clock == "wall" else "cpu_seconds"] for checkpoint in ends]
+    assert all(read >= due for read, due in zip(seconds, (0.75, 1.5), strict=True))
 
 
 def test_finished_runs_are_not_repeated(tiny_dataset, tmp_path, made_up):

@@ -139,16 +139,16 @@ def test_a_second_stage_after_another_runs_first_is_resumed_where_it_was(tiny_da
     fail_in(made, made.pipeline.datamanager, "next_train", lambda step: step == SWITCH + 3)
     resumed = longer(tiny_dataset, tmp_path / "resumed", switch=15, load_dir=made.checkpoint_dir)
     assert SWITCH < resumed._start_step <= SWITCH + 3
-    assert resumed.plan == made.plan
-    assert resumed.plan.at(resumed._start_step).config.name == "masked"
+    assert resumed.schedule.plan == made.schedule.plan
+    assert resumed.schedule.plan.at(resumed._start_step).config.name == "masked"
 
 
 @pytest.mark.slow
 def test_a_finished_run_that_is_extended_stays_in_its_last_stage(tiny_dataset, tmp_path, whole):
     """Though its last step may be where the first stage of the longer run would end."""
     made = longer(tiny_dataset, tmp_path, switch=STEPS, max_num_iterations=2 * STEPS, load_dir=whole.checkpoint_dir)
-    assert made.plan.at(STEPS).config.name == "masked"
-    assert made.plan.num_iterations == SWITCH + STEPS
+    assert made.schedule.plan.at(STEPS).config.name == "masked"
+    assert made.schedule.plan.length == SWITCH + STEPS
     made._keep_stage_of(made._loaded)
     assert not list(made.base_dir.glob("stage-*"))
 

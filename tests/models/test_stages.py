@@ -26,7 +26,7 @@ def test_defaults_are_the_papers_iterations():
 @pytest.mark.parametrize("total", [1, 2, 7, 301])
 def test_fractions_add_up_to_the_total(total):
     plan = plan_stages((StageConfig("a", 0.3), StageConfig("b", 0.7)), total)
-    assert plan.num_iterations == total == sum(lengths(plan))
+    assert plan.length == total == sum(lengths(plan))
 
 
 def test_lengths_replace_fractions():
