@@ -4,8 +4,8 @@
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --clock cpu --threads 1 --parts views
 
 A simulated noisy session is trained for the same seconds with every setting, and judged against what is known:
-held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and the range
-from the least to the largest. Ranges that overlap are no difference. What is finished is not done again.
+held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their
+range. Ranges that overlap are no difference. What is finished is not done again.
 """
 
 from __future__ import annotations

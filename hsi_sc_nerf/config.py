@@ -5,7 +5,8 @@ nerfstudio discovers the data parser in `data.dataparser`.
 
 from __future__ import annotations
 
-import torch
+from typing import Any
+
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -17,6 +18,7 @@ from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.optimizers import MuonOptimizerConfig
 from hsi_sc_nerf.models.pipeline import SpectralPipeline, SpectralPipelineConfig
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
+from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS, RAYS, default_device
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
@@ -34,6 +36,9 @@ def pipeline_with_panel(config: SpectralPipelineConfig, **options) -> SpectralPi
     return pipeline
 
 
+_BALANCED = PRESETS[default_device()]["balanced"]
+
+
 def _adam(lr: float) -> OptimizerConfig:
     return AdamOptimizerConfig(lr=lr, eps=1e-15)
 
@@ -49,11 +54,11 @@ def _method(
     optimizers: dict[str, OptimizerConfig],
     full_frame: StageConfig,
     masked: StageConfig,
+    **options: Any,
 ) -> StagedTrainerConfig:
     """Configuration of a method's trainer, with all that the two methods have in common."""
     return StagedTrainerConfig(
         method_name=method_name,
-        max_num_iterations=sum(paper.STAGE_ITERATIONS),
         steps_per_save=2000,
         steps_per_eval_batch=500,
         steps_per_eval_image=5000,
@@ -61,13 +66,14 @@ def _method(
         pipeline=pipeline,
         # Without schedules: the stages scale the learning rates.
         optimizers={name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()},
-        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        machine=MachineConfig(device_type=default_device()),
         # The progress bar of the stages replaces nerfstudio's table.
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),
         viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer+tensorboard",
         full_frame=full_frame,
         masked=masked,
+        **options,
     )
 
 
@@ -76,7 +82,7 @@ hsi_sc_nerf = MethodSpecification(
         "hsi-sc-nerf",
         SpectralPipelineConfig(
             _target=pipeline_with_panel,  # type: ignore[arg-type]
-            datamanager=SpectralDataManagerConfig(),
+            datamanager=SpectralDataManagerConfig(train_num_rays_per_batch=_BALANCED[RAYS]),
             model=SpectralModelConfig(),
         ),
         {
@@ -87,6 +93,8 @@ hsi_sc_nerf = MethodSpecification(
         },
         full_frame=full_frame_stage(),
         masked=masked_stage(),
+        preset="balanced",
+        max_num_iterations=_BALANCED[ITERATIONS],
     ),
     description="HSI-SC-NeRF: hyperspectral 3D reconstruction of turntable captures from a stationary camera.",
 )
@@ -152,6 +160,7 @@ hsi_sc_nerf_paper = MethodSpecification(
             lr_start=_published_lr(paper.STAGE_ITERATIONS[0]),
             lr_end=_published_lr(sum(paper.STAGE_ITERATIONS)),
         ),
+        max_num_iterations=sum(paper.STAGE_ITERATIONS),
     ),
     description="HSI-SC-NeRF as published: the baseline that hsi-sc-nerf is measured against.",
 )

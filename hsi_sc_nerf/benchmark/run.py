@@ -107,11 +107,11 @@ class BenchmarkRun:
 
 def build_trainer(job: Job) -> StagedTrainer:
     """The trainer that ``ns-train`` would make, without evaluations of its own on the way."""
+    config: Any = training_config(job.method, job.words)  # imports nerfstudio in an order that it can bear
     import torch
     from nerfstudio.utils import writer
 
     writer.EVENT_WRITERS.clear()  # of an earlier trainer in this process
-    config: Any = training_config(job.method, job.words)
     config.pipeline.datamanager.data = Path(job.data)
     if job.iterations is None:
         config.max_train_seconds, config.train_clock = job.train_seconds, job.clock

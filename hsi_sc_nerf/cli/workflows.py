@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
@@ -31,17 +31,13 @@ STEPS_NAME = "steps.json"
 """File of the output folder that says which steps were done with what; it marks the folder as a run's."""
 MATERIAL_NAME = "point_cloud-material.json"
 """File of the output folder that says what was decided of the light on the object."""
-ITERATIONS_ON_CPU = 4000
-"""Without a GPU, 40 000 iterations take hours; these come close (docs/validation/reconstruction.md)."""
-ITERATIONS_ON_GPU = 40_000
 DEMO_MARK = ".hsi-sc-nerf-demo"
 """File that marks the folder of a demo, whose contents may be replaced."""
 StepRunner = Callable[[str, Sequence[str], Path], StepCost]
 """Runs a command; gets the step's name, the command and the file for its output."""
 
-# Fewer rays a step than the default, for two cores.
 DEMO_TRAINING = {
-    "pipeline.datamanager.train-num-rays-per-batch": "1024",
+    "preset": "fast",
     "evaluate-stages": "False",
     "steps-per-eval-batch": "1000000",
     "steps-per-eval-image": "1000000",
@@ -93,8 +89,11 @@ class RunCommand:
     """Folder of the capture session."""
     output_dir: Path
     """Folder for the dataset, the trained run, the cloud, the traits and report.html."""
+    preset: Literal["fast", "balanced", "best"] = "balanced"
+    """How long to train: on two cores without a GPU fast takes about one minute, balanced five and best twenty; on a
+    GPU 10 seconds, one minute and seven."""
     max_num_iterations: int | None = between(1, math.inf, default=None)
-    """Training steps of both stages together. Default: 40000 on a GPU, 4000 without one."""
+    """Training steps of both stages together, in place of the preset's."""
     num_points: int = between(1, math.inf, default=200_000)
     """Number of points of the cloud."""
     process: str = ""
@@ -144,7 +143,9 @@ class RunCommand:
         config, weights = run / "config.yml", run / "nerfstudio_models"
         packed = data / "transforms.json"
         training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
-        training += ["--timestamp", "run", "--vis", "tensorboard", "--max-num-iterations", self._iterations()]
+        training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", self.preset]
+        if self.max_num_iterations is not None:
+            training += ["--max-num-iterations", self.max_num_iterations]
         evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
         exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]
         exporting += ["--num-points", self.num_points]
@@ -182,13 +183,6 @@ class RunCommand:
             Step(name, tuple(map(str, words)), inputs, outputs, name != "material")
             for name, words, inputs, outputs in table
         ]
-
-    def _iterations(self) -> int:
-        if self.max_num_iterations is not None:
-            return self.max_num_iterations
-        import torch  # deferred because it takes seconds to import
-
-        return ITERATIONS_ON_GPU if torch.cuda.is_available() else ITERATIONS_ON_CPU
 
     def _bring_up_to_date(self, step: Step, console: Console, title: str, run_step: StepRunner) -> None:
         """Run a step unless its results are those of the same command and inputs."""
@@ -268,8 +262,8 @@ class DemoCommand:
     """Folder for all results; an earlier demo there is replaced."""
     scene: str = "pear"
     """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
-    iterations: int = 800
-    """Training steps of both stages together."""
+    iterations: int | None = between(1, math.inf, default=None)
+    """Training steps of both stages together, in place of those of `--preset fast`."""
     points: int = 60_000
     """Number of points of the cloud."""
 
@@ -294,7 +288,9 @@ class DemoCommand:
             shutil.rmtree(earlier, ignore_errors=True)
         config = runs / "demo" / "hsi-sc-nerf" / "demo" / "config.yml"
         training: list[object] = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", runs]
-        training += ["--experiment-name", "demo", "--timestamp", "demo", "--max-num-iterations", self.iterations]
+        training += ["--experiment-name", "demo", "--timestamp", "demo"]
+        if self.iterations is not None:
+            training += ["--max-num-iterations", self.iterations]
         training += [word for key, value in DEMO_TRAINING.items() for word in (f"--{key}", value)]
         evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
         exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]

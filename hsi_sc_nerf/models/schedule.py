@@ -17,6 +17,9 @@ from hsi_sc_nerf.models.stages import Stage, StagePlan, resumed_plan
 Clock = Literal["wall", "cpu"]
 """Wall time, or processor time over all threads, which other work on the machine hardly changes."""
 
+_NO_LIMIT = 10**9
+"""Iterations that nerfstudio may take in a timed run."""
+
 
 class Schedule:
     """Where a run is in its plan.
@@ -56,6 +59,21 @@ class Schedule:
     def complete(self) -> bool:
         """Whether the last step was the run's last."""
         return self.stage_complete and self.stage is self.plan.stages[-1]
+
+    def require_steps_left(self, steps_done: int) -> int:
+        """How many steps may still be taken; a timed run ends by the clock.
+
+        Raises:
+            InputError: the run that is to go on is complete.
+        """
+        if self.complete:
+            unit, option = (
+                ("seconds", "--max-train-seconds") if self._unit else ("iterations", "--max-num-iterations")
+            )
+            raise InputError(
+                f"the checkpoint's run has all its {self.plan.length:g} {unit}; raise {option} to train on."
+            )
+        return _NO_LIMIT if self._unit else int(self.plan.length) - steps_done
 
     def begin_step(self, step: int) -> None:
         """Take up the next stage if the last one is complete, and read the position before the step.

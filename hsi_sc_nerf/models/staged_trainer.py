@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 import math
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,6 +30,7 @@ from hsi_sc_nerf.models.checkpoints import (
 from hsi_sc_nerf.models.chosen_effects import effects_setting, resumed_effects
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.presets import Preset, apply_preset
 from hsi_sc_nerf.models.schedule import Clock, Schedule
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
@@ -54,8 +55,6 @@ from hsi_sc_nerf.settings_file import between, check_options
 
 _GPU_PROGRESS_STEPS = 16
 """On a GPU the progress bar is brought up to date once in so many steps: each time, the GPU is waited for."""
-_NO_LIMIT = 10**9
-"""Iterations that nerfstudio may take in a timed run, which ends by the clock."""
 
 
 @dataclass
@@ -67,6 +66,8 @@ class StagedTrainerConfig(TrainerConfig):
     """First stage: whole frames, with the object and its boundary sampled more often than the rest."""
     masked: StageConfig = field(default_factory=masked_stage)
     """Second stage: the masked object, and some background rays."""
+    preset: Preset | None = None
+    """fast, balanced or best: iterations and rays a step for the device. An option of your own goes before it."""
     max_train_seconds: float | None = between(0.001, math.inf, default=None)
     """End the run after so many seconds of training instead of --max-num-iterations; stages and learning rates follow
     the clock. Evaluations and saving do not count. Two such runs do not have the same weights bit by bit."""
@@ -76,6 +77,9 @@ class StagedTrainerConfig(TrainerConfig):
     """Evaluate the held-out views at the end of each stage and write the result beside the stage's checkpoint."""
     capture_steps: bool = True
     """On a GPU, launch a step's forward and backward pass as one CUDA graph."""
+
+    def __post_init__(self) -> None:
+        apply_preset(self)
 
     def plan(self) -> StagePlan:
         """The stages of the run.
@@ -125,14 +129,13 @@ class StagedTrainer(Trainer):
         if self.world_size > 1:
             # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
-        timed = self.config.max_train_seconds is not None
+        clock = self.config.train_clock if self.config.max_train_seconds is not None else None
         wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else lambda: None
-        self.schedule = Schedule(self.config.plan(), self.config.train_clock if timed else None, wait)
+        self.schedule = Schedule(self.config.plan(), clock, wait)
         self._frozen: set[str] | None = None
-        self._steps_since_update = 0
         self._saved_step: int | None = None
         self._loaded: Path | None = None
-        self._trained_step = -1
+        self._trained_step, self._steps_since_update = -1, 0
         self._guard = NonFiniteGuard()
         self._captured: CapturedSteps | None = None
         try:
@@ -147,9 +150,10 @@ class StagedTrainer(Trainer):
         # Evaluation and export build what was trained, whatever becomes of the dataset.
         self._model_config.effects = effects_setting(self._model.effects)
         self.config.save_config()
-        on_gpu = self.pipeline.device.type == "cuda"
-        plain = not (self.config.mixed_precision or self.config.use_grad_scaler or self.config.log_gradients)
-        if on_gpu and plain and self.config.capture_steps and not self.config.gradient_accumulation_steps:
+        config = self.config
+        unusual = config.mixed_precision or config.use_grad_scaler or config.log_gradients
+        unusual = unusual or config.gradient_accumulation_steps or not config.capture_steps
+        if self.pipeline.device.type == "cuda" and not unusual:
             self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -174,18 +178,12 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            schedule, timed = self.schedule, self.config.max_train_seconds is not None
             was_to_be_kept = self._loaded is not None and self._keep_stage_of(self._loaded)
-            if schedule.complete and was_to_be_kept:
+            if self.schedule.complete and was_to_be_kept:
                 return
-            if schedule.complete:
-                option, unit = ("--max-train-seconds", "seconds") if timed else ("--max-num-iterations", "iterations")
-                raise InputError(
-                    f"{self._loaded}: has all its {schedule.plan.length:g} {unit}; raise {option} to train on."
-                )
-            left = _NO_LIMIT if timed else int(schedule.plan.length) - self._start_step
-            self.config = dataclasses.replace(self.config, max_num_iterations=left)
-            with training_progress(schedule) as self._show_progress:
+            self.config = copy.copy(self.config)
+            self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
+            with training_progress(self.schedule) as self._show_progress:
                 super().train()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights, so these are the last finite ones.
@@ -326,9 +324,8 @@ class StagedTrainer(Trainer):
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         self._saved_step = step
         if self.config.save_only_latest_checkpoint:
-            for older in self.checkpoint_dir.glob("*.ckpt"):
-                if older != path:
-                    older.unlink()
+            for older in {*self.checkpoint_dir.glob("*.ckpt")} - {path}:
+                older.unlink()
 
     def _checkpoint_to_load(self) -> Path | None:
         if self.config.load_dir is not None:

@@ -174,3 +174,21 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monke
         made.save_checkpoint(1)
     assert list(made.checkpoint_dir.iterdir()) == before
     assert [path for path in made.base_dir.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.slow
+def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path / "first", max_train_seconds=1.0)
+    made.train()
+    assert {path.name for path in made.base_dir.glob("stage-*")} == {"stage-full-frame", "stage-masked"}
+    state = torch.load(max(made.checkpoint_dir.glob("*.ckpt")))
+    assert state["training"]["position"] >= 1.0
+    assert state["step"] == made._trained_step
+    longer = trainer(tiny_dataset, tmp_path / "longer", max_train_seconds=6.0, load_dir=made.checkpoint_dir)
+    longer.train()
+    later = torch.load(max(longer.checkpoint_dir.glob("*.ckpt")))
+    assert later["training"]["position"] > state["training"]["position"]
+    assert later["training"]["completed_stage"] == "masked"
+    assert later["step"] > state["step"]
+    with pytest.raises(SystemExit, match=r"hsi-sc-nerf: [^\n]*--max-num-iterations"):
+        trainer(tiny_dataset, tmp_path / "other", load_dir=made.checkpoint_dir)

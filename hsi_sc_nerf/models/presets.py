@@ -1,0 +1,63 @@
+"""Named settings of a training run: what they cost and give stands in docs/validation/accuracy_and_time.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any, Literal
+
+import torch
+
+Preset = Literal["fast", "balanced", "best"]
+
+Device = Literal["cpu", "cuda"]
+
+ITERATIONS = "max_num_iterations"
+RAYS = "pipeline.datamanager.train_num_rays_per_batch"
+
+PRESETS: Mapping[Device, Mapping[Preset, Mapping[str, int]]] = {
+    "cpu": {
+        "fast": {ITERATIONS: 800, RAYS: 1024},
+        "balanced": {ITERATIONS: 4000, RAYS: 1024},
+        "best": {ITERATIONS: 16_000, RAYS: 1024},
+    },
+    "cuda": {
+        "fast": {ITERATIONS: 1000, RAYS: 2048},
+        "balanced": {ITERATIONS: 5000, RAYS: 2048},
+        "best": {ITERATIONS: 40_000, RAYS: 2048},
+    },
+}
+"""Settings by device and preset, as attributes of the trainer's configuration."""
+
+
+def apply_preset(config: Any) -> None:
+    """Set what the configuration's preset sets for its device, but for settings that the user has changed.
+
+    Args:
+        config: of the trainer; changed in place, unless its preset is None. A setting is the user's where it is not
+            that of balanced, the default.
+
+    Example:
+        >>> from types import SimpleNamespace as Config
+        >>> manager = Config(train_num_rays_per_batch=512)
+        >>> machine, pipeline = Config(device_type="cpu"), Config(datamanager=manager)
+        >>> balanced = PRESETS[default_device()]["balanced"][ITERATIONS]
+        >>> config = Config(preset="fast", max_num_iterations=balanced, machine=machine, pipeline=pipeline)
+        >>> apply_preset(config)
+        >>> config.max_num_iterations, manager.train_num_rays_per_batch
+        (800, 512)
+    """
+    if config.preset is None:
+        return
+    device: Device = "cuda" if config.machine.device_type == "cuda" else "cpu"
+    untouched = PRESETS[default_device()]["balanced"]
+    for path, value in PRESETS[device][config.preset].items():
+        parent, _, name = path.rpartition(".")
+        part = attrgetter(parent)(config) if parent else config
+        if getattr(part, name) == untouched[path]:
+            setattr(part, name, value)
+
+
+def default_device() -> Device:
+    """The device that a run trains on if none is named."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
