@@ -16,7 +16,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import tyro
 from mkdocs.config.defaults import MkDocsConfig
@@ -25,7 +25,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
-from hsi_sc_nerf.cli.commands import Commands
+from hsi_sc_nerf.cli.commands import COMMANDS, command_line, named_commands
 from hsi_sc_nerf.terminal import markdown_table
 
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
@@ -90,14 +90,15 @@ def commands_page() -> str:
 
 def command_names() -> list[str]:
     """The commands, in the order in which the help lists them."""
-    return [get_args(command)[1].name for command in get_args(Commands)]
+    return list(COMMANDS)
 
 
 def help_text(command: str) -> str:
     """What ``hsi-sc-nerf COMMAND --help`` prints, 110 characters wide and without colours."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit), _plain_terminal():
-        tyro.cli(Commands, prog="hsi-sc-nerf", args=[*([command] if command else []), "--help"])  # type: ignore[call-overload]
+        words = [*([command] if command else []), "--help"]
+        tyro.cli(command_line(named_commands(words)), prog="hsi-sc-nerf", args=words)
     return re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
 
 

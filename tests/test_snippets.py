@@ -16,7 +16,7 @@ import torch
 import tyro
 from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.commands import Commands
+from hsi_sc_nerf.cli.commands import command_line
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.export.ply import read_spectral_ply
@@ -71,7 +71,7 @@ def assert_parses(page: str, line: str, parse: Callable[[list[str]], object], ca
 
 
 def test_our_command_lines_parse(capsys: pytest.CaptureFixture) -> None:
-    parse = partial(tyro.cli, Commands)
+    parse = partial(tyro.cli, command_line())
     ours = [(page, line) for page, line in command_lines() if line.startswith("hsi-sc-nerf")]
     assert len(ours) > 20
     for page, line in ours:

@@ -2,30 +2,65 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import make_dataclass
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple, Union
 
 import tyro
 
-from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
-from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
-from hsi_sc_nerf.cli.light import MaterialCommand
-from hsi_sc_nerf.cli.sessions import InspectCommand, MarkersCommand, ProcessCommand, SimulateCommand
-from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand, SampleCommand
-from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand
 
-Commands = (
-    Annotated[DemoCommand, tyro.conf.subcommand("demo")]
-    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
-    | Annotated[RunCommand, tyro.conf.subcommand("run")]
-    | Annotated[MarkersCommand, tyro.conf.subcommand("markers")]
-    | Annotated[InspectCommand, tyro.conf.subcommand("inspect")]
-    | Annotated[ProcessCommand, tyro.conf.subcommand("process")]
-    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
-    | Annotated[SampleCommand, tyro.conf.subcommand("sample")]
-    | Annotated[MaterialCommand, tyro.conf.subcommand("material")]
-    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
-    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
-    | Annotated[TraitsCommand, tyro.conf.subcommand("traits")]
-    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
-    | Annotated[BenchmarkCommand, tyro.conf.subcommand("benchmark")]
-)
+class Command(NamedTuple):
+    """Where a command is, and what the list of commands says of it."""
+
+    module: str
+    class_name: str
+    summary: str
+
+
+COMMANDS = {
+    "demo": Command("workflows", "DemoCommand", "Simulate, reconstruct and judge a fruit: try this first."),
+    "simulate": Command("sessions", "SimulateCommand", "Simulate a turntable session, with its truth."),
+    "run": Command("workflows", "RunCommand", "Do all steps from a capture session to traits and a report."),
+    "markers": Command("sessions", "MarkersCommand", "Write ArUco markers to print."),
+    "inspect": Command("sessions", "InspectCommand", "Check a session in seconds, before you process it."),
+    "process": Command("sessions", "ProcessCommand", "Calibrate captures, estimate poses and masks, pack a dataset."),
+    "export": Command("trained_runs", "ExportCommand", "Write the spectral point cloud of a trained run."),
+    "sample": Command("trained_runs", "SampleCommand", "Add spectra of a trained run to the points of a PLY file."),
+    "material": Command("light", "MaterialCommand", "Tell the material's reflectance apart from the light on it."),
+    "render": Command("trained_runs", "RenderCommand", "Render views of a trained run as ENVI cubes and videos."),
+    "compare": Command("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
+    "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
+    "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
+    "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
+}
+"""The commands, in the order in which the help lists them."""
+
+
+def command_line(names: Sequence[str] = tuple(COMMANDS)) -> Any:
+    """The type that tyro parses the command line with; of the commands, only these are imported.
+
+    Importing all takes seconds. The others are listed, and have no options.
+    """
+    classes = {name: _imported(name) if name in names else _listed(name) for name in COMMANDS}
+    # The list shows the summary; the command's own help shows its docstring.
+    return Union[  # noqa: UP007
+        tuple(
+            Annotated[made, tyro.conf.subcommand(name, description=None if name in names else COMMANDS[name].summary)]
+            for name, made in classes.items()
+        )
+    ]
+
+
+def named_commands(words: Sequence[str]) -> tuple[str, ...]:
+    """The commands that a command line needs: the one that it begins with, or none."""
+    return tuple(word for word in words[:1] if word in COMMANDS)
+
+
+def _imported(name: str) -> type:
+    entry = COMMANDS[name]
+    return getattr(import_module(f"hsi_sc_nerf.cli.{entry.module}"), entry.class_name)
+
+
+def _listed(name: str) -> type:
+    return make_dataclass(COMMANDS[name].class_name, [], namespace={"__doc__": COMMANDS[name].summary})

@@ -25,7 +25,8 @@ def main() -> None:
 
         ignore_library_warnings()
         # Reading the options can already raise InputError.
-        command = tyro.cli(commands.Commands, description=commands.__doc__)
+        needed = commands.named_commands(sys.argv[1:])
+        command = tyro.cli(commands.command_line(needed), description=commands.__doc__)
         command.main()
     except InputError as error:
         _tell("Error: ", str(error))

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from hsi_sc_nerf.cli import main as entry
+from hsi_sc_nerf.cli.commands import COMMANDS
 from hsi_sc_nerf.cli.sessions import MarkersCommand
 
 MAIN = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
@@ -84,3 +85,29 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
     subprocess.run([*MAIN, *words], check=True, capture_output=True)
     for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
         assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()
+
+
+def test_help_loads_no_numerical_library_and_a_command_only_its_own():
+    """Loading all of them takes seconds."""
+    code = """
+import sys
+from hsi_sc_nerf.cli import main
+sys.argv = ["hsi-sc-nerf", *sys.argv[1:]]
+try:
+    main.main()
+except SystemExit:
+    pass
+print(*sys.modules)
+"""
+
+    def loaded(*words):
+        printed = subprocess.run([sys.executable, "-c", code, *words, "--help"], check=True, capture_output=True)
+        *told, modules = printed.stdout.decode().splitlines()
+        return "\n".join(told), set(modules.split())
+
+    told, modules = loaded()
+    assert all(f" {name} " in told for name in COMMANDS)
+    assert not modules & {"numpy", "scipy", "matplotlib", "cv2", "torch", "nerfstudio"}
+    told, modules = loaded("markers")
+    assert "--output" in told
+    assert "torch" not in modules
