@@ -27,7 +27,7 @@ class Schedule:
     Args:
         plan: in iterations, or in seconds.
         clock: that the plan's seconds refer to; None for a plan in iterations.
-        wait: finishes the work of a GPU before the clock is paused.
+        wait: finishes the work of a GPU before the clock is paused; None without one.
 
     Attributes:
         stage: of the present step, or of the last one.
@@ -45,14 +45,12 @@ class Schedule:
         ('full-frame', True, False)
     """
 
-    def __init__(
-        self, plan: StagePlan, clock: Clock | None = None, wait: Callable[[], object] = lambda: None
-    ) -> None:
+    def __init__(self, plan: StagePlan, clock: Clock | None = None, wait: Callable[[], object] | None = None) -> None:
         self.plan, self._unit = plan, clock
         self.stage: Stage = plan.stages[0]
         self.position = 0.0
         self.stage_complete = False
-        self.clock = TrainingClock(wait)
+        self.clock = TrainingClock(wait or (lambda: None))
         self._begun = False
 
     @property

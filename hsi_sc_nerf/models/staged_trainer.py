@@ -130,7 +130,7 @@ class StagedTrainer(Trainer):
             # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
         clock = self.config.train_clock if self.config.max_train_seconds is not None else None
-        wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else lambda: None
+        wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else None
         self.schedule = Schedule(self.config.plan(), clock, wait)
         self._frozen: set[str] | None = None
         self._saved_step: int | None = None
@@ -151,9 +151,9 @@ class StagedTrainer(Trainer):
         self._model_config.effects = effects_setting(self._model.effects)
         self.config.save_config()
         config = self.config
-        unusual = config.mixed_precision or config.use_grad_scaler or config.log_gradients
-        unusual = unusual or config.gradient_accumulation_steps or not config.capture_steps
-        if self.pipeline.device.type == "cuda" and not unusual:
+        plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
+        plain = plain and not config.gradient_accumulation_steps
+        if self.pipeline.device.type == "cuda" and config.capture_steps and plain:
             self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
 
     def setup_optimizers(self) -> GuardedOptimizers:

@@ -99,7 +99,7 @@ def training_progress(schedule: Schedule) -> Iterator[Callable[[int, float], Non
         bar.update(task, completed=completed, description=description, steps=steps, quality=quality)
 
     with timed_progress(TextColumn("{task.fields[steps]}"), TextColumn("{task.fields[quality]}")) as bar:
-        task = bar.add_task("training", total=total, completed=schedule.position, steps="", quality="")
+        task = bar.add_task("training", total=total, completed=round(schedule.position), steps="", quality="")
         yield update
 
 
