@@ -5,7 +5,7 @@
 
 A simulated noisy session is trained for the same time with every setting, and judged against what is known: held-out
 views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their range. Ranges
-that overlap are no difference. What is finished is not done again.
+range. Ranges that overlap are no difference. What is finished is not done again.
 
 Other work on the machine changes seconds by a third from hour to hour, and steps not at all. So the seconds of a step
 are measured once for all settings, in turns in one process, and each setting is trained for the steps that its time

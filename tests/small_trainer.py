@@ -7,7 +7,14 @@ from hsi_sc_nerf.config import hsi_sc_nerf
 STEPS = 6
 
 
-def trainer(tiny_dataset, folder, device="cpu", effects="view_dependence,still_chamber,pose_refinement", **changes):
+def trainer(
+    tiny_dataset,
+    folder,
+    device="cpu",
+    effects="view_dependence,still_chamber,pose_refinement",
+    predict_normals=False,
+    **changes,
+):
     config = copy.deepcopy(hsi_sc_nerf.config)
     config.pipeline.datamanager.data = tiny_dataset[0]
     config.pipeline.datamanager.train_num_rays_per_batch = 64
@@ -18,7 +25,7 @@ def trainer(tiny_dataset, folder, device="cpu", effects="view_dependence,still_c
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.machine.device_type = device
     config.max_num_iterations, config.evaluate_stages = STEPS, False
-    model.effects = effects
+    model.effects, model.predict_normals = effects, predict_normals
     for key, value in changes.items():
         setattr(config, key, value)
     made = config.setup(local_rank=0, world_size=1)

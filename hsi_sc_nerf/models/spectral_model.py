@@ -291,7 +291,7 @@ class SpectralModel(NerfactoModel):
             return outputs
         fills: dict[str, Any] = {"depth": rays.fars, "expected_depth": rays.fars}
         return outputs | {
-            name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), value.shape[1])))
+            name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), *value.shape[1:])))
             for name, value in outputs.items()
             if isinstance(value, Tensor)
         }

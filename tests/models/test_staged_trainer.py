@@ -78,6 +78,16 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
     assert shrunk == pytest.approx([3.0 * rate for rate in rates[3:]])  # the first stage does not learn the field
 
 
+@pytest.mark.slow
+def test_normals_are_predicted_where_an_occupancy_grid_places_the_samples(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path, predict_normals=True)
+    weights = made.pipeline.model.field.mlp_pred_normals.layers[0].weight
+    before = weights.clone()
+    made.train()
+    assert not torch.equal(before, weights)
+    assert torch.isfinite(weights).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
