@@ -3,8 +3,8 @@
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts views
 
-A simulated noisy session is trained for the same time with every setting, and judged against what is known: held-out
-views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their range. Ranges
+A simulated noisy session is trained for the same time with every setting, and judged against what is known:
+held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their
 range. Ranges that overlap are no difference. What is finished is not done again.
 
 Other work on the machine changes seconds by a third from hour to hour, and steps not at all. So the seconds of a step
@@ -61,15 +61,11 @@ _MODEL = "--pipeline.model"
 SETTINGS: dict[str, str] = {
     DEFAULT: "",
     "2048 rays a step": f"{_RAYS} 2048",
-    "4096 rays a step": f"{_RAYS} 4096",
     "8 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 8",
     "32 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 32",
     "every band a channel": f"{_MODEL}.head direct",
     "first stage a quarter": "--full-frame.fraction 0.25 --masked.fraction 0.75",
-    "first stage three quarters": "--full-frame.fraction 0.75 --masked.fraction 0.25",
     "no angular loss": f"{_MODEL}.angular-loss-mult 0",
-    "angular loss times three": f"{_MODEL}.angular-loss-mult 0.09",
-    "predicted normals": f"{_MODEL}.predict-normals True",
     "all three effects": f"{_MODEL}.effects view_dependence,still_chamber,pose_refinement",
     "no effects": f"{_MODEL}.effects none",
 }
