@@ -1,0 +1,277 @@
+"""Commands killed at random moments and started again, and commands that get Ctrl-C at random moments.
+
+    uv run python benchmarks/killed_commands.py
+
+Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and started
+again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the same bytes;
+checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded. TensorBoard's
+logs are not compared, for they hold times, and each start adds one. A file is half-written if it lies under its final
+name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from results_table import RESULTS, write_results
+
+from hsi_sc_nerf.benchmark.steps import typed_command
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_picture
+from hsi_sc_nerf.models.checkpoints import read_checkpoint, require_whole
+from hsi_sc_nerf.models.run_settings import read_config
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+
+KILLED = ["command", "undisturbed, s", "moments", "after its end", "half-written files", "other results", "leftovers"]
+STOPPED = [
+    *("command", "moments", "after its end", "ends by 130 and one line", "ends otherwise", "goes on"),
+    *("half-written files", "leftovers"),
+]
+STEPS, RAYS = 150, 128
+TRAINED = Path("e", "hsi-sc-nerf", "run")
+NOT_COMPARED = "events.out.tfevents"
+# A command that still runs so long after Ctrl-C has swallowed it.
+_ENDS_S = 10.0
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that writes to the folder ``out`` of the current one."""
+
+    name: str
+    words: tuple[str, ...]
+
+    def again(self, folder: Path) -> tuple[str, ...]:
+        """What is typed after it was killed."""
+        checkpoints = Path("out") / TRAINED / "nerfstudio_models"
+        saved = self.words[0] == "ns-train" and any((folder / checkpoints).glob("step-*.ckpt"))
+        return (*self.words, *(("--load-dir", str(checkpoints)) if saved else ()))
+
+
+def commands(inputs: Path) -> list[Command]:
+    """The commands; each works on what the references of those before it left in ``inputs``."""
+    data, run, cloud = inputs / "process" / "out", inputs / "ns-train" / "out" / TRAINED, "point_cloud.ply"
+    training = f"ns-train hsi-sc-nerf --data {data} --output-dir out --experiment-name e --timestamp run"
+    training += f" --vis tensorboard --max-num-iterations {STEPS} --steps-per-save {STEPS // 6}"
+    training += f" --pipeline.datamanager.train-num-rays-per-batch {RAYS} --steps-per-eval-batch {STEPS // 3}"
+    return [
+        Command(line.split()[0] if line.startswith("ns") else line.split()[1], tuple(line.split()))
+        for line in (
+            f"hsi-sc-nerf process {inputs / 'session'} --output-dir out",
+            training,
+            f"ns-export pointcloud --load-config {run / 'config.yml'} --output-dir out --num-points 3000",
+            f"hsi-sc-nerf traits {inputs / 'ns-export' / 'out' / cloud} --data {data} --splits 1 --output-dir out",
+        )
+    ]
+
+
+def simulated(folder: Path) -> Path:
+    """The session that all commands work on."""
+    return simulate_session(override(load_scene("pear"), frames=10, size_px=112, bands=12), folder, progress=False)
+
+
+def start(words: tuple[str, ...], folder: Path) -> subprocess.Popen[bytes]:
+    """Start a command in ``folder``, in a process group of its own that Ctrl-C reaches; its output goes to a log."""
+    folder.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCHDYNAMO_DISABLE": "1", "TERM": "dumb"}
+    environment["PYTHONWARNINGS"] = "ignore"
+    if environment.pop("PYTHONDONTWRITEBYTECODE", None):
+        environment["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "killed-commands-pycache")
+    with (folder / "log").open("wb") as log:
+        return subprocess.Popen(
+            typed_command(words),
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+
+
+def undisturbed(command: Command, folder: Path) -> float:
+    """Run a command and return its seconds.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    started = time.monotonic()
+    if start(command.words, folder).wait() != 0:
+        raise RuntimeError(f"{command.name}: {(folder / 'log').read_text()[-2000:]}")
+    return time.monotonic() - started
+
+
+def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str]:
+    """Kill a command, start it again, and count what is wrong."""
+    found: Counter[str] = Counter()
+    process = start(command.words, folder)
+    try:
+        process.wait(after_s)
+        found["after its end"] = 1
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    half = half_written(folder / "out", reference / "out")
+    # A finished training has nothing to go on with, which is one sentence and status 1: its results decide.
+    start(command.again(folder), folder).wait()
+    other = differences(reference / "out", folder / "out")
+    left = leftovers(folder / "out", reference / "out")
+    for name, paths in (("half-written files", half), ("other results", other), ("leftovers", left)):
+        found[name] = len(paths)
+        if paths:
+            print(f"{command.name} killed after {after_s:.2f} s: {name}: {', '.join(map(str, paths))}", flush=True)
+    return found
+
+
+def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str]:
+    """Press Ctrl-C once, and count how the command ends and what it leaves."""
+    found: Counter[str] = Counter()
+    process = start(command.words, folder)
+    try:
+        process.wait(after_s)
+        found["after its end"] = 1
+        return found
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGINT)
+    pressed = time.monotonic()
+    try:
+        process.wait(_ENDS_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    told = (folder / "log").read_text(errors="replace")
+    lines = [line for line in told.splitlines() if line.strip()]
+    one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
+    if process.returncode in (0, -signal.SIGKILL):
+        found["after its end" if process.returncode == 0 and time.monotonic() - pressed < 1.0 else "goes on"] = 1
+    else:
+        found["ends by 130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
+    found["half-written files"] = len(half_written(folder / "out", reference / "out"))
+    left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
+    found["leftovers"] = len(left)
+    if found["ends otherwise"] or found["goes on"] or left:
+        print(f"{command.name}, Ctrl-C after {after_s:.2f} s: status {process.returncode}, {left}", flush=True)
+        print("    " + "\n    ".join(lines[-4:]), flush=True)
+    return found
+
+
+def half_written(folder: Path, reference: Path) -> list[Path]:
+    """Files under their final names that are not whole."""
+    return [
+        path
+        for path in _files(folder)
+        if not any(part.startswith(".partial-") or part.endswith("-writing") for part in path.parts)
+        and not _is_whole(folder / path, reference / path)
+    ]
+
+
+def _is_whole(path: Path, reference: Path) -> bool:
+    if reference.is_file() and reference.read_bytes() == path.read_bytes():
+        return True
+    try:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".ckpt":
+            require_whole(path)
+        elif path.name == "config.yml":
+            read_config(path)
+        else:
+            return path.suffix == ".png" and read_picture(path, 3) is not None
+    except (InputError, ValueError):
+        return False
+    return True
+
+
+def differences(reference: Path, folder: Path) -> list[Path]:
+    """Files of the reference that are missing or have other contents."""
+    return [path for path in _files(reference) if not _is_same(reference / path, folder / path)]
+
+
+def _is_same(reference: Path, found: Path) -> bool:
+    if not found.is_file():
+        return False
+    if reference.suffix == ".ckpt":
+        return _same_values(read_checkpoint(reference), read_checkpoint(found))
+    if reference.name == "config.yml":
+        one, other = (dataclasses.replace(read_config(path), load_dir=None) for path in (reference, found))
+        return bool(one == other)
+    return reference.read_bytes() == found.read_bytes()
+
+
+def _same_values(one: Any, other: Any) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same_values(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(_same_values, one, other))
+    return bool(one == other)
+
+
+def leftovers(folder: Path, reference: Path) -> list[Path]:
+    """Files that the reference lacks."""
+    return sorted(set(_files(folder)) - set(_files(reference)))
+
+
+def _files(folder: Path) -> list[Path]:
+    """All files under a folder but TensorBoard's, relative to it."""
+    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
+    return [path for path in found if not path.name.startswith(NOT_COMPARED)]
+
+
+def moments_s(count: int, seconds: float, seed: str) -> Iterator[float]:
+    """Random moments, one in each of ``count`` equal parts of a command's duration."""
+    rng = random.Random(seed)
+    for part in range(count):
+        yield seconds * (part + rng.random()) / count
+
+
+def main(moments: int = 20, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
+    """Kill and interrupt every command, and write both tables.
+
+    Args:
+        moments: of each command and signal.
+        seed: of the moments.
+        only: part of the names of the commands to disturb; the other rows of the tables are kept.
+        results: folder of the tables.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        inputs, folder = Path(temporary) / "inputs", Path(temporary) / "disturbed"
+        simulated(inputs / "session")
+        for command in commands(inputs):
+            undisturbed(command, inputs / command.name)
+            if only not in command.name:
+                continue
+            # Once more, for the first start compiles and reads what later ones find.
+            seconds = undisturbed(command, folder)
+            for name, deed, columns in (
+                ("killed_commands", killed_and_repeated, KILLED),
+                ("interrupted_commands", stopped, STOPPED),
+            ):
+                counts: Counter[str] = Counter()
+                for after_s in moments_s(moments, seconds, f"{seed} {name} {command.name}"):
+                    shutil.rmtree(folder, ignore_errors=True)
+                    counts += deed(command, folder, inputs / command.name, after_s)
+                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": moments}
+                row = [str(known.get(column, counts[column])) for column in columns]
+                write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
