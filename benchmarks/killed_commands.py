@@ -2,11 +2,11 @@
 
     uv run python benchmarks/killed_commands.py
 
-Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and started
-again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the same bytes;
-checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded. TensorBoard's
-logs are not compared, for they hold times, and each start adds one. A file is half-written if it lies under its final
-name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings.
+Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and
+started again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the
+same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded.
+TensorBoard's logs are not compared, for they hold times, and each start adds one. A file is half-written if it lies
+under its final name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STOPPED = [
     *("command", "moments", "after its end", "ends by 130 and one line", "ends otherwise", "goes on"),
     *("half-written files", "leftovers"),
 ]
-STEPS, RAYS = 150, 128
+STEPS, RAYS = 120, 128
 TRAINED = Path("e", "hsi-sc-nerf", "run")
 NOT_COMPARED = "events.out.tfevents"
 # A command that still runs so long after Ctrl-C has swallowed it.
@@ -68,15 +68,15 @@ def commands(inputs: Path) -> list[Command]:
     """The commands; each works on what the references of those before it left in ``inputs``."""
     data, run, cloud = inputs / "process" / "out", inputs / "ns-train" / "out" / TRAINED, "point_cloud.ply"
     training = f"ns-train hsi-sc-nerf --data {data} --output-dir out --experiment-name e --timestamp run"
-    training += f" --vis tensorboard --max-num-iterations {STEPS} --steps-per-save {STEPS // 6}"
+    training += f" --vis tensorboard --max-num-iterations {STEPS} --steps-per-save {STEPS // 5}"
     training += f" --pipeline.datamanager.train-num-rays-per-batch {RAYS} --steps-per-eval-batch {STEPS // 3}"
     return [
         Command(line.split()[0] if line.startswith("ns") else line.split()[1], tuple(line.split()))
         for line in (
             f"hsi-sc-nerf process {inputs / 'session'} --output-dir out",
             training,
-            f"ns-export pointcloud --load-config {run / 'config.yml'} --output-dir out --num-points 3000",
-            f"hsi-sc-nerf traits {inputs / 'ns-export' / 'out' / cloud} --data {data} --splits 1 --output-dir out",
+            f"ns-export pointcloud --load-config {run / 'config.yml'} --output-dir out --num-points 2000",
+            f"hsi-sc-nerf traits {inputs / 'ns-export' / 'out' / cloud} --data {data} --splits 0 --output-dir out",
         )
     ]
 
@@ -242,12 +242,13 @@ def moments_s(count: int, seconds: float, seed: str) -> Iterator[float]:
         yield seconds * (part + rng.random()) / count
 
 
-def main(moments: int = 20, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
+def main(moments: int = 20, presses: int = 10, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
     """Kill and interrupt every command, and write both tables.
 
     Args:
-        moments: of each command and signal.
-        seed: of the moments.
+        moments: at which each command is killed.
+        presses: moments at which each command gets Ctrl-C.
+        seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
         results: folder of the tables.
     """
@@ -260,15 +261,15 @@ def main(moments: int = 20, seed: int = 0, only: str = "", results: Path = RESUL
                 continue
             # Once more, for the first start compiles and reads what later ones find.
             seconds = undisturbed(command, folder)
-            for name, deed, columns in (
-                ("killed_commands", killed_and_repeated, KILLED),
-                ("interrupted_commands", stopped, STOPPED),
+            for name, deed, columns, count in (
+                ("killed_commands", killed_and_repeated, KILLED, moments),
+                ("interrupted_commands", stopped, STOPPED, presses),
             ):
                 counts: Counter[str] = Counter()
-                for after_s in moments_s(moments, seconds, f"{seed} {name} {command.name}"):
+                for after_s in moments_s(count, seconds, f"{seed} {name} {command.name}"):
                     shutil.rmtree(folder, ignore_errors=True)
                     counts += deed(command, folder, inputs / command.name, after_s)
-                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": moments}
+                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
 
