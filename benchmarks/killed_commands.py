@@ -5,8 +5,10 @@
 Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and
 started again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the
 same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded.
-TensorBoard's logs are not compared, for they hold times, and each start adds one. A file is half-written if it lies
-under its final name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings.
+TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are the speeds among the metrics
+of a stage. A file is half-written if it lies under its final name, has not the reference's bytes, and cannot be read
+as JSON, PNG, checkpoint or settings. A moment that comes after the command's end, which differs from run to run, is
+drawn again for a shorter duration.
 """
 
 from __future__ import annotations
@@ -38,14 +40,12 @@ from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
-KILLED = ["command", "undisturbed, s", "moments", "after its end", "half-written files", "other results", "leftovers"]
-STOPPED = [
-    *("command", "moments", "after its end", "ends by 130 and one line", "ends otherwise", "goes on"),
-    *("half-written files", "leftovers"),
-]
+KILLED = ["command", "undisturbed, s", "moments", "half-written files", "other results", "leftovers"]
+STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on", "half-written files", "leftovers"]
 STEPS, RAYS = 120, 128
 TRAINED = Path("e", "hsi-sc-nerf", "run")
 NOT_COMPARED = "events.out.tfevents"
+SPEEDS = ("num_rays_per_sec", "fps")
 # A command that still runs so long after Ctrl-C has swallowed it.
 _ENDS_S = 10.0
 
@@ -117,13 +117,13 @@ def undisturbed(command: Command, folder: Path) -> float:
     return time.monotonic() - started
 
 
-def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str]:
-    """Kill a command, start it again, and count what is wrong."""
+def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str] | None:
+    """Kill a command, start it again, and count what is wrong; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)
     try:
         process.wait(after_s)
-        found["after its end"] = 1
+        return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -139,29 +139,29 @@ def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s
     return found
 
 
-def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str]:
-    """Press Ctrl-C once, and count how the command ends and what it leaves."""
+def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str] | None:
+    """Press Ctrl-C once, and count how the command ends and what it leaves; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)
     try:
         process.wait(after_s)
-        found["after its end"] = 1
-        return found
+        return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGINT)
-    pressed = time.monotonic()
     try:
         process.wait(_ENDS_S)
+        if process.returncode == 0:
+            return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     told = (folder / "log").read_text(errors="replace")
     lines = [line for line in told.splitlines() if line.strip()]
     one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
-    if process.returncode in (0, -signal.SIGKILL):
-        found["after its end" if process.returncode == 0 and time.monotonic() - pressed < 1.0 else "goes on"] = 1
+    if process.returncode == -signal.SIGKILL:
+        found["goes on"] = 1
     else:
-        found["ends by 130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
+        found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
     found["half-written files"] = len(half_written(folder / "out", reference / "out"))
     left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
     found["leftovers"] = len(left)
@@ -211,7 +211,15 @@ def _is_same(reference: Path, found: Path) -> bool:
     if reference.name == "config.yml":
         one, other = (dataclasses.replace(read_config(path), load_dir=None) for path in (reference, found))
         return bool(one == other)
+    if reference.parent.name.startswith("stage-"):
+        return _metrics(reference) == _metrics(found)
     return reference.read_bytes() == found.read_bytes()
+
+
+def _metrics(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text())
+    results = {key: value for key, value in content["results"].items() if not key.startswith(SPEEDS)}
+    return content | {"results": results}
 
 
 def _same_values(one: Any, other: Any) -> bool:
@@ -235,18 +243,18 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in found if not path.name.startswith(NOT_COMPARED)]
 
 
-def moments_s(count: int, seconds: float, seed: str) -> Iterator[float]:
-    """Random moments, one in each of ``count`` equal parts of a command's duration."""
+def moments(count: int, seed: str) -> Iterator[float]:
+    """Random moments, one in each of ``count`` equal parts of a command's duration, as fractions of it."""
     rng = random.Random(seed)
     for part in range(count):
-        yield seconds * (part + rng.random()) / count
+        yield (part + rng.random()) / count
 
 
-def main(moments: int = 20, presses: int = 10, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
+def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
     """Kill and interrupt every command, and write both tables.
 
     Args:
-        moments: at which each command is killed.
+        kills: moments at which each command is killed.
         presses: moments at which each command gets Ctrl-C.
         seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
@@ -262,13 +270,18 @@ def main(moments: int = 20, presses: int = 10, seed: int = 0, only: str = "", re
             # Once more, for the first start compiles and reads what later ones find.
             seconds = undisturbed(command, folder)
             for name, deed, columns, count in (
-                ("killed_commands", killed_and_repeated, KILLED, moments),
+                ("killed_commands", killed_and_repeated, KILLED, kills),
                 ("interrupted_commands", stopped, STOPPED, presses),
             ):
                 counts: Counter[str] = Counter()
-                for after_s in moments_s(count, seconds, f"{seed} {name} {command.name}"):
-                    shutil.rmtree(folder, ignore_errors=True)
-                    counts += deed(command, folder, inputs / command.name, after_s)
+                lasts_s = seconds
+                for moment in moments(count, f"{seed} {name} {command.name}"):
+                    found = None
+                    while found is None:
+                        shutil.rmtree(folder, ignore_errors=True)
+                        found = deed(command, folder, inputs / command.name, moment * lasts_s)
+                        lasts_s *= 0.9 if found is None else 1.0
+                    counts += found
                 known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
