@@ -5,10 +5,10 @@
 Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and
 started again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the
 same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded.
-TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are the speeds among the metrics
-of a stage. A file is half-written if it lies under its final name, has not the reference's bytes, and cannot be read
-as JSON, PNG, checkpoint or settings. A moment that comes after the command's end, which differs from run to run, is
-drawn again for a shorter duration.
+TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are the speeds among the
+metrics of a stage. A file is half-written if it lies under its final name, has not the reference's bytes, and cannot
+be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's end, which differs from run to
+run, is drawn again for a shorter duration.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ STEPS, RAYS = 120, 128
 TRAINED = Path("e", "hsi-sc-nerf", "run")
 NOT_COMPARED = "events.out.tfevents"
 SPEEDS = ("num_rays_per_sec", "fps")
-# A command that still runs so long after Ctrl-C has swallowed it.
-_ENDS_S = 10.0
+# A command that still runs so long after Ctrl-C, or then ends as if nothing were, has swallowed it.
+_ENDS_S, _WAS_ENDING_S = 10.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,10 @@ def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> 
         return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGINT)
+    pressed = time.monotonic()
     try:
         process.wait(_ENDS_S)
-        if process.returncode == 0:
+        if process.returncode == 0 and time.monotonic() - pressed < _WAS_ENDING_S:
             return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
@@ -158,7 +159,7 @@ def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> 
     told = (folder / "log").read_text(errors="replace")
     lines = [line for line in told.splitlines() if line.strip()]
     one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
-    if process.returncode == -signal.SIGKILL:
+    if process.returncode in (0, -signal.SIGKILL):
         found["goes on"] = 1
     else:
         found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
