@@ -43,6 +43,7 @@ from hsi_sc_nerf.models.stages import (
 )
 from hsi_sc_nerf.models.training_watch import (
     NonFiniteGuard,
+    RisenLossGuard,
     TrainingDivergedError,
     flush_logs,
     non_finite_names,
@@ -123,6 +124,7 @@ class StagedTrainer(Trainer):
         self._loaded: Path | None = None
         self._completed: str | None = None
         self._guard = NonFiniteGuard()
+        self._risen_loss = RisenLossGuard()
         self._captured: CapturedSteps | None = None
         try:
             self._keep_effects()
@@ -190,9 +192,12 @@ class StagedTrainer(Trainer):
             with training_progress(self.plan.num_iterations, self._start_step) as self._show_progress:
                 super().train()
         except TrainingDivergedError as error:
-            # Skipped steps do not change the weights, so these are the last finite ones.
-            self.save_checkpoint(self.step)
-            raise SystemExit(f"hsi-sc-nerf: {error}. The last good checkpoint is in {self.checkpoint_dir}") from error
+            # Skipped steps do not change the weights: unless the loss had risen before, they are still good.
+            if not self._risen_loss.risen_in_a_row:
+                self.save_checkpoint(self.step)
+            good = any(self.checkpoint_dir.glob("step-*.ckpt"))
+            kept = f"The last good checkpoint is in {self.checkpoint_dir}" if good else "No checkpoint was good"
+            raise SystemExit(f"hsi-sc-nerf: {error}. {kept}.") from error
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         except KeyboardInterrupt:
@@ -238,6 +243,7 @@ class StagedTrainer(Trainer):
         warning = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
         if warning is not None:
             CONSOLE.print(f"[yellow]{escape(warning)}")
+        self._risen_loss.record(step, stage, float(loss))
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for group, rate in rates.items():  # under the names of nerfstudio's own schedules
                 writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
@@ -330,8 +336,8 @@ class StagedTrainer(Trainer):
 
         ``training`` holds what a resumed run needs beside nerfstudio's contents to give the same result.
         """
-        if step == self._saved_step:
-            return
+        if step == self._saved_step or self._risen_loss.risen_in_a_row:
+            return  # the checkpoint before, which this one would replace, is better
         stage = self.plan.at(step)
         state = {
             "step": step,

@@ -1,13 +1,16 @@
 """What is watched while a run trains: steps that are not finite, the progress, the results of its stages.
 
-Steps with non-finite losses or gradients are skipped; too many in a row stop the run.
+Steps with non-finite losses or gradients are skipped; too many in a row stop the run. So does a loss that rises far
+above what it was and stays there.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from statistics import median
 
 import torch
 from nerfstudio.utils import writer
@@ -24,8 +27,16 @@ MAX_SKIPPED_IN_A_ROW = 20
 """Skipped steps that end a run: single ones come from damaged values, so many from weights that are lost."""
 
 
+LOSS_STEPS = 10
+"""Steps whose median loss is compared: single batches spike, also in runs that end well."""
+RISEN_FACTOR = 10.0
+"""A loss of so many times the least one of the stage has risen: batches differ by factors of two to three."""
+MAX_RISEN_IN_A_ROW = 100
+"""Steps with a risen loss that end a run: one that is too fast at first comes back within some tens."""
+
+
 class TrainingDivergedError(RuntimeError):
-    """Too many steps in a row were not finite."""
+    """Too many steps in a row were not finite, or had a risen loss."""
 
 
 def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
@@ -65,6 +76,45 @@ class NonFiniteGuard:
                 "damaged frames"
             )
         return sentence
+
+
+class RisenLossGuard:
+    """Tells when a loss is far above what it was in the same stage, and stays there."""
+
+    risen_in_a_row = 0
+
+    def __init__(self) -> None:
+        self._stage: Stage | None = None
+        self._last: deque[float] = deque(maxlen=LOSS_STEPS)
+        self._least = math.inf
+
+    def record(self, step: int, stage: Stage, loss: float) -> None:
+        """Record a step.
+
+        Args:
+            step: the step.
+            stage: its stage; its first loss is the one to compare with until there is a smaller median.
+            loss: of all terms; one that is not finite does not count.
+
+        Raises:
+            TrainingDivergedError: this was the last of `MAX_RISEN_IN_A_ROW`, or the stage ends with a risen loss.
+        """
+        if stage is not self._stage:
+            self._stage, self._least, self.risen_in_a_row = stage, math.inf, 0
+            self._last.clear()
+        if math.isfinite(loss):
+            self._last.append(loss)
+            self._least = min(self._least, loss) if len(self._last) == 1 else self._least
+        if len(self._last) < LOSS_STEPS:
+            return
+        now = median(self._last)
+        self._least = min(self._least, now)
+        self.risen_in_a_row = self.risen_in_a_row + 1 if now > RISEN_FACTOR * self._least else 0
+        if self.risen_in_a_row == MAX_RISEN_IN_A_ROW or (self.risen_in_a_row and step == stage.end - 1):
+            raise TrainingDivergedError(
+                f"step {step}: the loss is {now / self._least:.3g} times the least one of its stage, and has been "
+                f"more than {RISEN_FACTOR:g} times for {self.risen_in_a_row} steps; lower the learning rate"
+            )
 
 
 def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
