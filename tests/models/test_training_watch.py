@@ -60,8 +60,8 @@ def test_a_loss_that_stays_far_above_its_least_stops_the_run():
     assert len(found) == 50 + after + MAX_RISEN_IN_A_ROW - 1
     assert max(risen_steps(falls + [0.05] * 200)) == 0
     assert max(risen_steps(falls + ([5.0] * 4 + [0.01] * 12) * 20)) == 0  # single spikes
-    back = risen_steps(falls + [0.5] * MAX_RISEN_IN_A_ROW + [0.01] * 200)
-    assert max(back) == MAX_RISEN_IN_A_ROW - 1
+    back = risen_steps(falls + [0.5] * (MAX_RISEN_IN_A_ROW - LOSS_STEPS) + [0.01] * 200)
+    assert MAX_RISEN_IN_A_ROW - LOSS_STEPS <= max(back) < MAX_RISEN_IN_A_ROW
     assert back[-1] == 0
 
 
