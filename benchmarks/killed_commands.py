@@ -2,13 +2,16 @@
 
     uv run python benchmarks/killed_commands.py
 
-Each command works on a small simulated session. An undisturbed run of it is the reference. Killed (SIGKILL) and
-started again, training with ``--load-dir`` as soon as there is a checkpoint, it must leave the same files with the
-same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the folder that was loaded.
-TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are the speeds among the
-metrics of a stage. A file is half-written if it lies under its final name, has not the reference's bytes, and cannot
-be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's end, which differs from run to
-run, is drawn again for a shorter duration.
+Each command works on a small simulated session. An undisturbed run of it is the reference. One half of the moments is
+spread over the command's duration, the other over the time from its first file to its end, where files can be hit.
+
+Killed (SIGKILL) and started again, training with ``--load-dir`` as soon as there is a checkpoint, a command must
+leave the same files with the same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml
+without the folder that was loaded. TensorBoard's logs are not compared, for they hold times, and each start adds
+one; nor are the speeds among the metrics of a stage. What was killed before its first file is not started again:
+that would be another undisturbed run, of which one is compared. A file is half-written if it lies under its final
+name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes
+after the command's end, which differs from run to run, is drawn again for a shorter duration.
 """
 
 from __future__ import annotations
@@ -40,7 +43,15 @@ from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
-KILLED = ["command", "undisturbed, s", "moments", "half-written files", "other results", "leftovers"]
+KILLED = [
+    "command",
+    "undisturbed, s",
+    "moments",
+    "of them after the first file",
+    "half-written files",
+    "other results",
+    "leftovers",
+]
 STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on", "half-written files", "leftovers"]
 STEPS, RAYS = 120, 128
 TRAINED = Path("e", "hsi-sc-nerf", "run")
@@ -81,6 +92,28 @@ def commands(inputs: Path) -> list[Command]:
     ]
 
 
+@dataclass(frozen=True)
+class Moment:
+    """Seconds after a command's start, or after its first file."""
+
+    after_s: float
+    writing: bool
+
+    def comes(self, process: subprocess.Popen[bytes], folder: Path) -> bool:
+        """Wait for it; False if the process ended before."""
+        while self.writing and process.poll() is None and not _files(folder / "out"):
+            time.sleep(0.005)
+        try:
+            process.wait(self.after_s)
+        except subprocess.TimeoutExpired:
+            return True
+        return False
+
+    def shorter(self) -> Moment:
+        """The same moment of a command that takes less time."""
+        return Moment(0.9 * self.after_s, self.writing)
+
+
 def simulated(folder: Path) -> Path:
     """The session that all commands work on."""
     return simulate_session(override(load_scene("pear"), frames=10, size_px=112, bands=12), folder, progress=False)
@@ -105,28 +138,33 @@ def start(words: tuple[str, ...], folder: Path) -> subprocess.Popen[bytes]:
         )
 
 
-def undisturbed(command: Command, folder: Path) -> float:
-    """Run a command and return its seconds.
+def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
+    """Run a command; its seconds until its first file and until its end.
 
     Raises:
         RuntimeError: it failed.
     """
     started = time.monotonic()
-    if start(command.words, folder).wait() != 0:
+    process = start(command.words, folder)
+    while process.poll() is None and not _files(folder / "out"):
+        time.sleep(0.005)
+    first_file_s = time.monotonic() - started
+    if process.wait() != 0:
         raise RuntimeError(f"{command.name}: {(folder / 'log').read_text()[-2000:]}")
-    return time.monotonic() - started
+    return first_file_s, time.monotonic() - started
 
 
-def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str] | None:
+def killed_and_repeated(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
     """Kill a command, start it again, and count what is wrong; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)
-    try:
-        process.wait(after_s)
+    if not moment.comes(process, folder):
         return None
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    if not _files(folder / "out"):
+        return found
+    found["of them after the first file"] = 1
     half = half_written(folder / "out", reference / "out")
     # A finished training has nothing to go on with, which is one sentence and status 1: its results decide.
     start(command.again(folder), folder).wait()
@@ -135,19 +173,17 @@ def killed_and_repeated(command: Command, folder: Path, reference: Path, after_s
     for name, paths in (("half-written files", half), ("other results", other), ("leftovers", left)):
         found[name] = len(paths)
         if paths:
-            print(f"{command.name} killed after {after_s:.2f} s: {name}: {', '.join(map(str, paths))}", flush=True)
+            print(f"{command.name} killed at {moment}: {name}: {', '.join(map(str, paths))}", flush=True)
     return found
 
 
-def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> Counter[str] | None:
+def stopped(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
     """Press Ctrl-C once, and count how the command ends and what it leaves; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)
-    try:
-        process.wait(after_s)
+    if not moment.comes(process, folder):
         return None
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     pressed = time.monotonic()
     try:
         process.wait(_ENDS_S)
@@ -167,7 +203,7 @@ def stopped(command: Command, folder: Path, reference: Path, after_s: float) -> 
     left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
     found["leftovers"] = len(left)
     if found["ends otherwise"] or found["goes on"] or left:
-        print(f"{command.name}, Ctrl-C after {after_s:.2f} s: status {process.returncode}, {left}", flush=True)
+        print(f"{command.name}, Ctrl-C at {moment}: status {process.returncode}, {left}", flush=True)
         print("    " + "\n    ".join(lines[-4:]), flush=True)
     return found
 
@@ -244,11 +280,12 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in found if not path.name.startswith(NOT_COMPARED)]
 
 
-def moments(count: int, seed: str) -> Iterator[float]:
-    """Random moments, one in each of ``count`` equal parts of a command's duration, as fractions of it."""
+def moments(count: int, first_file_s: float, seconds: float, seed: str) -> Iterator[Moment]:
+    """Random moments, one in each of equal parts of a command's duration, then of the time after its first file."""
     rng = random.Random(seed)
-    for part in range(count):
-        yield (part + rng.random()) / count
+    for writing, parts, lasts_s in ((False, count - count // 2, seconds), (True, count // 2, seconds - first_file_s)):
+        for part in range(parts):
+            yield Moment(lasts_s * (part + rng.random()) / parts, writing)
 
 
 def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
@@ -265,23 +302,25 @@ def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", resu
         inputs, folder = Path(temporary) / "inputs", Path(temporary) / "disturbed"
         simulated(inputs / "session")
         for command in commands(inputs):
+            shutil.rmtree(folder, ignore_errors=True)
             undisturbed(command, inputs / command.name)
             if only not in command.name:
                 continue
             # Once more, for the first start compiles and reads what later ones find.
-            seconds = undisturbed(command, folder)
+            first_file_s, seconds = undisturbed(command, folder)
+            if differences(inputs / command.name / "out", folder / "out"):
+                raise RuntimeError(f"{command.name}: two undisturbed runs leave different files")
             for name, deed, columns, count in (
                 ("killed_commands", killed_and_repeated, KILLED, kills),
                 ("interrupted_commands", stopped, STOPPED, presses),
             ):
                 counts: Counter[str] = Counter()
-                lasts_s = seconds
-                for moment in moments(count, f"{seed} {name} {command.name}"):
+                for moment in moments(count, first_file_s, seconds, f"{seed} {name} {command.name}"):
                     found = None
                     while found is None:
                         shutil.rmtree(folder, ignore_errors=True)
-                        found = deed(command, folder, inputs / command.name, moment * lasts_s)
-                        lasts_s *= 0.9 if found is None else 1.0
+                        found = deed(command, folder, inputs / command.name, moment)
+                        moment = moment.shorter()
                     counts += found
                 known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
