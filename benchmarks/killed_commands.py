@@ -5,17 +5,18 @@
 Each command works on a small simulated session. An undisturbed run of it is the reference. One half of the moments is
 spread over the command's duration, the other over the time from its first file to its end, where files can be hit.
 
-Killed (SIGKILL) and started again, training with ``--load-dir`` as soon as there is a checkpoint, a command must
-leave the same files with the same bytes; checkpoints are compared tensor by tensor, bit by bit, and config.yml
-without the folder that was loaded. TensorBoard's logs are not compared, for they hold times, and each start adds
-one; nor are the speeds among the metrics of a stage. What was killed before its first file is not started again:
-that would be another undisturbed run, of which one is compared. A file is half-written if it lies under its final
-name, has not the reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes
-after the command's end, which differs from run to run, is drawn again for a shorter duration.
+Commands are killed (SIGKILL) and started again, which is killed, and so on, training with ``--load-dir`` as soon as
+there is a checkpoint. After some kills a command may run to its end, and must leave the same files with the same
+bytes as the undisturbed run; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the
+folder that was loaded. TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are
+the speeds among the metrics of a stage. A file is half-written if it lies under its final name, has not the
+reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's
+end, which differs from run to run, is drawn again for a shorter duration.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -47,13 +48,14 @@ KILLED = [
     "command",
     "undisturbed, s",
     "moments",
-    "of them after the first file",
+    "runs to the end",
     "half-written files",
     "other results",
     "leftovers",
 ]
 STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on", "half-written files", "leftovers"]
 STEPS, RAYS = 120, 128
+KILLS_IN_A_ROW = 4
 TRAINED = Path("e", "hsi-sc-nerf", "run")
 NOT_COMPARED = "events.out.tfevents"
 SPEEDS = ("num_rays_per_sec", "fps")
@@ -101,8 +103,9 @@ class Moment:
 
     def comes(self, process: subprocess.Popen[bytes], folder: Path) -> bool:
         """Wait for it; False if the process ended before."""
-        while self.writing and process.poll() is None and not _files(folder / "out"):
-            time.sleep(0.005)
+        before = _state(folder)
+        while self.writing and process.poll() is None and _state(folder) == before:
+            time.sleep(0.01)
         try:
             process.wait(self.after_s)
         except subprocess.TimeoutExpired:
@@ -154,40 +157,61 @@ def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
     return first_file_s, time.monotonic() - started
 
 
-def killed_and_repeated(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
-    """Kill a command, start it again, and count what is wrong; None where it had ended."""
+def killed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+    """Kill a command at every moment, let it run to its end after some, and count what is wrong."""
     found: Counter[str] = Counter()
-    process = start(command.words, folder)
-    if not moment.comes(process, folder):
-        return None
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    if not _files(folder / "out"):
-        return found
-    found["of them after the first file"] = 1
-    half = half_written(folder / "out", reference / "out")
-    # A finished training has nothing to go on with, which is one sentence and status 1: its results decide.
-    start(command.again(folder), folder).wait()
-    other = differences(reference / "out", folder / "out")
-    left = leftovers(folder / "out", reference / "out")
-    for name, paths in (("half-written files", half), ("other results", other), ("leftovers", left)):
-        found[name] = len(paths)
-        if paths:
-            print(f"{command.name} killed at {moment}: {name}: {', '.join(map(str, paths))}", flush=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    waiting, in_a_row = list(expected), 0
+    while waiting:
+        moment = waiting.pop(0)
+        process = start(command.again(folder), folder)
+        if moment.comes(process, folder):
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            in_a_row += 1
+            half = half_written(folder / "out", reference / "out")
+            found["half-written files"] += len(half)
+            if half:
+                print(f"{command.name} killed at {moment}: half-written: {', '.join(map(str, half))}", flush=True)
+            if in_a_row < KILLS_IN_A_ROW and waiting:
+                continue
+            # A finished training has nothing to go on with, which is one sentence and status 1: its results decide.
+            start(command.again(folder), folder).wait()
+        else:
+            waiting.append(moment.shorter())
+        other, left = differences(reference / "out", folder / "out"), leftovers(folder / "out", reference / "out")
+        if other or left:
+            print(f"{command.name} after kills until {moment}: other {other}, left over {left}", flush=True)
+        found += Counter({"runs to the end": 1, "other results": len(other), "leftovers": len(left)})
+        shutil.rmtree(folder)
+        in_a_row = 0
     return found
 
 
-def stopped(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
+def pressed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+    """Press Ctrl-C once at every moment, each time in a new folder."""
+    counts: Counter[str] = Counter()
+    for moment in expected:
+        found = None
+        while found is None:
+            shutil.rmtree(folder, ignore_errors=True)
+            found = _stopped(command, folder, reference, moment)
+            moment = moment.shorter()
+        counts += found
+    return counts
+
+
+def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
     """Press Ctrl-C once, and count how the command ends and what it leaves; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)
     if not moment.comes(process, folder):
         return None
     os.killpg(process.pid, signal.SIGINT)
-    pressed = time.monotonic()
+    since = time.monotonic()
     try:
         process.wait(_ENDS_S)
-        if process.returncode == 0 and time.monotonic() - pressed < _WAS_ENDING_S:
+        if process.returncode == 0 and time.monotonic() - since < _WAS_ENDING_S:
             return None
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
@@ -216,6 +240,15 @@ def half_written(folder: Path, reference: Path) -> list[Path]:
         if not any(part.startswith(".partial-") or part.endswith("-writing") for part in path.parts)
         and not _is_whole(folder / path, reference / path)
     ]
+
+
+def _state(folder: Path) -> set[tuple[Path, int]]:
+    out = folder / "out"
+    found = set()
+    for path in _files(out):
+        with contextlib.suppress(FileNotFoundError):  # temporary ones come and go
+            found.add((path, (out / path).stat().st_mtime_ns))
+    return found
 
 
 def _is_whole(path: Path, reference: Path) -> bool:
@@ -280,9 +313,8 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in found if not path.name.startswith(NOT_COMPARED)]
 
 
-def moments(count: int, first_file_s: float, seconds: float, seed: str) -> Iterator[Moment]:
+def moments(count: int, first_file_s: float, seconds: float, rng: random.Random) -> Iterator[Moment]:
     """Random moments, one in each of equal parts of a command's duration, then of the time after its first file."""
-    rng = random.Random(seed)
     for writing, parts, lasts_s in ((False, count - count // 2, seconds), (True, count // 2, seconds - first_file_s)):
         for part in range(parts):
             yield Moment(lasts_s * (part + rng.random()) / parts, writing)
@@ -301,27 +333,22 @@ def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", resu
     with tempfile.TemporaryDirectory() as temporary:
         inputs, folder = Path(temporary) / "inputs", Path(temporary) / "disturbed"
         simulated(inputs / "session")
+        undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
         for command in commands(inputs):
-            shutil.rmtree(folder, ignore_errors=True)
-            undisturbed(command, inputs / command.name)
+            first_file_s, seconds = undisturbed(command, inputs / command.name)
             if only not in command.name:
                 continue
-            # Once more, for the first start compiles and reads what later ones find.
-            first_file_s, seconds = undisturbed(command, folder)
-            if differences(inputs / command.name / "out", folder / "out"):
-                raise RuntimeError(f"{command.name}: two undisturbed runs leave different files")
-            for name, deed, columns, count in (
-                ("killed_commands", killed_and_repeated, KILLED, kills),
-                ("interrupted_commands", stopped, STOPPED, presses),
+            rng = random.Random(f"{seed} {command.name}")
+            for name, columns, count in (
+                ("killed_commands", KILLED, kills),
+                ("interrupted_commands", STOPPED, presses),
             ):
-                counts: Counter[str] = Counter()
-                for moment in moments(count, first_file_s, seconds, f"{seed} {name} {command.name}"):
-                    found = None
-                    while found is None:
-                        shutil.rmtree(folder, ignore_errors=True)
-                        found = deed(command, folder, inputs / command.name, moment)
-                        moment = moment.shorter()
-                    counts += found
+                expected = list(moments(count, first_file_s, seconds, rng))
+                rng.shuffle(expected)
+                if name == "killed_commands":
+                    counts = killed(command, folder, inputs / command.name, expected)
+                else:
+                    counts = pressed(command, folder, inputs / command.name, expected)
                 known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)

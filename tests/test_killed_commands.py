@@ -1,6 +1,7 @@
 """A small run of benchmarks/killed_commands.py: ``process`` killed three times goes on to the same dataset."""
 
 import os
+import random
 import shutil
 import signal
 import sys
@@ -53,7 +54,7 @@ def test_what_is_wrong_is_found(tmp_path):
 
 
 def test_moments_are_spread_and_repeat():
-    found = list(moments(10, 2.0, 12.0, "seed"))
+    found = list(moments(10, 2.0, 12.0, random.Random(1)))
     assert [int(moment.after_s / (2.0 if moment.writing else 2.4)) for moment in found] == [*range(5), *range(5)]
     assert [moment.writing for moment in found] == [False] * 5 + [True] * 5
-    assert found == list(moments(10, 2.0, 12.0, "seed"))
+    assert found == list(moments(10, 2.0, 12.0, random.Random(1)))
