@@ -320,7 +320,14 @@ def moments(count: int, first_file_s: float, seconds: float, rng: random.Random)
             yield Moment(lasts_s * (part + rng.random()) / parts, writing)
 
 
-def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", results: Path = RESULTS) -> None:
+def main(
+    kills: int = 20,
+    presses: int = 10,
+    seed: int = 0,
+    only: str = "",
+    keep: Path | None = None,
+    results: Path = RESULTS,
+) -> None:
     """Kill and interrupt every command, and write both tables.
 
     Args:
@@ -328,13 +335,18 @@ def main(kills: int = 20, presses: int = 10, seed: int = 0, only: str = "", resu
         presses: moments at which each command gets Ctrl-C.
         seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
+        keep: folder for the session and the undisturbed results; what lies there is not made again.
         results: folder of the tables.
     """
     with tempfile.TemporaryDirectory() as temporary:
-        inputs, folder = Path(temporary) / "inputs", Path(temporary) / "disturbed"
-        simulated(inputs / "session")
-        undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
+        inputs, folder = (keep or Path(temporary) / "inputs").absolute(), Path(temporary) / "disturbed"
+        if not (inputs / "session").is_dir():
+            simulated(inputs / "session")
+            undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
         for command in commands(inputs):
+            if only not in command.name and (inputs / command.name).is_dir():
+                continue
+            shutil.rmtree(inputs / command.name, ignore_errors=True)
             first_file_s, seconds = undisturbed(command, inputs / command.name)
             if only not in command.name:
                 continue
