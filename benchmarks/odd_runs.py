@@ -1,6 +1,6 @@
 """Short training runs in odd situations: each ends better than it began, or stops with one sentence.
 
-    uv run python benchmarks/odd_runs.py --steps 200
+    uv run python benchmarks/odd_runs.py
 
 A small simulated pear with true poses and masks is changed as each case says, and trained. The root mean square error
 of the reflectance at fixed training pixels is taken before and after; all weights must be finite.
@@ -262,7 +262,7 @@ CASES = (
 )
 
 
-def main(steps: int = 200, only: str = "", results: Path = RESULTS) -> None:
+def main(steps: int = 300, only: str = "", results: Path = RESULTS) -> None:
     """Train every case and write the table.
 
     Args:

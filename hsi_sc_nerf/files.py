@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
+import shutil
 import struct
 import zlib
 from collections.abc import Iterator
@@ -30,7 +32,8 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
     """Context manager that gives a temporary file for each path and renames it to the path at the end of the block.
 
     The temporary files lie beside the paths, are hidden, and have the same suffixes. If the block fails, they are
-    deleted and the files at ``paths`` stay as they are. Missing folders are made.
+    deleted and the files at ``paths`` stay as they are. Missing folders are made. What processes that were killed
+    left of the same files is deleted.
 
     Raises:
         InputError: the operating system refused to write (full disk, no permission).
@@ -43,6 +46,7 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
     try:
         for path in paths:
             path.parent.mkdir(parents=True, exist_ok=True)
+            delete_remains(path)
         yield temporary
         for source, target in zip(temporary, paths, strict=True):
             os.replace(source, target)
@@ -55,6 +59,31 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
             # A file that cannot be deleted was not written; the error above says why.
             with suppress(OSError):
                 source.unlink(missing_ok=True)
+
+
+def delete_remains(path: Path) -> None:
+    """Delete the temporary files and folders of ``path`` whose processes have ended: these were killed."""
+    for remains in path.parent.glob(f"{TEMPORARY_PREFIX}*-{glob.escape(path.name)}"):
+        process = remains.name.removeprefix(TEMPORARY_PREFIX).partition("-")[0]
+        if not process.isdecimal() or _is_running(int(process)):
+            continue
+        if remains.is_dir():
+            shutil.rmtree(remains, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                remains.unlink()
+
+
+def _is_running(process: int) -> bool:
+    if os.name != "posix":  # where asking would end it
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def make_folder(path: Path) -> None:

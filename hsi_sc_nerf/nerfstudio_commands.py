@@ -10,6 +10,7 @@ they are.
 
 from __future__ import annotations
 
+import signal
 import sys
 import types
 from collections.abc import Callable
@@ -76,19 +77,26 @@ class _ScriptBeingImported(types.ModuleType):
 
 def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
     def main(self: Any) -> None:
+        ours: bool | None = None
         try:
             ours = prepare(self)
             if ours and type(self).__name__ == "ExportPointCloud":
                 _export_spectral_cloud(self)
-                return
+            else:
+                original(self)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        try:
-            original(self)
         except OSError as error:
             if not ours or error.filename is None:
                 raise
             raise SystemExit(f"hsi-sc-nerf: {error.filename}: {error.strerror}; choose another path.") from error
+        except KeyboardInterrupt:
+            if ours is False:
+                raise
+            # Another Ctrl-C, while what was begun is ended and cleared away, would only print where it came.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            print("hsi-sc-nerf: stopped.", file=sys.stderr)
+            raise SystemExit(130) from None
 
     main.__doc__ = original.__doc__
     return main

@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -9,7 +12,7 @@ from hsi_sc_nerf.cli.light import MaterialCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, ProcessCommand
 from hsi_sc_nerf.cli.trained_runs import RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_json, read_picture, require_writable, write_png
+from hsi_sc_nerf.files import atomic_write, delete_remains, read_json, read_picture, require_writable, write_png
 
 NOTHING = Path("nothing")
 
@@ -66,3 +69,21 @@ def test_what_is_no_json_object_is_refused_in_a_sentence(tmp_path, text):
     path.write_text(text)
     with pytest.raises(InputError, match=r"a\.json: is no JSON object.*; mend it\."):
         read_json(path, "mend it")
+
+
+def test_what_a_killed_process_left_is_deleted_and_what_a_running_one_writes_is_kept(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    target = tmp_path / "cloud[1].ply"
+    left, folder = (tmp_path / f".partial-{ended.pid}-{name}" for name in (target.name, "b.zarr"))
+    others = [tmp_path / f".partial-{os.getppid()}-{target.name}", tmp_path / f".partial-{ended.pid}-cloud.ply"]
+    for path in (left, *others, folder / "c" / "0"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("half")
+    with atomic_write(target) as (temporary,):
+        temporary.write_text("whole")
+    assert not left.exists()
+    assert target.read_text() == "whole"
+    assert all(path.exists() for path in others)
+    delete_remains(tmp_path / "b.zarr")
+    assert not folder.exists()

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import signal
 import sys
 import types
 from pathlib import Path
@@ -122,3 +123,17 @@ def test_external_methods_are_listed_without_a_look_at_sources_and_say_how_they_
     with pytest.raises(SystemExit):
         external_methods.ExternalMethodDummyTrainerConfig("x", external_methods.ExternalMethod("Install x.", []))
     assert "Install x." in capsys.readouterr().out
+
+
+def test_ctrl_c_is_one_line_for_our_runs_alone(ours, other, capsys, monkeypatch):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    stopped = adapter._adapted(interrupted)
+    with pytest.raises(SystemExit) as ended:
+        stopped(command("ComputePSNR", with_checkpoint(ours), output_path=Path("scores.json")))
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "hsi-sc-nerf: stopped.\n"
+    with pytest.raises(KeyboardInterrupt):
+        stopped(command("ComputePSNR", other))

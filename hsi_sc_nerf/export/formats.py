@@ -31,7 +31,7 @@ from hsi_sc_nerf.export.cloud import (
     comment_lines,
 )
 from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
-from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, make_folder
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, delete_remains, make_folder
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
 _SUFFIXES: dict[CloudFormat, str] = {"ply": ".ply", "las": ".las", "netcdf": ".nc", "zarr": ".zarr"}
@@ -204,6 +204,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
     try:
         make_folder(path.parent)
+        delete_remains(path)
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
         group.attrs.update(_table_attributes(cloud))
 

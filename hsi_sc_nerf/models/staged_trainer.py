@@ -44,7 +44,9 @@ from hsi_sc_nerf.models.stages import (
 )
 from hsi_sc_nerf.models.training_watch import (
     NonFiniteGuard,
+    RisenLossGuard,
     TrainingDivergedError,
+    end_diverged_run,
     end_stopped_run,
     flush_logs,
     non_finite_names,
@@ -129,18 +131,17 @@ class StagedTrainer(Trainer):
         if self.world_size > 1:
             # Rays and random numbers follow from the step, so all processes would train on the same rays.
             raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
-        clock = self.config.train_clock if self.config.max_train_seconds is not None else None
+        clock = self.config.train_clock if self.config.max_train_seconds else None
         wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else None
         self.schedule = Schedule(self.config.plan(), clock, wait)
         self._frozen: set[str] | None = None
         self._saved_step: int | None = None
         self._loaded: Path | None = None
         self._trained_step, self._steps_since_update = -1, 0
-        self._guard = NonFiniteGuard()
+        self._guard, self._risen_loss = NonFiniteGuard(), RisenLossGuard()
         self._captured: CapturedSteps | None = None
         try:
-            path = self._checkpoint_to_load()
-            if path is not None:
+            if path := self._checkpoint_to_load():
                 self._model_config.effects = resumed_effects(self._model_config.effects, path)
             super().setup(test_mode)
         except InputError as error:
@@ -152,8 +153,8 @@ class StagedTrainer(Trainer):
         self.config.save_config()
         config = self.config
         plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
-        plain = plain and not config.gradient_accumulation_steps
-        if self.pipeline.device.type == "cuda" and config.capture_steps and plain:
+        plain = plain and config.capture_steps and not config.gradient_accumulation_steps
+        if self.pipeline.device.type == "cuda" and plain:
             self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -178,17 +179,16 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            was_to_be_kept = self._loaded is not None and self._keep_stage_of(self._loaded)
-            if self.schedule.complete and was_to_be_kept:
+            if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:
                 return
             self.config = copy.copy(self.config)
             self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
             with training_progress(self.schedule) as self._show_progress:
                 super().train()
         except TrainingDivergedError as error:
-            # Skipped steps do not change the weights, so these are the last finite ones.
+            # Skipped steps do not change the weights: unless the loss had risen before, they are still good.
             self.save_checkpoint(self.step)
-            raise SystemExit(f"hsi-sc-nerf: {error}. The last good checkpoint is in {self.checkpoint_dir}") from error
+            end_diverged_run(error, self.checkpoint_dir)
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
         except KeyboardInterrupt:
@@ -230,8 +230,8 @@ class StagedTrainer(Trainer):
             self._show_progress(step, float(metrics_dict["psnr"]))
         self.schedule.end_step(step)
         self._trained_step = step
-        if self.schedule.complete:
-            self.stop_training = True
+        self.stop_training |= self.schedule.complete
+        self._risen_loss.record(step, self.schedule, float(loss))
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:
@@ -302,8 +302,8 @@ class StagedTrainer(Trainer):
 
         ``training`` holds what a resumed run needs beside nerfstudio's contents to give the same result.
         """
-        if step == self._saved_step:
-            return
+        if step == self._saved_step or self._risen_loss.risen_in_a_row:
+            return  # the checkpoint before, which this one would replace, is better
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),

@@ -1,15 +1,18 @@
 """What is watched while a run trains: steps that are not finite, the progress, the results of its stages.
 
-Steps with non-finite losses or gradients are skipped; too many in a row stop the run.
+Steps with non-finite losses or gradients are skipped; too many in a row stop the run. So does a loss that rises far
+above what it was and stays there.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import median
 from typing import NoReturn
 
 import torch
@@ -18,6 +21,7 @@ from rich.progress import TextColumn
 from torch import Tensor
 
 from hsi_sc_nerf.models.schedule import Schedule
+from hsi_sc_nerf.models.stages import Stage
 from hsi_sc_nerf.terminal import timed_progress
 
 # Metrics of the paper's table.
@@ -27,8 +31,16 @@ MAX_SKIPPED_IN_A_ROW = 20
 """Skipped steps that end a run: single ones come from damaged values, so many from weights that are lost."""
 
 
+LOSS_STEPS = 10
+"""Steps whose median loss is compared: single batches spike, also in runs that end well."""
+RISEN_FACTOR = 10.0
+"""A loss of so many times the least one of the stage has risen: batches differ by factors of two to three."""
+MAX_RISEN_IN_A_ROW = 100
+"""Steps with a risen loss that end a run: one that is too fast at first comes back within some tens."""
+
+
 class TrainingDivergedError(RuntimeError):
-    """Too many steps in a row were not finite."""
+    """Too many steps in a row were not finite, or had a risen loss."""
 
 
 def non_finite_names(values: Mapping[str, Tensor]) -> list[str]:
@@ -68,6 +80,45 @@ class NonFiniteGuard:
                 "damaged frames"
             )
         return sentence
+
+
+class RisenLossGuard:
+    """Tells when a loss is far above what it was in the same stage, and stays there."""
+
+    risen_in_a_row = 0
+
+    def __init__(self) -> None:
+        self._stage: Stage | None = None
+        self._last: deque[float] = deque(maxlen=LOSS_STEPS)
+        self._least = math.inf
+
+    def record(self, step: int, schedule: Schedule, loss: float) -> None:
+        """Record a step that has ended.
+
+        Args:
+            step: the step.
+            schedule: of the run; a stage's first loss is the one to compare with until there is a smaller median.
+            loss: of all terms; one that is not finite does not count.
+
+        Raises:
+            TrainingDivergedError: this was the last of `MAX_RISEN_IN_A_ROW`, or the stage ends with a risen loss.
+        """
+        if schedule.stage is not self._stage:
+            self._stage, self._least, self.risen_in_a_row = schedule.stage, math.inf, 0
+            self._last.clear()
+        if math.isfinite(loss):
+            self._last.append(loss)
+            self._least = min(self._least, loss) if len(self._last) == 1 else self._least
+        if len(self._last) < LOSS_STEPS:
+            return
+        now = median(self._last)
+        self._least = min(self._least, now)
+        self.risen_in_a_row = self.risen_in_a_row + 1 if now > RISEN_FACTOR * self._least else 0
+        if self.risen_in_a_row == MAX_RISEN_IN_A_ROW or (self.risen_in_a_row and schedule.stage_complete):
+            raise TrainingDivergedError(
+                f"step {step}: the loss is {now / self._least:.3g} times the least one of its stage, and has been "
+                f"more than {RISEN_FACTOR:g} times for {self.risen_in_a_row} steps; lower the learning rate"
+            )
 
 
 def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
@@ -120,3 +171,10 @@ def end_stopped_run(checkpoints: Path) -> NoReturn:
     hint = f"; --load-dir {checkpoints} goes on from the last checkpoint" if saved else ""
     print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
     raise SystemExit(130) from None
+
+
+def end_diverged_run(error: TrainingDivergedError, checkpoints: Path) -> NoReturn:
+    """End with one line that says what diverged and where the last good checkpoint is."""
+    good = any(checkpoints.glob("step-*.ckpt"))
+    kept = f"The last good checkpoint is in {checkpoints}" if good else "No checkpoint was good"
+    raise SystemExit(f"hsi-sc-nerf: {error}. {kept}.") from error

@@ -22,7 +22,7 @@ from hsi_sc_nerf.poses.posed_session import in_object_frame
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, require_parallax
 from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
@@ -71,14 +71,18 @@ def poses_from_markers(
     height, width = images[0].shape
     linked, rejected, static = usable(observed.observations)
     if len(np.unique(linked.frame)) < FEWEST_FRAMES:
+        advice = "take smaller steps or show more markers"
+        if static:
+            advice = f"markers {', '.join(map(str, static))} stand still in the image: check that the table turns"
         raise InputError(
             f"only {len(np.unique(linked.frame))} of the {len(images)} frames {names[0]} ... {names[-1]} share "
-            f"markers with others, {FEWEST_FRAMES} are needed; take smaller steps or show more markers"
+            f"markers with others, {FEWEST_FRAMES} are needed; {advice}"
         )
     start = initialise(linked, (width / 2, height / 2), width, info.marker_side_m or _SIDE_WITHOUT_SCALE_M)
     # The first adjustment is unweighted, so that a wrong covariance can do no harm.
     unweighted = np.tile(np.eye(8), (len(linked), 1, 1))
     start = Problem(start, MarkerResiduals(start, linked, 1.0, unweighted)).minimise(start)
+    require_parallax(start.distance, np.linalg.norm(start.marker_poses[:, :3, 3] - [start.distance, 0, 0], axis=-1))
     first, _, outliers = adjust_without_outliers(start, linked)
     start = first.turntable
     rejected += [r for r in outliers if r.frame not in start.frames]

@@ -18,10 +18,30 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from typing_extensions import Self
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, cross_matrix
 
 FEWEST_FRAMES = 3
 """Fewer frames do not determine a turntable's axis."""
+_LEAST_DISTANCE = 0.02
+"""Of the camera from the axis, in distances of the object: nearer, all frames see it from within two degrees."""
+
+
+def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) -> None:
+    """Refuse an axis through the camera, about which a camera turns that does not move.
+
+    Args:
+        distance: of the camera from the axis.
+        object_distances: of the camera from points of the object, in the same unit.
+
+    Raises:
+        InputError: all frames see the object from one side.
+    """
+    if distance < _LEAST_DISTANCE * np.median(object_distances):
+        raise InputError(
+            "the axis goes through the camera, so that all frames show the object from one side: the camera seems to "
+            "have turned where it stands; let it stand still, and turn the table"
+        )
 
 
 class _Sightings:

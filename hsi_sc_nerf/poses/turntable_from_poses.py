@@ -23,7 +23,7 @@ from hsi_sc_nerf.geometry.camera import (
     rotation_about_z,
     rotation_angle_deg,
 )
-from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable, require_parallax
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
 _CONTRADICTS_DEG = 3.0
@@ -56,7 +56,7 @@ def turntable_from_poses(
         the angle 0. And the frames whose pose contradicts the others', which it lacks.
 
     Raises:
-        InputError: fewer than three poses, or poses that do not turn about one axis.
+        InputError: fewer than three poses, or poses that do not turn about one axis beside the camera.
     """
     posed = np.isfinite(world_to_camera).all(axis=(1, 2))
     if posed.sum() < FEWEST_FRAMES:
@@ -84,6 +84,8 @@ def turntable_from_poses(
     if (base @ axis)[1] > 0.0:  # the image's y points down
         axis, angles = -axis, -angles
     camera = -base.T @ before_camera
+    if len(points_3d):
+        require_parallax(distance, np.linalg.norm(points_3d - on_axis - camera, axis=-1))
     x = _perpendicular(camera, axis) / distance
     at_zero = np.stack([x, np.cross(axis, x), axis])
     first = int(np.flatnonzero(good)[0])

@@ -117,14 +117,14 @@ def test_several_devices_are_refused(tiny_dataset, tmp_path):
         config.setup(local_rank=0, world_size=2).setup()
 
 
-def poison(made, bad_steps):
-    """Make the batch of some steps infinite, as a damaged cube would."""
+def poison(made, bad_steps, factor=float("inf")):
+    """Make the batch of some steps infinite, as a damaged cube would, or so many times too bright."""
     original = made.pipeline.datamanager.next_train
 
     def next_train(step):
         rays, batch = original(step)
         if step in bad_steps:
-            batch["spectral"] = batch["spectral"] * float("inf")
+            batch["spectral"] = batch["spectral"] * factor
         return rays, batch
 
     made.pipeline.datamanager.next_train = next_train
@@ -149,6 +149,19 @@ def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset,
     allow_nerfstudio_checkpoints()
     state = torch.load(checkpoint)  # the safe loader
     assert all(torch.isfinite(value).all() for value in state["pipeline"].values() if value.is_floating_point())
+
+
+@pytest.mark.slow
+def test_a_run_whose_loss_rises_and_stays_there_stops_with_the_checkpoint_before(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path, max_num_iterations=60, steps_per_save=5)
+    poison(made, range(15, 60), factor=30.0)
+    with pytest.raises(
+        SystemExit, match=r"^hsi-sc-nerf: step 29: the loss is [^\n]*last good checkpoint is in [^\n]*\.$"
+    ):
+        made.train()
+    (checkpoint,) = made.checkpoint_dir.glob("*.ckpt")
+    assert 10 <= torch.load(checkpoint)["step"] < 20
+    assert not list(made.base_dir.glob("stage-*"))
 
 
 @pytest.mark.slow

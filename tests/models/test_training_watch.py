@@ -1,13 +1,19 @@
 """Steps that are not finite; what TensorBoard is given, read back with its own reader."""
 
+import numpy as np
 import pytest
 import torch
 from small_trainer import STEPS, trainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from hsi_sc_nerf.models.schedule import Schedule
+from hsi_sc_nerf.models.stages import Stage, StagePlan, full_frame_stage, masked_stage
 from hsi_sc_nerf.models.training_watch import (
+    LOSS_STEPS,
+    MAX_RISEN_IN_A_ROW,
     MAX_SKIPPED_IN_A_ROW,
     NonFiniteGuard,
+    RisenLossGuard,
     TrainingDivergedError,
     non_finite_names,
     stage_summary,
@@ -30,6 +36,48 @@ def test_guard_names_the_step_and_stops_after_the_limit_in_a_row():
         guard.record(number, ["hsi_loss"], [])
     with pytest.raises(TrainingDivergedError, match="step 99"):
         guard.record(99, ["hsi_loss"], [])
+
+
+STAGES = Stage(full_frame_stage(), 0, 1000), Stage(masked_stage(), 1000, 2000)
+
+
+def risen_steps(losses):
+    """How long the loss had risen after each step, until the run is stopped."""
+    guard, schedule, found = RisenLossGuard(), Schedule(StagePlan(STAGES)), []
+    for step, loss in enumerate(losses):
+        schedule.begin_step(step)
+        schedule.end_step(step)
+        try:
+            guard.record(step, schedule, loss)
+        except TrainingDivergedError:
+            return [*found, "stopped"]
+        found.append(guard.risen_in_a_row)
+    return found
+
+
+def test_a_loss_that_stays_far_above_its_least_stops_the_run():
+    falls = list(np.geomspace(1.0, 0.01, 50))
+    after = LOSS_STEPS // 2  # so many raise the median of a window
+    found = risen_steps(falls + [0.5] * 200)
+    assert found[-1] == "stopped"
+    assert len(found) == 50 + after + MAX_RISEN_IN_A_ROW - 1
+    assert max(risen_steps(falls + [0.05] * 200)) == 0
+    assert max(risen_steps(falls + ([5.0] * 4 + [0.01] * 12) * 20)) == 0  # single spikes
+    back = risen_steps(falls + [0.5] * (MAX_RISEN_IN_A_ROW - LOSS_STEPS) + [0.01] * 200)
+    assert MAX_RISEN_IN_A_ROW - LOSS_STEPS <= max(back) < MAX_RISEN_IN_A_ROW
+    assert back[-1] == 0
+
+
+def test_a_run_that_is_lost_from_its_second_step_on_is_compared_with_its_first():
+    assert risen_steps([0.1] + [50.0] * 200)[-1] == "stopped"
+    assert risen_steps([0.1] + [50.0, float("nan")] * 200)[-1] == "stopped"
+    assert max(risen_steps([float("nan")] + [50.0] * 200)) == 0
+
+
+def test_each_stage_has_a_loss_of_its_own_and_must_not_end_with_a_risen_one():
+    assert max(risen_steps([0.01] * 1000 + [0.5] * 500)) == 0
+    assert risen_steps([0.01] * 990 + [0.5] * 10)[-1] == "stopped"
+    assert len(risen_steps([0.01] * 990 + [0.5] * 10)) == 1000
 
 
 @pytest.fixture

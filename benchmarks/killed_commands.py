@@ -1,0 +1,370 @@
+"""Commands killed at random moments and started again, and commands that get Ctrl-C at random moments.
+
+    uv run python benchmarks/killed_commands.py
+
+Each command works on a small simulated session. An undisturbed run of it is the reference. One half of the moments is
+spread over the command's duration, the other over the time from its first file to its end, where files can be hit.
+
+Commands are killed (SIGKILL) and started again, which is killed, and so on, training with ``--load-dir`` as soon as
+there is a checkpoint. After some kills a command may run to its end, and must leave the same files with the same
+bytes as the undisturbed run; checkpoints are compared tensor by tensor, bit by bit, and config.yml without the
+folder that was loaded. TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are
+the speeds among the metrics of a stage. A file is half-written if it lies under its final name, has not the
+reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's
+end, which differs from run to run, is drawn again for a shorter duration.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from results_table import RESULTS, write_results
+
+from hsi_sc_nerf.benchmark.steps import typed_command
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_picture
+from hsi_sc_nerf.models.checkpoints import read_checkpoint, require_whole
+from hsi_sc_nerf.models.run_settings import read_config
+from hsi_sc_nerf.simulate.scene import load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+
+KILLED = [
+    "command",
+    "undisturbed, s",
+    "moments",
+    "runs to the end",
+    "half-written files",
+    "other results",
+    "leftovers",
+]
+STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on", "half-written files", "leftovers"]
+STEPS, RAYS = 120, 128
+KILLS_IN_A_ROW = 4
+TRAINED = Path("e", "hsi-sc-nerf", "run")
+NOT_COMPARED = "events.out.tfevents"
+SPEEDS = ("num_rays_per_sec", "fps")
+# A command that still runs so long after Ctrl-C, or then ends as if nothing were, has swallowed it.
+_ENDS_S, _WAS_ENDING_S = 10.0, 1.0
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that writes to the folder ``out`` of the current one."""
+
+    name: str
+    words: tuple[str, ...]
+
+    def again(self, folder: Path) -> tuple[str, ...]:
+        """What is typed after it was killed."""
+        checkpoints = Path("out") / TRAINED / "nerfstudio_models"
+        saved = self.words[0] == "ns-train" and any((folder / checkpoints).glob("step-*.ckpt"))
+        return (*self.words, *(("--load-dir", str(checkpoints)) if saved else ()))
+
+
+def commands(inputs: Path) -> list[Command]:
+    """The commands; each works on what the references of those before it left in ``inputs``."""
+    data, run, cloud = inputs / "process" / "out", inputs / "ns-train" / "out" / TRAINED, "point_cloud.ply"
+    training = f"ns-train hsi-sc-nerf --data {data} --output-dir out --experiment-name e --timestamp run"
+    training += f" --vis tensorboard --max-num-iterations {STEPS} --steps-per-save {STEPS // 5}"
+    training += f" --pipeline.datamanager.train-num-rays-per-batch {RAYS} --steps-per-eval-batch {STEPS // 3}"
+    return [
+        Command(line.split()[0] if line.startswith("ns") else line.split()[1], tuple(line.split()))
+        for line in (
+            f"hsi-sc-nerf process {inputs / 'session'} --output-dir out",
+            training,
+            f"ns-export pointcloud --load-config {run / 'config.yml'} --output-dir out --num-points 2000",
+            f"hsi-sc-nerf traits {inputs / 'ns-export' / 'out' / cloud} --data {data} --splits 0 --output-dir out",
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Seconds after a command's start, or after its first file."""
+
+    after_s: float
+    writing: bool
+
+    def comes(self, process: subprocess.Popen[bytes], folder: Path) -> bool:
+        """Wait for it; False if the process ended before."""
+        before = _state(folder)
+        while self.writing and process.poll() is None and _state(folder) == before:
+            time.sleep(0.01)
+        try:
+            process.wait(self.after_s)
+        except subprocess.TimeoutExpired:
+            return True
+        return False
+
+    def shorter(self) -> Moment:
+        """The same moment of a command that takes less time."""
+        return Moment(0.9 * self.after_s, self.writing)
+
+
+def simulated(folder: Path) -> Path:
+    """The session that all commands work on."""
+    return simulate_session(override(load_scene("pear"), frames=10, size_px=112, bands=12), folder, progress=False)
+
+
+def start(words: tuple[str, ...], folder: Path) -> subprocess.Popen[bytes]:
+    """Start a command in ``folder``, in a process group of its own that Ctrl-C reaches; its output goes to a log."""
+    folder.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCHDYNAMO_DISABLE": "1", "TERM": "dumb"}
+    environment["PYTHONWARNINGS"] = "ignore"
+    if environment.pop("PYTHONDONTWRITEBYTECODE", None):
+        environment["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "killed-commands-pycache")
+    with (folder / "log").open("wb") as log:
+        return subprocess.Popen(
+            typed_command(words),
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+
+
+def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
+    """Run a command; its seconds until its first file and until its end.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    started = time.monotonic()
+    process = start(command.words, folder)
+    while process.poll() is None and not _files(folder / "out"):
+        time.sleep(0.005)
+    first_file_s = time.monotonic() - started
+    if process.wait() != 0:
+        raise RuntimeError(f"{command.name}: {(folder / 'log').read_text()[-2000:]}")
+    return first_file_s, time.monotonic() - started
+
+
+def killed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+    """Kill a command at every moment, let it run to its end after some, and count what is wrong."""
+    found: Counter[str] = Counter()
+    shutil.rmtree(folder, ignore_errors=True)
+    waiting, in_a_row = list(expected), 0
+    while waiting:
+        moment = waiting.pop(0)
+        process = start(command.again(folder), folder)
+        if moment.comes(process, folder):
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            in_a_row += 1
+            half = half_written(folder / "out", reference / "out")
+            found["half-written files"] += len(half)
+            if half:
+                print(f"{command.name} killed at {moment}: half-written: {', '.join(map(str, half))}", flush=True)
+            if in_a_row < KILLS_IN_A_ROW and waiting:
+                continue
+            # A finished training has nothing to go on with, which is one sentence and status 1: its results decide.
+            start(command.again(folder), folder).wait()
+        else:
+            waiting.append(moment.shorter())
+        other, left = differences(reference / "out", folder / "out"), leftovers(folder / "out", reference / "out")
+        if other or left:
+            print(f"{command.name} after kills until {moment}: other {other}, left over {left}", flush=True)
+        found += Counter({"runs to the end": 1, "other results": len(other), "leftovers": len(left)})
+        shutil.rmtree(folder)
+        in_a_row = 0
+    return found
+
+
+def pressed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+    """Press Ctrl-C once at every moment, each time in a new folder."""
+    counts: Counter[str] = Counter()
+    for moment in expected:
+        found = None
+        while found is None:
+            shutil.rmtree(folder, ignore_errors=True)
+            found = _stopped(command, folder, reference, moment)
+            moment = moment.shorter()
+        counts += found
+    return counts
+
+
+def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
+    """Press Ctrl-C once, and count how the command ends and what it leaves; None where it had ended."""
+    found: Counter[str] = Counter()
+    process = start(command.words, folder)
+    if not moment.comes(process, folder):
+        return None
+    os.killpg(process.pid, signal.SIGINT)
+    since = time.monotonic()
+    try:
+        process.wait(_ENDS_S)
+        if process.returncode == 0 and time.monotonic() - since < _WAS_ENDING_S:
+            return None
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    told = (folder / "log").read_text(errors="replace")
+    lines = [line for line in told.splitlines() if line.strip()]
+    one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
+    if process.returncode in (0, -signal.SIGKILL):
+        found["goes on"] = 1
+    else:
+        found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
+    found["half-written files"] = len(half_written(folder / "out", reference / "out"))
+    left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
+    found["leftovers"] = len(left)
+    if found["ends otherwise"] or found["goes on"] or left:
+        print(f"{command.name}, Ctrl-C at {moment}: status {process.returncode}, {left}", flush=True)
+        print("    " + "\n    ".join(lines[-4:]), flush=True)
+    return found
+
+
+def half_written(folder: Path, reference: Path) -> list[Path]:
+    """Files under their final names that are not whole."""
+    return [
+        path
+        for path in _files(folder)
+        if not any(part.startswith(".partial-") or part.endswith("-writing") for part in path.parts)
+        and not _is_whole(folder / path, reference / path)
+    ]
+
+
+def _state(folder: Path) -> set[tuple[Path, int]]:
+    out = folder / "out"
+    found = set()
+    for path in _files(out):
+        with contextlib.suppress(FileNotFoundError):  # temporary ones come and go
+            found.add((path, (out / path).stat().st_mtime_ns))
+    return found
+
+
+def _is_whole(path: Path, reference: Path) -> bool:
+    if reference.is_file() and reference.read_bytes() == path.read_bytes():
+        return True
+    try:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".ckpt":
+            require_whole(path)
+        elif path.name == "config.yml":
+            read_config(path)
+        else:
+            return path.suffix == ".png" and read_picture(path, 3) is not None
+    except (InputError, ValueError):
+        return False
+    return True
+
+
+def differences(reference: Path, folder: Path) -> list[Path]:
+    """Files of the reference that are missing or have other contents."""
+    return [path for path in _files(reference) if not _is_same(reference / path, folder / path)]
+
+
+def _is_same(reference: Path, found: Path) -> bool:
+    if not found.is_file():
+        return False
+    if reference.suffix == ".ckpt":
+        return _same_values(read_checkpoint(reference), read_checkpoint(found))
+    if reference.name == "config.yml":
+        one, other = (dataclasses.replace(read_config(path), load_dir=None) for path in (reference, found))
+        return bool(one == other)
+    if reference.parent.name.startswith("stage-"):
+        return _metrics(reference) == _metrics(found)
+    return reference.read_bytes() == found.read_bytes()
+
+
+def _metrics(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text())
+    results = {key: value for key, value in content["results"].items() if not key.startswith(SPEEDS)}
+    return content | {"results": results}
+
+
+def _same_values(one: Any, other: Any) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same_values(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(_same_values, one, other))
+    return bool(one == other)
+
+
+def leftovers(folder: Path, reference: Path) -> list[Path]:
+    """Files that the reference lacks."""
+    return sorted(set(_files(folder)) - set(_files(reference)))
+
+
+def _files(folder: Path) -> list[Path]:
+    """All files under a folder but TensorBoard's, relative to it."""
+    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
+    return [path for path in found if not path.name.startswith(NOT_COMPARED)]
+
+
+def moments(count: int, first_file_s: float, seconds: float, rng: random.Random) -> Iterator[Moment]:
+    """Random moments, one in each of equal parts of a command's duration, then of the time after its first file."""
+    for writing, parts, lasts_s in ((False, count - count // 2, seconds), (True, count // 2, seconds - first_file_s)):
+        for part in range(parts):
+            yield Moment(lasts_s * (part + rng.random()) / parts, writing)
+
+
+def main(
+    kills: int = 20,
+    presses: int = 10,
+    seed: int = 0,
+    only: str = "",
+    keep: Path | None = None,
+    results: Path = RESULTS,
+) -> None:
+    """Kill and interrupt every command, and write both tables.
+
+    Args:
+        kills: moments at which each command is killed.
+        presses: moments at which each command gets Ctrl-C.
+        seed: of both.
+        only: part of the names of the commands to disturb; the other rows of the tables are kept.
+        keep: folder for the session and the undisturbed results; what lies there is not made again.
+        results: folder of the tables.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        inputs, folder = (keep or Path(temporary) / "inputs").absolute(), Path(temporary) / "disturbed"
+        if not (inputs / "session").is_dir():
+            simulated(inputs / "session")
+            undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
+        for command in commands(inputs):
+            if only not in command.name and (inputs / command.name).is_dir():
+                continue
+            shutil.rmtree(inputs / command.name, ignore_errors=True)
+            first_file_s, seconds = undisturbed(command, inputs / command.name)
+            if only not in command.name:
+                continue
+            rng = random.Random(f"{seed} {command.name}")
+            for name, columns, count in (
+                ("killed_commands", KILLED, kills),
+                ("interrupted_commands", STOPPED, presses),
+            ):
+                expected = list(moments(count, first_file_s, seconds, rng))
+                rng.shuffle(expected)
+                if name == "killed_commands":
+                    counts = killed(command, folder, inputs / command.name, expected)
+                else:
+                    counts = pressed(command, folder, inputs / command.name, expected)
+                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
+                row = [str(known.get(column, counts[column])) for column in columns]
+                write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

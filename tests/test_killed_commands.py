@@ -1,0 +1,60 @@
+"""A small run of benchmarks/killed_commands.py: ``process`` killed three times goes on to the same dataset."""
+
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from killed_commands import Command, differences, half_written, leftovers, moments, start
+
+from hsi_sc_nerf.files import atomic_write, write_json
+
+
+@pytest.mark.slow
+def test_process_killed_again_and_again_goes_on_to_the_same_dataset(tiny_dataset, tmp_path):
+    data, session = tiny_dataset
+    command = Command("process", ("hsi-sc-nerf", "process", str(session), "--output-dir", "out"))
+    out = tmp_path / "out"
+    # Calibration and frames; poses; masks, effects and the end.
+    for sign in (".cache/*.note", "poses.json", "masks/*.png"):
+        process = start(command.words, tmp_path)
+        while process.poll() is None and not list(out.glob(sign)):
+            time.sleep(0.01)
+        assert process.poll() is None, (tmp_path / "log").read_text()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        assert half_written(out, data) == []
+        assert not (out / "transforms.json").exists()
+    assert start(command.again(tmp_path), tmp_path).wait() == 0
+    assert differences(data, out) == []
+    assert leftovers(out, data) == []
+
+
+def test_what_is_wrong_is_found(tmp_path):
+    reference, found = tmp_path / "reference", tmp_path / "found"
+    write_json(reference / "a.json", {"a": 1})
+    with atomic_write(reference / "b.bip") as (temporary,):
+        temporary.write_bytes(b"1234")
+    shutil.copytree(reference, found)
+    assert half_written(found, reference) == differences(reference, found) == leftovers(found, reference) == []
+    (found / "a.json").write_text('{"a": 2}')  # whole, but not the same
+    (found / "b.bip").write_bytes(b"12")
+    (found / ".partial-1-b.bip").write_bytes(b"12")
+    assert half_written(found, reference) == [Path("b.bip")]
+    assert differences(reference, found) == [Path("a.json"), Path("b.bip")]
+    assert leftovers(found, reference) == [Path(".partial-1-b.bip")]
+    (found / "a.json").write_text('{"a"')
+    assert half_written(found, reference) == [Path("a.json"), Path("b.bip")]
+
+
+def test_moments_are_spread_and_repeat():
+    found = list(moments(10, 2.0, 12.0, random.Random(1)))
+    assert [int(moment.after_s / (2.0 if moment.writing else 2.4)) for moment in found] == [*range(5), *range(5)]
+    assert [moment.writing for moment in found] == [False] * 5 + [True] * 5
+    assert found == list(moments(10, 2.0, 12.0, random.Random(1)))
