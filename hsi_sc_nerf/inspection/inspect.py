@@ -24,13 +24,8 @@ from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_ma
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.known_camera import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
-from hsi_sc_nerf.poses.upright import rotation_from_corners
 
 INSPECTION_NAME = "inspection.json"
-UPRIGHT_FRAMES = 6
-"""Frames from whose markers the upright direction is measured."""
-FEWEST_SIGHTINGS = 4
-"""Fewest markers, over these frames, that can show it."""
 WHOLE_TURN_DEG = 0.05
 """Frames that fill a turn to this fraction are taken for one whole turn."""
 THUMBNAIL_COLUMNS = 12
@@ -107,16 +102,7 @@ def inspect_session(
 
 def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
     """The session with the rotation of its images by its markers, unless ``session.json`` states one."""
-    step = max(1, len(markers.detections) // UPRIGHT_FRAMES)
-    sightings = [
-        (frame, marker, corners)
-        for frame, seen in enumerate(markers.detections[::step])
-        for marker, corners in seen.items()
-    ]
-    measured = None
-    if len(sightings) >= FEWEST_SIGHTINGS:
-        frame, marker, corners = (np.array(column) for column in zip(*sightings, strict=True))
-        measured = rotation_from_corners(frame, marker, corners)
+    measured = markers.rotation_deg
     values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
     assumed = session.image_rotation_deg
     if measured is None:

@@ -11,7 +11,6 @@ from jaxtyping import UInt8
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
@@ -76,9 +75,6 @@ def poses_from_markers(
             f"markers with others, {FEWEST_FRAMES} are needed; take smaller steps or show more markers"
         )
     start = initialise(linked, (width / 2, height / 2), width, info.marker_side_m or _SIDE_WITHOUT_SCALE_M)
-    # The first adjustment is unweighted, so that a wrong covariance can do no harm.
-    unweighted = np.tile(np.eye(8), (len(linked), 1, 1))
-    start = Problem(start, MarkerResiduals(start, linked, 1.0, unweighted)).minimise(start)
     first, _, outliers = adjust_without_outliers(start, linked)
     start = first.turntable
     rejected += [r for r in outliers if r.frame not in start.frames]
