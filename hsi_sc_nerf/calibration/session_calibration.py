@@ -30,13 +30,13 @@ from hsi_sc_nerf.calibration.lamp_drift import (
     survey_lines,
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
-from hsi_sc_nerf.calibration.panel import read_panel
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.calibration.white_reference import Roi, White, WhiteReference, tarp_roi
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
     measure_whites,
+    read_panel,
     white_cubes,
     white_exposure_ratio,
     white_source,

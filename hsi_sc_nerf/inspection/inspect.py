@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from matplotlib import rc_context
 
-from hsi_sc_nerf.calibration.white_check import check_white
+from hsi_sc_nerf.calibration.calibration_checks import check_white
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo

@@ -23,7 +23,7 @@ from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 from hsi_sc_nerf.poses.marker_initialisation import initialise
-from hsi_sc_nerf.poses.marker_outliers import usable
+from hsi_sc_nerf.poses.model_selection import usable
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations
 
 LEAST_NOISE = 1e-4

@@ -16,9 +16,9 @@ from hsi_sc_nerf.poses.container_outline import ContainerOutline, container_outl
 from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
-from hsi_sc_nerf.poses.marker_outliers import usable
+from hsi_sc_nerf.poses.model_selection import usable
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
-from hsi_sc_nerf.poses.posed_session import in_object_frame
+from hsi_sc_nerf.poses.posed_session import in_object_frame, pose_uncertainty
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
@@ -31,7 +31,6 @@ from hsi_sc_nerf.poses.track_adjustment import (
 )
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
-from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
 
 _FOCAL_SIGMA = 0.002
 """Of an earlier session's focal length, as a fraction."""

@@ -14,15 +14,13 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
-from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
-from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS, adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
-from hsi_sc_nerf.poses.posed_session import in_object_frame
+from hsi_sc_nerf.poses.posed_session import in_object_frame, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
-from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
 _SIDE_WITHOUT_SCALE_M = 0.03

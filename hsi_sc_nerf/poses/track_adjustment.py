@@ -15,6 +15,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.posed_session import with_hidden_errors
 from hsi_sc_nerf.poses.residuals import (
     MarkerResiduals,
     PointResiduals,
@@ -22,7 +23,6 @@ from hsi_sc_nerf.poses.residuals import (
 )
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
-from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.

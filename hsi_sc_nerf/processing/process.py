@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.calibration_checks import check_calibration
+from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
@@ -39,8 +39,7 @@ from hsi_sc_nerf.packed.dataset import (
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
-from hsi_sc_nerf.processing.fingerprint import session_fingerprint
-from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
+from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
@@ -51,9 +50,8 @@ from hsi_sc_nerf.processing.posed_frames import (
     posed_frames,
 )
 from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
-from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
-from hsi_sc_nerf.processing.voted_hull import VotedHull, voted_hull
+from hsi_sc_nerf.processing.voted_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
 
 
@@ -155,8 +153,9 @@ def process_session(
         progress=progress,
     )
     pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
-    num_values = sum(cache.gray.size for cache in caches) * len(calibration.bands)
-    console.print(describe_pixel_counts(pixel_counts, num_values), highlight=False)
+    num_pixels = sum(cache.gray.size for cache in caches)
+    console.print(describe_pixel_counts(pixel_counts, num_pixels * len(calibration.bands)), highlight=False)
+    checks.add([check_clipped(session, calibration, pixel_counts, num_pixels)])
     poses = pose_frames(
         session,
         [cache.gray for cache in caches],

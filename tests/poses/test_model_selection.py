@@ -14,19 +14,21 @@ from turntable_scene import MarkerScene
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.marker_outliers import (
+from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.model_selection import (
     DISPLACED,
+    EVIDENCE_NEEDED,
     adjust_without_outliers,
+    frame_motions,
+    select_model,
     usable,
     without_uncertain_frames,
 )
-from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, frame_motions, select_model
 from hsi_sc_nerf.poses.object_frame import apparent_sides
 from hsi_sc_nerf.poses.pose_checks import check_poses
+from hsi_sc_nerf.poses.posed_session import pose_uncertainty
 from hsi_sc_nerf.poses.report import pose_report
 from hsi_sc_nerf.poses.turntable import MarkerObservations
-from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
 from hsi_sc_nerf.simulate.frames import Simulation
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

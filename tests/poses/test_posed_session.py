@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.posed_session import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
-from hsi_sc_nerf.poses.uncertainty import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
 
 SEEDS = 12
 
