@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -51,6 +51,17 @@ def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> N
         sentences = " ".join(finding.sentence for finding in refused)
         accept = " ".join(f"--accept {name}" for name in dict.fromkeys(finding.name for finding in refused))
         raise InputError(f"{sentences} (To go on in spite of this: {accept}.)")
+
+
+def names_in_short(names: Sequence[str], most: int = 6) -> str:
+    """Names in a sentence; of many the first ones and their number."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def leave_out(names: Sequence[str]) -> str:
+    """The options that leave captures out."""
+    return " ".join(f"--exclude {name}" for name in names)
 
 
 def judged(name: str, value: float, limits: tuple[float, float], sentence: str, advice: str) -> Finding:

@@ -12,19 +12,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hsi_sc_nerf.calibration.detector import dark_columns, no_data, unlit_bands
+from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
 from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, white_exposure_ratio, white_source
-from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
 
-LINES, DARK_LINES = 16, 8
-"""Lines of each cube that are read, evenly spread, and of each dark cube."""
 ABOVE_WHITE = 1.05
 """Reflectance above the white's: noise and uneven light alone take a white wall's values just above 1."""
 ABOVE_AMBER, ABOVE_RED = 0.01, 0.05
@@ -98,7 +95,7 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
     """What is wrong with the tarp (None for nothing), the fraction of clipped values, and the figures behind it."""
     tarp, frames = session.white, session.frames
     assert tarp is not None
-    light = _light(tarp.cube, tarp.dark)
+    light = light_of_some_lines(tarp.cube, tarp.dark)
     image = light.mean(axis=-1)
     brightest = np.percentile(image, 99.0)
     region = largest_component(image >= TARP_BRIGHTNESS * brightest)
@@ -170,7 +167,7 @@ def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, ob
     whites, uneven, good_bands = [], {}, np.ones(len(session.wavelengths_nm), bool)
     for frame in session.frames:
         assert frame.white is not None
-        light = _light(frame.white, frame.white_dark)
+        light = light_of_some_lines(frame.white, frame.white_dark)
         columns = np.median(light, axis=0)
         if len(columns) != frame.cube.shape[1]:
             columns = np.median(columns, axis=0, keepdims=True)
@@ -197,21 +194,11 @@ def _compare_with_white(
     """
     images, clipped, outshone = [], [], []
     for frame, white in zip(frames, whites, strict=True):
-        light = _light(frame.cube, frame.dark)[..., live]
+        light = light_of_some_lines(frame.cube, frame.dark)[..., live]
         images.append(light.mean(axis=-1))
         clipped.append((light > ABOVE_WHITE * white[..., live]).mean())
         outshone.append((light > OUTSHONE * white[..., live]).mean(axis=(0, 1)))
     return np.stack(images), float(np.mean(clipped)), float(np.mean(outshone, axis=0).max())
-
-
-def _light(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "lines samples bands"]:
-    """Counts above dark of some lines; 0 for no data."""
-    rows = np.unique(np.linspace(0, cube.shape[0] - 1, min(LINES, cube.shape[0]) + 2).round().astype(int)[1:-1])
-    counts = np.asarray(cube.memmap()[rows])
-    missing = no_data(counts, cube.ignore_value)
-    dark_lines = None if dark is None else dark.memmap()[:DARK_LINES]
-    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:])
-    return light if missing is None else np.where(missing, 0.0, light)
 
 
 def check_calibration(session: Session, calibration: SessionCalibration) -> list[Finding]:

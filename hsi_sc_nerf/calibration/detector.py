@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
 from scipy import ndimage
+
+from hsi_sc_nerf.capture.envi import Cube
 
 NEIGHBOURS = 11
 """Width of the median window along the line that an element is compared with."""
@@ -31,8 +33,8 @@ BELOW_TOP = 10
 """Readings pile up at the largest count if it has more of them than this many counts below it together."""
 MIN_TOP_PAIRS = 20
 """Fewest readings, and fewest pairs of neighbours, that can be a pile at the largest count."""
-SAME_PATTERN = 1.5
-"""Variance of the frames' dark patterns, relative to that of noise, up to which they are the same."""
+SOME_LINES = 16
+"""Lines that are read of a cube, and at most of its dark cube, for a look at it."""
 BRIGHT = 0.5
 """Fraction of the largest count above which readings are bright."""
 
@@ -140,10 +142,10 @@ def elements_without_response(
     return fails & ~follows
 
 
-def unlit_bands(light: Float[np.ndarray, "columns bands"], min_light: float = MIN_LIGHT) -> Bool[np.ndarray, "bands"]:
-    """Bands whose median over the columns is below ``min_light`` times that of the brightest; nan counts as 0."""
+def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "bands"]:
+    """Bands whose median over the columns is below ``MIN_LIGHT`` times that of the brightest; nan counts as 0."""
     typical = np.median(np.where(np.isfinite(light), light, 0.0), axis=0)
-    return ~((typical > 0.0) & (typical >= min_light * typical.max()))
+    return ~((typical > 0.0) & (typical >= MIN_LIGHT * typical.max()))
 
 
 def dark_columns(
@@ -159,35 +161,18 @@ def dark_columns(
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
 
 
-def pooled_darks(
-    darks: Sequence[Float[np.ndarray, "columns bands"]], readings: int, read_noise: Float[np.ndarray, "bands"]
-) -> list[Float[np.ndarray, "columns bands"]]:
-    """The frames' dark counts with the pattern of columns and bands that all share, and each frame's own level.
+def spread_rows(lines: int, most: int) -> Int[np.ndarray, "rows"]:
+    """Numbers of lines that are evenly spread over a cube, without its first and last if it has many."""
+    return np.unique(np.linspace(0, lines - 1, min(most, lines) + 2).round().astype(int)[1:-1])
 
-    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame, and that of a band's
-    level is in all its pixels. A frame's level is one offset of all bands, or has a value in each band where the
-    frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
 
-    Args:
-        darks: `dark_columns` of each frame.
-        readings: lines of each dark cube.
-        read_noise: standard deviation of one reading.
-    """
-    if len(darks) < 2 or len({dark.shape for dark in darks}) > 1 or len(darks[0]) < 2:
-        return list(darks)
-    stacked = np.stack(darks)
-    frames, columns, bands = stacked.shape
-    level = stacked.mean(axis=1, keepdims=True)
-    pattern = (stacked - level).mean(axis=0)
-    expected = np.maximum((1.0 - 1.0 / frames) * read_noise**2 / readings, 1e-12)
-    of_columns = np.median(np.square(stacked - level - pattern).mean(axis=0), axis=0) / (1.0 - 1.0 / columns)
-    if np.median(of_columns / expected) > SAME_PATTERN:
-        return list(darks)
-    offset = level.mean(axis=2, keepdims=True)
-    of_bands = np.square(level - offset - (level - offset).mean(axis=0)).mean(axis=0)[0]
-    if bands > 1 and np.mean(of_bands * columns / expected) / (1.0 - 1.0 / bands) <= SAME_PATTERN:
-        pattern, level = (stacked - offset).mean(axis=0), offset
-    return list(level + pattern)
+def light_of_some_lines(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "rows samples bands"]:
+    """Counts above dark of ``SOME_LINES`` lines of a cube (`spread_rows`); 0 for no data."""
+    counts = np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])
+    missing = no_data(counts, cube.ignore_value)
+    dark_lines = None if dark is None else dark.memmap()[:SOME_LINES]
+    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:]).astype(np.float32)
+    return light if missing is None else np.where(missing, np.float32(0.0), light)
 
 
 def no_data(counts: Num[np.ndarray, "*shape"], ignore_value: float | None) -> Bool[np.ndarray, "*shape"] | None:

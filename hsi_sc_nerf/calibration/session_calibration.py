@@ -18,7 +18,7 @@ from hsi_sc_nerf.calibration.detector import (
     fill_no_data,
     find_defects,
     no_data,
-    pooled_darks,
+    spread_rows,
 )
 from hsi_sc_nerf.calibration.flat_field import flat_field
 from hsi_sc_nerf.calibration.lamp_drift import (
@@ -208,9 +208,6 @@ def _drift(
 ) -> LampDriftEstimate | NotMeasurable:
     """The lamps' drift, from counts at the first frame's integration time."""
     captures = session.frames
-    lines = {0 if capture.dark is None else capture.dark.shape[0] for capture in captures}
-    if len(lines) == 1 and 0 not in lines:
-        darks = pooled_darks(darks, lines.pop(), noise.read_noise)
     survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 
@@ -258,7 +255,7 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     captures = session.frames
     lines, samples, _ = captures[0].cube.shape
     numbers = np.unique(np.linspace(0, len(captures) - 1, DEFECT_FRAMES).round().astype(int))
-    rows = np.unique(np.linspace(0, lines - 1, DEFECT_LINES + 2).round().astype(int)[1:-1])
+    rows = spread_rows(lines, DEFECT_LINES)
     of_frames = []
     for capture in (captures[number] for number in numbers):
         chosen = np.union1d(rows, _brightest_lines(capture.cube))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.capture.session import Capture, Session, in_short
-from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.look import Look, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
@@ -70,17 +70,6 @@ def acquisition_day(capture: Capture) -> str | None:
     text = str(capture.cube.fields.get("acquisition date", "")).strip()
     match = _DAY.search(text)
     return match.group() if match else text or None
-
-
-def names_in_short(names: Sequence[str], most: int = 6) -> str:
-    """Names in a sentence; of many the first ones and their number."""
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
-
-
-def leave_out(names: Sequence[str]) -> str:
-    """The options that leave captures out."""
-    return " ".join(f"--exclude {name}" for name in names)
 
 
 def _binning(capture: Capture) -> str | None:

@@ -17,8 +17,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Finding, Level
-from hsi_sc_nerf.inspection.capture_checks import names_in_short
+from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker

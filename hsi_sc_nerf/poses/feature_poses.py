@@ -133,6 +133,7 @@ def _posed(
     findings: list[Finding] = []
     if camera is not None:
         findings = check_camera(adjusted, found, camera)
+    errors_px, overall_px = turntable.frame_errors_px(found.tracks, n)
     height, width = images[0].shape
     outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
     if scale_of(adjusted.turntable, info, outline)[0] is None:
@@ -151,14 +152,14 @@ def _posed(
         (width, height),
         info,
         outline,
-        reprojection_error_px=turntable.over_session(found.frame_errors_px(), n),
+        reprojection_error_px=errors_px,
         dropped={
             names[i]: "it shares too few features with other frames"
             for i in np.setdiff1d(np.arange(n), turntable.frames).tolist()
         },
         dictionary=None if markers is None else dictionary,
         markers_per_frame=per_frame,
-        overall_error_px=found.overall_error_px,
+        overall_error_px=overall_px,
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",

@@ -92,10 +92,7 @@ def poses_from_markers(
     if not lie_on_disc(turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker corner."
         found.append(Finding("poses-origin", "amber", sentence))
-    squared_px2 = ((turntable.reproject(kept) - kept.corners_px) ** 2).sum(-1).mean(-1)
-    seen = np.bincount(kept.frame, minlength=len(names))
-    with np.errstate(invalid="ignore"):
-        errors_px = np.sqrt(np.bincount(kept.frame, squared_px2, len(names)) / seen)
+    errors_px, overall_px = turntable.frame_errors_px(kept, len(names))
     return in_object_frame(
         with_hidden_errors(adjusted),
         kept,
@@ -103,10 +100,10 @@ def poses_from_markers(
         (width, height),
         info,
         reprojection_error_px=errors_px,
-        overall_error_px=float(np.sqrt(squared_px2.mean())),
+        overall_error_px=overall_px,
         dropped=_dropped(names, np.isin(np.arange(len(names)), turntable.frames), rejected),
         dictionary=dictionary,
-        markers_per_frame=tuple(seen.tolist()),
+        markers_per_frame=tuple(np.bincount(kept.frame, minlength=len(names)).tolist()),
         blur_px=float(np.median(observed.blur_px)),
         loop_closure_deg=loop_closure_deg(MarkerResiduals(turntable, kept, LOSS_SIGMAS), turntable),
         findings=tuple(found),

@@ -23,7 +23,7 @@ from scipy.stats import f as f_distribution
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
-from hsi_sc_nerf.poses.residuals import MarkerResiduals, whitening
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.result import RejectedMarker
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Turntable
 
@@ -162,10 +162,9 @@ def _fits(
     best: Adjusted, observations: MarkerObservations, good: Bool[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Error of each observation in pixels, and whether it is no outlier, judged by the good ones."""
-    residual = best.turntable.reproject(observations) - observations.corners_px
-    error_px = np.sqrt((residual**2).sum(-1).mean(-1))
-    weighted = np.einsum("nij,nj->ni", whitening(observations.covariance_px2), residual.reshape(-1, 8))
-    sigmas = np.sqrt((weighted**2).mean(-1) / best.variance)
+    error_px = best.turntable.errors_px(observations)
+    whitened = MarkerResiduals(best.turntable, observations, LOSS_SIGMAS).values(best.turntable)
+    sigmas = np.sqrt((whitened**2).mean(axis=(1, 2)) / best.variance)
     limit_px = max(_OUTLIER_PX, _OUTLIER_MEDIANS * float(np.median(error_px[good])))
     return error_px, (error_px < limit_px) | (sigmas < _OUTLIER_SIGMAS)
 
@@ -260,9 +259,8 @@ def frame_motions(turntable: Turntable, observations: MarkerObservations) -> Fra
     variance = max(1.0, float(by_motion[enough].sum()) / max(freedom, 1))
     ratio = np.maximum(by_angle - by_motion, 0.0) / (_FRAME_PARAMETERS - 1) / variance
     p_value = np.where(enough, f_distribution.sf(ratio, _FRAME_PARAMETERS - 1, max(freedom, 1)), 1.0)
-    squared_px2 = ((turned.reproject(seen) - seen.corners_px) ** 2).sum(-1).mean(-1)
-    rms_error_px = np.sqrt(np.bincount(frame[agrees], squared_px2[agrees], n) / np.maximum(markers, 1))
-    return FrameMotions(turntable.frames, p_value, rms_error_px)
+    errors_px, _ = turned.frame_errors_px(seen.select(agrees), int(turntable.frames.max()) + 1)
+    return FrameMotions(turntable.frames, p_value, np.nan_to_num(errors_px[turntable.frames]))
 
 
 def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 # The paper's target for the reprojection error (section "Pose Estimation").
@@ -163,8 +163,5 @@ def _left_out(poses: TurntablePoses) -> str:
     by_reason: dict[str, list[str]] = {}
     for name, why in sorted(poses.dropped.items()):
         by_reason.setdefault(why, []).append(name)
-    groups = []
-    for why, names in by_reason.items():
-        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        groups.append(f"{', '.join(names[:_MOST_NAMES])}{more} ({why})")
+    groups = [f"{names_in_short(names, _MOST_NAMES)} ({why})" for why, names in by_reason.items()]
     return f"{len(poses.dropped)} of {len(poses.names)} frames are left out: {'; '.join(groups)}."

@@ -185,6 +185,18 @@ class Turntable:
         corners = self.corners()[landmark].reshape(-1, 3)
         return project(self, np.repeat(frame, 4), corners).pixels.reshape(-1, 4, 2)
 
+    def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
+        """Distance of each sighting from its projection; of a marker the root mean square over its corners."""
+        away = self.reproject(seen) - (seen.pixels if isinstance(seen, Tracks) else seen.corners_px)
+        return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
+
+    def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
+        """Root mean square error in each of the session's ``size`` frames, nan without sightings; and in all."""
+        squared = self.errors_px(seen) ** 2
+        with np.errstate(invalid="ignore"):
+            of_frames = np.bincount(seen.frame, squared, size) / np.bincount(seen.frame, minlength=size)
+        return np.sqrt(of_frames), float(np.sqrt(squared.mean()))
+
     def resized(self, factor: float) -> Turntable:
         """The turntable with all lengths times a factor: its images stay the same."""
         poses = self.marker_poses.copy()

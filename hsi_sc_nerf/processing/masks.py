@@ -39,6 +39,9 @@ LID_MIDDLE = 0.3
 CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
 
+COLUMNS, TILE_PX = 6, 240
+"""Of the contact sheet: frames in a row, and the width of each."""
+
 
 @dataclass(frozen=True)
 class MaskConfig:
@@ -196,9 +199,6 @@ def mask_picture(
     images: Sequence[UInt8[np.ndarray, "h w 3"]],
     masks: Sequence[Bool[np.ndarray, "h w"]],
     names: Sequence[str],
-    *,
-    columns: int = 6,
-    tile_px: int = 240,
 ) -> None:
     """Write a contact sheet: each frame's pseudo-RGB image with its mask's outline and its name.
 
@@ -207,8 +207,8 @@ def mask_picture(
     """
     tiles = []
     for image, mask, name in zip(images, masks, names, strict=True):
-        scale = tile_px / image.shape[1]
-        size = (tile_px, round(image.shape[0] * scale))
+        scale = TILE_PX / image.shape[1]
+        size = (TILE_PX, round(image.shape[0] * scale))
         interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
         small = cv2.resize(np.ascontiguousarray(image), size, interpolation=interpolation)
         tile = draw_outline(small, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
@@ -216,7 +216,7 @@ def mask_picture(
             cv2.putText(tile, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
         tiles.append(tile)
     blank = np.full_like(tiles[0], 255)
-    rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
+    rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
     rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 

@@ -17,7 +17,6 @@ from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
     describe_calibration,
-    describe_pixel_counts,
     draw_calibration,
     write_calibration,
 )
@@ -154,7 +153,6 @@ def process_session(
     )
     pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
     num_pixels = sum(cache.gray.size for cache in caches)
-    console.print(describe_pixel_counts(pixel_counts, num_pixels * len(calibration.bands)), highlight=False)
     checks.add([check_clipped(session, calibration, pixel_counts, num_pixels)])
     poses = pose_frames(
         session,

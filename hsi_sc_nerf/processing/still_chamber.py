@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of
+from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of, through_lens
 
 MAX_FRAMES = 16
 """Frames that are compared, evenly spread over the session."""
@@ -84,13 +83,10 @@ def turntable_silhouette(
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels of a camera that show the turntable's disc or the container (`turntable_cylinders`)."""
     silhouette = np.zeros((dataset.intrinsics.h, dataset.intrinsics.w), np.uint8)
-    to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
-    matrix = dataset.intrinsics.matrix()
     for points in turntable_cylinders(dataset):
-        in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
-        pixels, _ = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), matrix, dataset.distortion)
+        pixels = through_lens(points, camera_to_world, dataset.intrinsics, dataset.distortion)
         # OpenCV draws in coordinates whose origin is the first pixel's centre.
-        cv2.fillConvexPoly(silhouette, cv2.convexHull(np.rint(pixels[:, 0] - 0.5).astype(np.int32)), 1)
+        cv2.fillConvexPoly(silhouette, cv2.convexHull(np.rint(pixels - 0.5).astype(np.int32)), 1)
     return silhouette > 0
 
 
@@ -108,7 +104,7 @@ def turntable_cylinders(dataset: PackedDataset) -> list[Float[np.ndarray, "point
     return [_rims(reach, lowest, 0.0), _rims(prism_radius, 0.0, container.height_m)]
 
 
-def _rims(radius_m: float, low_m: float, high_m: float, points: int = 64) -> Float[np.ndarray, "points 3"]:
-    angle = 2.0 * np.pi * np.arange(points) / points
+def _rims(radius_m: float, low_m: float, high_m: float) -> Float[np.ndarray, "points 3"]:
+    angle = 2.0 * np.pi * np.arange(64) / 64
     circle = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.insert(circle, 2, height, axis=1) for height in (low_m, high_m)])

@@ -212,7 +212,7 @@ def sightings(
     found: list[tuple[np.ndarray, ...]] = []
     for frame in range(0, len(masks), -(-len(masks) // MAX_FRAMES)):
         pose = camera_to_worlds[frame]
-        pixels, depth = _pixels(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
+        pixels, depth = through_lens(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
         to_eye = pose[:3, 3] - points
         facing = (normals * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
         inside = ~dilate(~masks[frame], 2 * OUTLINE_PX + 1)
@@ -230,13 +230,13 @@ def sightings(
     return Sightings(point, frames, normal, reflectance, points, normals)
 
 
-def _pixels(
+def through_lens(
     points: Float[np.ndarray, "n 3"],
     pose: Float[np.ndarray, "4 4"],
     intrinsics: PinholeIntrinsics,
     distortion: Float[np.ndarray, "4"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixel coordinates of points through the lens."""
+    """Pixel coordinates of points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
     to_camera = np.linalg.inv(pose @ OPENCV_TO_OPENGL)
     in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
     return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]

@@ -115,16 +115,16 @@ def test_the_middle_of_the_lid_is_in_the_middle_of_what_may_be_the_objects():
 
 
 def test_mask_picture_draws_each_outline(tmp_path):
-    images = [np.full((30, 40, 3), 90, np.uint8)] * 4
+    images = [np.full((30, 40, 3), 90, np.uint8)] * 7
     masks = [np.zeros((30, 40), bool) for _ in images]
-    masks[3][10:20, 10:20] = True
+    masks[6][10:20, 10:20] = True
     path = tmp_path / "masks.png"
-    mask_picture(path, images, masks, list("abcd"), columns=3, tile_px=80)
+    mask_picture(path, images, masks, list("abcdefg"))
     sheet = cv2.imread(str(path))[..., ::-1].astype(int)
-    assert sheet.shape == (120, 240, 3)
+    assert sheet.shape == (360, 1440, 3)
     magenta = (sheet == [255, 0, 200]).all(-1)
-    assert magenta[60:, :80].sum() > 40
-    assert not magenta[:60].any()
+    assert magenta[180:, :240].sum() > 120
+    assert not magenta[:180].any()
 
 
 @pytest.mark.slow
