@@ -33,6 +33,8 @@ BELOW_TOP = 10
 """Readings pile up at the largest count if it has more of them than this many counts below it together."""
 MIN_TOP_PAIRS = 20
 """Fewest readings, and fewest pairs of neighbours, that can be a pile at the largest count."""
+SAME_PATTERN = 1.5
+"""Variance of the frames' dark patterns, relative to that of noise, up to which they are the same."""
 SOME_LINES = 16
 """Lines that are read of a cube, and at most of its dark cube, for a look at it."""
 BRIGHT = 0.5
@@ -159,6 +161,37 @@ def dark_columns(
         return np.zeros((1, bands))
     columns = dark.mean(axis=0, dtype=np.float64)
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
+
+
+def pooled_darks(
+    darks: Sequence[Float[np.ndarray, "columns bands"]], readings: int, read_noise: Float[np.ndarray, "bands"]
+) -> list[Float[np.ndarray, "columns bands"]]:
+    """The frames' dark counts with the pattern of columns and bands that all share, and each frame's own level.
+
+    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame, and that of a band's
+    level is in all its pixels. A frame's level is one offset of all bands, or has a value in each band where the
+    frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
+
+    Args:
+        darks: `dark_columns` of each frame.
+        readings: lines of each dark cube.
+        read_noise: standard deviation of one reading.
+    """
+    if len(darks) < 2 or len({dark.shape for dark in darks}) > 1 or len(darks[0]) < 2:
+        return list(darks)
+    stacked = np.stack(darks)
+    frames, columns, bands = stacked.shape
+    level = stacked.mean(axis=1, keepdims=True)
+    pattern = (stacked - level).mean(axis=0)
+    expected = np.maximum((1.0 - 1.0 / frames) * read_noise**2 / readings, 1e-12)
+    of_columns = np.median(np.square(stacked - level - pattern).mean(axis=0), axis=0) / (1.0 - 1.0 / columns)
+    if np.median(of_columns / expected) > SAME_PATTERN:
+        return list(darks)
+    offset = level.mean(axis=2, keepdims=True)
+    of_bands = np.square(level - offset - (level - offset).mean(axis=0)).mean(axis=0)[0]
+    if bands > 1 and np.mean(of_bands * columns / expected) / (1.0 - 1.0 / bands) <= SAME_PATTERN:
+        pattern, level = (stacked - offset).mean(axis=0), offset
+    return list(level + pattern)
 
 
 def spread_rows(lines: int, most: int) -> Int[np.ndarray, "rows"]:

@@ -18,6 +18,7 @@ from hsi_sc_nerf.calibration.detector import (
     fill_no_data,
     find_defects,
     no_data,
+    pooled_darks,
     spread_rows,
 )
 from hsi_sc_nerf.calibration.flat_field import flat_field
@@ -208,6 +209,9 @@ def _drift(
 ) -> LampDriftEstimate | NotMeasurable:
     """The lamps' drift, from counts at the first frame's integration time."""
     captures = session.frames
+    lines = {0 if capture.dark is None else capture.dark.shape[0] for capture in captures}
+    if len(lines) == 1 and 0 not in lines:
+        darks = pooled_darks(darks, lines.pop(), noise.read_noise)
     survey = survey_lines(*captures[0].cube.shape[:2])
     exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
 

@@ -281,7 +281,7 @@ def _solve(observations: MarkerObservations, turntable: Turntable, free: FreePar
 
 def _steady(start: Turntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
     """The model without wobble; and the one with it, if the corners call for it."""
-    steady = solve(replace(start, radial=(0.0, 0.0), tilts_rad=None, shifts=None), FreeParameters())
+    steady = solve(replace(start, radial=(0.0, 0.0), motion=None), FreeParameters())
     steady = _with_lens(steady, solve)
     sigmas = (_FIRST_SPREAD[0], _FIRST_SPREAD[1] * steady.turntable.distance)
     wobbling = solve(steady.turntable, replace(steady.problem.free, motion_sigmas=sigmas))
@@ -321,7 +321,8 @@ def _without_displaced_frames(start: Turntable, observations: MarkerObservations
 
 def _motion_spread(turntable: Turntable) -> tuple[float, float]:
     """Root mean squares of the tilts (rad) and the shifts (m)."""
-    tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.tilts_and_shifts(), [2], axis=1))
+    assert turntable.motion is not None
+    tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.motion, [2], axis=1))
     return max(tilt, _LEAST_SPREAD[0]), max(shift, _LEAST_SPREAD[1])
 
 

@@ -59,7 +59,7 @@ def in_object_frame(
     turntable, n = adjusted.turntable.resized(metres), len(names)
     to_object = to_object_frame(turntable, disc_height(turntable) if outline is None else metres * outline.foot)
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
-    on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
+    on_disc, motion = lie_on_disc(turntable.corners()), turntable.motion
     uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, outline)
     return TurntablePoses(
         names=tuple(names),
@@ -72,8 +72,8 @@ def in_object_frame(
         disc_markers=tuple(turntable.markers[on_disc].tolist()),
         disc_by_container=outline is not None,
         disc_tilt_deg=disc_tilt_deg(turntable),
-        model="turntable" if tilts is None else "free poses",
-        wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
+        model="turntable" if motion is None else "free poses",
+        wobble_deg=None if motion is None else float(np.rad2deg(np.sqrt((motion[:, :2] ** 2).sum(-1).mean()))),
         evidence=dict(adjusted.evidence),
         metric=source is not None,
         scale=None if source is None else _scale(adjusted, turntable, markers, uncertainty.size, source, info),

@@ -12,6 +12,7 @@ from hsi_sc_nerf.calibration.detector import (
     Readings,
     elements_without_response,
     find_defects,
+    pooled_darks,
     saturation_counts,
     unlit_bands,
 )
@@ -226,3 +227,36 @@ def test_session_without_dark_cubes():
     # Where the light is weak, the dark counts hide it.
     assert not (defects.dead & ~truth_of(simulation)).any()
     assert (defects.dead & truth_of(simulation)).sum() > 0.7 * truth_of(simulation).sum()
+
+
+def darks_of_frames(pattern_change: float, readings: int = 16) -> tuple[list[np.ndarray], np.ndarray]:
+    """Darks of 12 frames, whose level drifts, with the noise of few lines; and the true ones."""
+    rng = np.random.default_rng(2)
+    level = np.linspace(90.0, 110.0, 12)[:, None, None]
+    true = level + rng.normal(0.0, 5.0, (1, 40, 6)) + pattern_change * rng.standard_normal((12, 40, 6))
+    return list(true + rng.normal(0.0, 4.0 / np.sqrt(readings), true.shape)), true
+
+
+def test_pooled_darks_have_less_noise_and_each_frames_level():
+    darks, true = darks_of_frames(0.0)
+    pooled = np.stack(pooled_darks(darks, 16, np.full(6, 4.0)))
+    assert np.std(pooled - true) < 0.4 * np.std(np.stack(darks) - true)
+    np.testing.assert_allclose((pooled - true).mean(axis=1), 0.0, atol=0.6)
+
+
+@pytest.mark.parametrize(("change_of_bands", "remaining"), [(0.0, 0.3), (1.0, 1.0)])
+def test_an_offset_is_pooled_over_the_bands_and_levels_of_bands_are_kept(change_of_bands, remaining):
+    rng, shape = np.random.default_rng(4), (12, 40, 60)
+    true = np.linspace(90.0, 92.0, 12)[:, None, None] + rng.normal(0.0, 5.0, (1, *shape[1:]))
+    true = true + change_of_bands * rng.standard_normal((12, 1, 60))
+    darks = list(true + rng.normal(0.0, 4.0 / np.sqrt(16), shape))
+    pooled = np.stack(pooled_darks(darks, 16, np.full(60, 4.0)))
+    of_one_level = 4.0 / np.sqrt(16 * 40)
+    assert np.std((pooled - true).mean(axis=1)) == pytest.approx(remaining * of_one_level, rel=0.15)
+
+
+def test_darks_whose_pattern_changes_are_kept():
+    darks, _ = darks_of_frames(2.0)
+    np.testing.assert_array_equal(pooled_darks(darks, 16, np.full(6, 4.0)), darks)
+    single = [np.zeros((1, 6)), np.ones((1, 6))]
+    np.testing.assert_array_equal(pooled_darks(single, 16, np.full(6, 4.0)), single)

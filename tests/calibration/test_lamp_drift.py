@@ -18,7 +18,6 @@ from hsi_sc_nerf.calibration.lamp_drift import (
     survey_lines,
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel
-from hsi_sc_nerf.calibration.report import draw_lamp_drift
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
@@ -96,13 +95,6 @@ def test_inter_reflection_makes_no_drift():
     )
     assert np.abs(drift.factor - 1.0).max() < 2e-4
     assert not drift.significant
-
-
-@pytest.mark.slow
-def test_noise_free_drift_before_an_even_background():
-    drift, true, _ = simulated(DRIFT)
-    assert drift.significant
-    assert np.sqrt(np.mean((drift.factor / true - 1.0) ** 2)) < 0.002
 
 
 @pytest.mark.slow
@@ -305,9 +297,3 @@ def test_survey_lines(lines, samples, count):
         steps = np.diff(chosen)
         assert len(chosen) == count
         assert steps[0] < steps[count // 2]
-
-
-def test_picture(tmp_path):
-    drift = measure(drawn())
-    draw_lamp_drift(tmp_path / "drift.png", drift, WAVELENGTHS_NM, corrected=True)
-    assert (tmp_path / "drift.png").stat().st_size > 10_000

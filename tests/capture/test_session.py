@@ -1,5 +1,4 @@
 import json
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ from capture_factory import BANDS, INFO, SIZE_PX, WAVELENGTHS_NM, write_capture,
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import is_session, open_session
-from hsi_sc_nerf.capture.session_info import read_band_centres, read_session_info
+from hsi_sc_nerf.capture.session_info import read_session_info
 from hsi_sc_nerf.errors import InputError
 
 COUNTS = np.full((SIZE_PX, SIZE_PX, BANDS), 500, np.uint16)
@@ -218,20 +217,6 @@ def test_without_band_centres_that_can_be_used(tmp_path, content, message):
         without_wavelengths(header)
     with pytest.raises(InputError, match=message):
         open_session(tmp_path)
-
-
-def test_the_instruments_own_list_of_band_centres():
-    path = resources.files("hsi_sc_nerf.simulate") / "specim_iq_band_centres_nm.csv"
-    centres_nm = read_band_centres(Path(str(path)))
-    assert (len(centres_nm), centres_nm[0], centres_nm[-1]) == (204, 397.32, 1003.58)
-
-
-def test_session_info_round_trip(tmp_path):
-    path = tmp_path / "session.json"
-    path.write_text(json.dumps({**INFO, "nominal_step_deg": 10, "direction": "cw", "marker_dictionary": None}))
-    info = read_session_info(path)
-    assert (info.nominal_step_deg, info.direction, info.marker_dictionary) == (10, "cw", None)
-    assert info.container_height_m == 0.07
 
 
 def test_something_else_in_the_place_of_session_info_is_not_taken_for_none(tmp_path):

@@ -14,7 +14,6 @@ from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.model_selection import linked_rows
 from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
 from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.report import draw_poses, is_full_turn, pose_report
@@ -62,29 +61,6 @@ def test_exact_corners_give_exact_poses(options):
     assert position < 1e-1
     turned = np.rad2deg(np.unwrap(turntable.angles_rad))
     np.testing.assert_allclose(turned, scene.angles_deg, atol=1e-2)
-
-
-def test_first_guess_is_all_but_exact_on_exact_corners():
-    scene = MarkerScene(frames=9, turn_deg=100.0)
-    observations = marker_observations(marker_turntable(scene), 0.0)
-    start = initialise(observations, (64.0, 64.0), scene.size_px, SIDE_M)
-    error = start.reproject(observations) - observations.corners_px
-    assert np.abs(error).max() < 0.05
-
-
-def test_noisy_corners_give_close_poses():
-    scene = MarkerScene(frames=12)
-    turntable = solve(scene, marker_observations(marker_turntable(scene), 0.05))
-    found = to_object_frame(turntable, disc_height(turntable)) @ turntable.camera_to_world()
-    rotation, position = pose_errors(found, scene.camera_to_world)
-    assert rotation < 0.2
-    assert position < 1.0
-
-
-def test_frames_without_a_shared_marker_are_not_linked():
-    frame = np.array([0, 0, 1, 1, 2, 3, 4])
-    marker = np.array([5, 6, 6, 7, 7, 8, 8])
-    np.testing.assert_array_equal(linked_rows(frame, marker), [True] * 5 + [False] * 2)
 
 
 @pytest.mark.slow

@@ -129,24 +129,19 @@ def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
     assert [finding.name for finding in poses.findings] == ["poses-given"]
 
 
-def test_angles_that_are_not_there():
-    with pytest.raises(InputError, match="the angles are not known"):
-        find_poses(BLANK, list("abcd"), SessionInfo(), "angles", camera=CAMERA, progress=False)
-    few = SessionInfo(frame_angles_deg=(0.0, 1.0))
-    with pytest.raises(InputError, match="2 frame angles"):
-        find_poses(BLANK, list("abcd"), few, "angles", camera=CAMERA, progress=False)
-
-
-def test_a_direction_that_nothing_tells():
-    camera = replace(CAMERA, direction=None)
-    with pytest.raises(InputError, match=r"which way the turntable turns is not known.*give direction"):
-        find_poses(BLANK, list("abcd"), STEPS, "angles", camera=camera, progress=False)
-
-
-def test_a_camera_of_other_images():
-    images = [np.zeros((10, 10), np.uint8)] * 4
-    with pytest.raises(InputError, match="10 x 10 pixels, but the camera of the earlier session had 64 x 48"):
-        find_poses(images, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
+@pytest.mark.parametrize(
+    ("info", "direction", "side_px", "message"),
+    [
+        (SessionInfo(), "ccw", 48, "the angles are not known"),
+        (SessionInfo(frame_angles_deg=(0.0, 1.0)), "ccw", 48, "2 frame angles"),
+        (STEPS, None, 48, r"which way the turntable turns is not known.*give direction"),
+        (STEPS, "ccw", 10, "64 x 10 pixels, but the camera of the earlier session had 64 x 48"),
+    ],
+)
+def test_angles_that_do_not_do_with_a_camera_are_refused(info, direction, side_px, message):
+    images, camera = [image[:side_px] for image in BLANK], replace(CAMERA, direction=direction)
+    with pytest.raises(InputError, match=message):
+        find_poses(images, list("abcd"), info, "angles", camera=camera, progress=False)
 
 
 def test_a_camera_that_no_one_has_is_not_believed():

@@ -284,15 +284,6 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     assert not more[2:].any()
 
 
-def test_plain_images_are_sessions_of_one_picture_a_frame():
-    images = [np.full((4, 5), k, np.uint8) for k in range(3)]
-    session = SessionPictures.of(images)
-    assert SessionPictures.of(session) is session
-    assert len(session) == 3
-    assert [int(image[0, 0]) for image in session] == [0, 1, 2]
-    assert session.named(GRAY)[2] is images[2]
-
-
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
 
 

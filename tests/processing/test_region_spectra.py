@@ -3,7 +3,7 @@
 import numpy as np
 
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.processing.region_spectra import border_spectrum, median_of_smallest
+from hsi_sc_nerf.processing.region_spectra import border_spectrum
 
 WAVELENGTHS_NM = np.linspace(450.0, 900.0, 6)
 
@@ -32,8 +32,3 @@ def test_border_spectrum_of_measured_values(tmp_path):
     border[1:-1, 1:-1] = False
     expected = np.append(np.nanmedian(reflectance[border][:, :5], axis=0), np.nan)
     np.testing.assert_allclose(border_spectrum(tmp_path / "c.hdr", foreground), expected, atol=1e-5)
-
-
-def test_median_of_the_smallest_values():
-    values = np.array([[4, 1, 9], [2, 3, 8], [6, 2, 7], [8, 9, 6]])
-    np.testing.assert_array_equal(median_of_smallest(values, np.array([4, 3, 0])), [5.0, 2.0, np.nan])
