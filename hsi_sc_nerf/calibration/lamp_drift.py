@@ -57,7 +57,6 @@ class LampDriftEstimate:
         static: which of the surveyed pixels are static.
         scatter: of their grey levels, sensor noise included (standard deviation, relative).
         p_value: of such a drift under steady lamps (`drift_p_value`).
-        significant: whether ``p_value`` is below ``SIGNIFICANCE``.
     """
 
     factor: Float[np.ndarray, "frames bands"]
@@ -66,7 +65,11 @@ class LampDriftEstimate:
     static: Bool[np.ndarray, "survey samples"]
     scatter: float
     p_value: float
-    significant: bool
+
+    @property
+    def significant(self) -> bool:
+        """Whether ``p_value`` is below ``SIGNIFICANCE``."""
+        return self.p_value < SIGNIFICANCE
 
     @property
     def static_fraction(self) -> float:
@@ -134,7 +137,7 @@ def measure_lamp_drift(
     standard_error[0] = 0.0
     few = slice(None, TESTED_TERMS)
     p_value = drift_p_value(coefficients[:, few], covariance[few, few], basis[lit, few])
-    return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
+    return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value)
 
 
 def correction(

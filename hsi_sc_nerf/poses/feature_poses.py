@@ -12,7 +12,7 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
-from hsi_sc_nerf.poses.container_outline import ContainerOutline, container_outline
+from hsi_sc_nerf.poses.container_outline import container_outline
 from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
@@ -135,7 +135,10 @@ def _posed(
         findings = check_camera(adjusted, found, camera)
     errors_px, overall_px = turntable.frame_errors_px(found.tracks, n)
     height, width = images[0].shape
-    outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
+    outline = None
+    if markers is None and info.container_diameter_m is not None and info.container_height_m is not None:
+        grays = SessionPictures.of(images).named(GRAY)
+        outline = container_outline(grays, adjusted.turntable, info.container_height_m / info.container_diameter_m)
     if scale_of(adjusted.turntable, info, outline)[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
@@ -164,13 +167,6 @@ def _posed(
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
     )
-
-
-def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> ContainerOutline | None:
-    if info.container_diameter_m is None or info.container_height_m is None:
-        return None
-    grays = SessionPictures.of(images).named(GRAY)
-    return container_outline(grays, turntable, info.container_height_m / info.container_diameter_m)
 
 
 def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -190,17 +190,6 @@ def _rejected_frames(observations: MarkerObservations, errors_px: Mapping[int, f
     return _rejected(observations, DISPLACED, np.array([errors_px[f] for f in observations.frame.tolist()]))
 
 
-@dataclass(frozen=True)
-class FrameMotions:
-    """Evidence that frames moved beside the turntable."""
-
-    frames: Int[np.ndarray, "f"]
-    p_value: Float[np.ndarray, "f"]
-    """Probability that chance alone lowers the frame's squares as much as a motion of its own does (F-test)."""
-    rms_error_px: Float[np.ndarray, "f"]
-    """Root mean square distance of the corners from the turntable's at the frame's best angle."""
-
-
 _Solve = Callable[[Turntable, FreeParameters], Adjusted]
 
 
@@ -228,7 +217,9 @@ def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted
     return _with_lens(wobbling, solve)
 
 
-def frame_motions(turntable: Turntable, observations: MarkerObservations) -> FrameMotions:
+def frame_motions(
+    turntable: Turntable, observations: MarkerObservations
+) -> tuple[Float[np.ndarray, "f"], Float[np.ndarray, "f"]]:
     """Test whether each frame fits the turntable by its angle, or needs tilts and shifts of its own.
 
     Camera, lens and markers are held. Frames of fewer than two markers, or of which fewer than half agree on one
@@ -237,6 +228,10 @@ def frame_motions(turntable: Turntable, observations: MarkerObservations) -> Fra
     Args:
         turntable: without wobble; observations of markers that it lacks are ignored.
         observations: marker corners.
+
+    Returns:
+        Of each frame the probability that chance alone lowers its squares as much as a motion of its own does
+        (F-test), and the root mean square distance of its corners from the turntable's at its best angle, px.
     """
     seen = observations.select(turntable.knows(observations))
     n, frame = len(turntable.frames), np.searchsorted(turntable.frames, seen.frame)
@@ -260,7 +255,7 @@ def frame_motions(turntable: Turntable, observations: MarkerObservations) -> Fra
     ratio = np.maximum(by_angle - by_motion, 0.0) / (_FRAME_PARAMETERS - 1) / variance
     p_value = np.where(enough, f_distribution.sf(ratio, _FRAME_PARAMETERS - 1, max(freedom, 1)), 1.0)
     errors_px, _ = turned.frame_errors_px(seen.select(agrees), int(turntable.frames.max()) + 1)
-    return FrameMotions(turntable.frames, p_value, np.nan_to_num(errors_px[turntable.frames]))
+    return p_value, np.nan_to_num(errors_px[turntable.frames])
 
 
 def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
@@ -301,21 +296,24 @@ def _without_displaced_frames(start: Turntable, observations: MarkerObservations
         return _steady(start.restricted(rest), partial(_solve, rest))
 
     # Displaced frames bend a turntable that is fitted to them: judge by one without the likeliest.
-    likeliest = start.frames[np.sort(np.argsort(frame_motions(start, observations).p_value, kind="stable")[:most])]
+    p_value, _ = frame_motions(start, observations)
+    likeliest = start.frames[np.sort(np.argsort(p_value, kind="stable")[:most])]
     steady, wobbling = steady_without(likeliest)
     if steady is None:
         return None
     angles = start.angles_rad.copy()
     angles[np.isin(start.frames, steady.turntable.frames)] = steady.turntable.angles_rad
-    judged = frame_motions(replace(steady.turntable, frames=start.frames, angles_rad=angles), observations)
-    displaced = judged.p_value < 10.0**-EVIDENCE_NEEDED
+    p_value, rms_error_px = frame_motions(
+        replace(steady.turntable, frames=start.frames, angles_rad=angles), observations
+    )
+    displaced = p_value < 10.0**-EVIDENCE_NEEDED
     if not 0 < displaced.sum() <= most:
         return None
     if not np.array_equal(start.frames[displaced], likeliest):
         steady, wobbling = steady_without(start.frames[displaced])
     if steady is None or wobbling is not None:
         return None
-    errors = zip(start.frames[displaced].tolist(), judged.rms_error_px[displaced].tolist(), strict=True)
+    errors = zip(start.frames[displaced].tolist(), rms_error_px[displaced].tolist(), strict=True)
     return replace(steady, displaced_frames=dict(errors))
 
 

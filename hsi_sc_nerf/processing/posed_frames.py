@@ -95,8 +95,14 @@ def pose_frames(
         if best.keys() != {GRAY}:
             seen_in = ", ".join(f"{name} ({count} frames)" for name, count in best.most_common())
             console.print(f"Markers stand out best in {seen_in}.", highlight=False)
-    for warning in _lying_on_its_side(session, report["axis_tilt_in_image_deg"]):
-        console.print(f"Warning: {warning}", highlight=False)
+    # The tilt counts clockwise from the picture's upright.
+    if quarter_turns := round(-report["axis_tilt_in_image_deg"] / 90.0):
+        rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
+        console.print(
+            "Warning: The turntable lies on its side in the pictures; set image_rotation_deg to "
+            f"{rotation_deg} in {session.info_path} to have them upright.",
+            highlight=False,
+        )
     for name in np.array(names)[~poses.used]:
         _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
     check(findings)
@@ -146,15 +152,3 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
         direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
     )
-
-
-def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:
-    """A warning where the turntable's axis, clockwise from the picture's upright, points to another side."""
-    quarter_turns = round(-axis_tilt_in_image_deg / 90.0)
-    if quarter_turns == 0:
-        return []
-    rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
-    return [
-        f"The turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
-        f"{session.info_path} to have them upright."
-    ]

@@ -32,7 +32,7 @@ def level_of(name, calibrated, **changes):
 def drift(change=0.05, error=0.001, scatter=0.003):
     factor = 1.0 - change * np.linspace(0.0, 1.0, 4)[:, None] * np.ones(BANDS)
     static = np.ones((8, SIZE_PX), bool)
-    return LampDriftEstimate(factor, factor, np.full(factor.shape, error), static, scatter, 0.0, True)
+    return LampDriftEstimate(factor, factor, np.full(factor.shape, error), static, scatter, 0.0)
 
 
 @pytest.mark.parametrize(
