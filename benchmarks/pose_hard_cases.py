@@ -23,8 +23,8 @@ from results_table import RESULTS, write_results
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override

@@ -44,8 +44,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
 from hsi_sc_nerf.poses.feature_poses import poses_from_features
 from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation

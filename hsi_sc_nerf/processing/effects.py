@@ -20,8 +20,8 @@ from hsi_sc_nerf.packed.effects import CERTAIN, EFFECT_COLUMNS, Effect, effect_r
 from hsi_sc_nerf.plotting import new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.processing.chamber import background_pixels, picture_of_chamber
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
-from hsi_sc_nerf.processing.still_chamber import background_pixels, picture_of_chamber
 from hsi_sc_nerf.processing.view_changes import (
     Change,
     Sightings,

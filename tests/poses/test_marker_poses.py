@@ -15,9 +15,9 @@ from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
-from hsi_sc_nerf.poses.pose_checks import check_poses
-from hsi_sc_nerf.poses.report import draw_poses, is_full_turn, pose_report
+from hsi_sc_nerf.poses.report import check_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.result import is_full_turn
 
 INFO = SessionInfo(marker_side_m=SIDE_M)
 

@@ -25,9 +25,8 @@ from hsi_sc_nerf.poses.model_selection import (
     without_uncertain_frames,
 )
 from hsi_sc_nerf.poses.object_frame import apparent_sides
-from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.posed_session import pose_uncertainty
-from hsi_sc_nerf.poses.report import pose_report
+from hsi_sc_nerf.poses.report import check_poses, pose_report
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 from hsi_sc_nerf.simulate.frames import Simulation
 

@@ -99,9 +99,9 @@ def test_session_to_dataset(tmp_path, specim):
 def test_a_session_of_finished_reflectance(tmp_path):
     session = tmp_path / "session"
     for number, angle in enumerate(ANGLES_DEG, start=1):
-        finished = frame_reflectance(angle).astype(np.float32)
+        finished = np.rot90(frame_reflectance(angle)).astype(np.float32)
         write_cube(session / f"REFLECTANCE_ball_{number}.hdr", finished, wavelengths_nm=WAVELENGTHS_NM)
-    (session / "session.json").write_text(json.dumps(INFO))
+    (session / "session.json").write_text(json.dumps({**INFO, "image_rotation_deg": 90}))
     output = run(session, tmp_path / "data")
     dataset = open_packed(output)
     assert dataset.uncertainty is None

@@ -1,4 +1,6 @@
-"""Whether the chamber behind the turntable stands still: what a picture of it tells more than its median spectrum.
+"""The chamber behind the turntable: its median spectrum, and whether it stands still.
+
+It stands still where a picture of it tells more than that spectrum.
 
 What of an image the turntable covers, its disc and the container, turns with the object.
 """
@@ -6,14 +8,17 @@ What of an image the turntable covers, its disc and the container, turns with th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of, through_lens
 
 MAX_FRAMES = 16
@@ -28,6 +33,7 @@ FEWEST_PIXELS = 16
 TRIMMED = 0.02
 """Fraction of the pixels that is left out: those unlike the chamber's spectrum, such as a stem on the axis that the
 masks miss."""
+_BORDER_FRACTION = 1 / 32
 
 
 def background_pixels(
@@ -108,3 +114,37 @@ def _rims(radius_m: float, low_m: float, high_m: float) -> Float[np.ndarray, "po
     angle = 2.0 * np.pi * np.arange(64) / 64
     circle = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.insert(circle, 2, height, axis=1) for height in (low_m, high_m)])
+
+
+def background_spectrum(
+    frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]
+) -> Float[np.ndarray, "bands"]:
+    """Median over frames of `border_spectrum`; 0 in a band that no frame measured there."""
+    spectra = np.stack([border_spectrum(frame.cube_path, mask) for frame, mask in zip(frames, masks, strict=True)])
+    measured = np.isfinite(spectra).any(axis=0)
+    background = np.zeros(spectra.shape[1])
+    background[measured] = np.nanmedian(spectra[:, measured], axis=0)
+    return background
+
+
+def border_spectrum(cube_path: Path, mask: Bool[np.ndarray, "lines samples"]) -> Float[np.ndarray, "bands"]:
+    """Median of what is measured on the image's border outside of the mask; nan in a band without any value."""
+    lines, samples = mask.shape
+    width = max(1, round(_BORDER_FRACTION * min(lines, samples)))
+    border = ~mask
+    border[width : lines - width, width : samples - width] = False
+    counts = open_cube(cube_path).memmap()[border]
+    # Flagged values are the largest number.
+    return median_of_smallest(counts, (counts != FLAGGED).sum(axis=0)) / REFLECTANCE_SCALE
+
+
+def median_of_smallest(
+    values: Num[np.ndarray, "n *shape"], number: Int[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape"]:
+    """Median along the first axis of the ``number`` smallest values; nan where the number is 0."""
+    if len(values) == 0:
+        return np.full(values.shape[1:], np.nan)
+    ordered = np.sort(values, axis=0)
+    middle = [np.take_along_axis(ordered, np.maximum(number - odd, 0)[None] // 2, axis=0)[0] for odd in (0, 1)]
+    # An even number has two middle values; of an odd number both are the same.
+    return np.where(number > 0, 0.5 * (middle[0].astype(np.float64) + middle[1]), np.nan)
