@@ -184,7 +184,7 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
         images = case.alter(images)
     info = known_info(simulation)
     started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, info, "markers", progress=False)
+    poses = find_poses(images, simulation.captures, info, "markers")
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))

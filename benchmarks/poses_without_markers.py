@@ -223,7 +223,7 @@ def _cells(
 ) -> tuple[str, ...]:
     try:
         if from_features is None:
-            poses = find_poses(session.images, session.names, info, "markers", progress=False)
+            poses = find_poses(session.images, session.names, info, "markers")
         else:
             poses = find_poses(
                 session.images, session.names, info, "colmap", camera=camera, from_features=from_features

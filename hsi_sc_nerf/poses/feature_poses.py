@@ -126,7 +126,7 @@ def _posed(
     dictionary = info.marker_dictionary or find_dictionary(images)
     markers, per_frame = None, (0,) * n
     if dictionary is not None:
-        markers, _, _ = usable(observe(images, dictionary, progress=False).observations)
+        markers, _, _ = usable(observe(images, dictionary).observations)
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
     adjusted, markers = adjust_together(found, markers, parameters)

@@ -30,8 +30,6 @@ def poses_from_markers(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     names: Sequence[str],
     info: SessionInfo,
-    *,
-    progress: bool = True,
 ) -> TurntablePoses:
     """Poses from markers that turn with the object before a camera that stands still.
 
@@ -45,7 +43,6 @@ def poses_from_markers(
         names: the frames' names, for messages and the report.
         info: the dictionary, found if it is not given; the markers' side or the container's size, which give the
             scale; the nominal step and the direction, which are only compared with the result.
-        progress: show progress bars.
 
     Raises:
         InputError: no markers, too few frames with linked markers to fix an axis, or nothing that gives the scale.
@@ -59,7 +56,7 @@ def poses_from_markers(
     check_frames(images, names)
     _check_scale(info)
     dictionary = info.marker_dictionary or find_dictionary(images)
-    observed = observe(images, dictionary, progress) if dictionary else None
+    observed = observe(images, dictionary) if dictionary else None
     if dictionary is None or observed is None or len(observed.observations) == 0:
         raise InputError(
             f"no marker was found in any of the {len(images)} frames {names[0]} ... {names[-1]}; check that the "

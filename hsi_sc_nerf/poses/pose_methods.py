@@ -31,7 +31,6 @@ def find_poses(
     method: PoseMethod = "auto",
     *,
     camera: KnownCamera | None = None,
-    progress: bool = True,
     from_markers: Callable[..., TurntablePoses] = poses_from_markers,
     from_features: Callable[..., TurntablePoses] = poses_from_features,
 ) -> TurntablePoses:
@@ -44,7 +43,6 @@ def find_poses(
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
-        progress: show progress bars.
         from_markers: the function behind the method.
         from_features: likewise.
 
@@ -59,7 +57,7 @@ def find_poses(
 
     def by(method: str) -> TurntablePoses:
         if method == "markers":
-            return from_markers(images, names, info, progress=progress)
+            return from_markers(images, names, info)
         if method == "colmap":
             return _checked(from_features(images, names, info, camera=camera))
         if camera is None:

@@ -66,14 +66,8 @@ def pose_frames(
         paths = [FramePaths.of(output_dir, name) for name in names]
         pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm)
     try:
-        poses = find_poses(
-            pictures or images,
-            names,
-            info=info,
-            method=method,
-            camera=camera,
-            progress=not console.quiet,
-        )
+        with console.status("finding poses"):
+            poses = find_poses(pictures or images, names, info=info, method=method, camera=camera)
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
     findings = check_poses(poses, info)

@@ -37,7 +37,7 @@ def pose_errors(found, truth):
 @lru_cache(maxsize=8)
 def estimated(**options):
     scene = MarkerScene(**options)
-    return scene, poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
+    return scene, poses_from_markers(scene.render(), scene.names(), INFO)
 
 
 @pytest.mark.slow
@@ -138,20 +138,19 @@ def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
 def test_frames_without_markers_are_refused_with_names_and_advice():
     noise = list(np.random.default_rng(0).integers(0, 255, (4, 64, 64)).astype(np.uint8))
     with pytest.raises(InputError, match=r"first \.\.\. last.*dictionary"):
-        poses_from_markers(noise, ["first", "b", "c", "last"], INFO, progress=False)
+        poses_from_markers(noise, ["first", "b", "c", "last"], INFO)
     scene = MarkerScene(frames=18)
     with pytest.raises(InputError, match="DICT_4X4_50"):
         poses_from_markers(
             scene.render()[:3],
             scene.names()[:3],
             SessionInfo(marker_dictionary="DICT_4X4_50", marker_side_m=SIDE_M),
-            progress=False,
         )
 
 
 def test_a_single_frame_is_refused():
     with pytest.raises(InputError, match="3 or more frames"):
-        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO, progress=False)
+        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO)
 
 
 @pytest.mark.slow
@@ -159,4 +158,4 @@ def test_a_camera_before_a_still_table_is_refused():
     scene = MarkerScene(frames=18, noise=0.01)
     still = [scene.render()[0]] * 4
     with pytest.raises(InputError, match="share"):
-        poses_from_markers(still, list("abcd"), INFO, progress=False)
+        poses_from_markers(still, list("abcd"), INFO)

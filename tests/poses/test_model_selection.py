@@ -191,7 +191,7 @@ def test_one_displaced_marker_is_no_displaced_frame():
 def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(frames, which):
     scene = MarkerScene(size_px=128, frames=frames, displaced=which)
     names = scene.names()
-    poses = poses_from_markers(scene.render(), names, SessionInfo(marker_side_m=SIDE_M), progress=False)
+    poses = poses_from_markers(scene.render(), names, SessionInfo(marker_side_m=SIDE_M))
     assert poses.model == "turntable"
     assert set(poses.dropped) == {names[i] for i in which}
     assert all(DISPLACED in why for why in poses.dropped.values())
@@ -331,13 +331,13 @@ def test_the_container_alone_gives_the_scale_and_a_wrong_one_is_noticed():
     info = SessionInfo(
         marker_dictionary=scene.markers.dictionary, container_diameter_m=wall_m, container_height_m=0.07
     )
-    poses = poses_from_markers(images, simulation.captures, info, progress=False)
+    poses = poses_from_markers(images, simulation.captures, info)
     assert poses.scale.source == "container"
     assert poses.scale.marker_side_m == pytest.approx(scene.markers.side_m, rel=5e-3)
     away_m = np.linalg.norm(poses.camera_to_world[:, :3, 3] - simulation.camera_to_world[:, :3, 3], axis=-1)
     assert away_m.max() < 4e-3
     info = replace(info, marker_side_m=1.05 * scene.markers.side_m)
-    wrong = poses_from_markers(images, simulation.captures, info, progress=False)
+    wrong = poses_from_markers(images, simulation.captures, info)
     assert wrong.scale.disagreement_percent == pytest.approx(5.0, abs=0.5)
     (finding,) = [f for f in check_poses(wrong, info) if f.name == "poses-scale"]
     assert finding.level == "red"
@@ -347,4 +347,4 @@ def test_the_container_alone_gives_the_scale_and_a_wrong_one_is_noticed():
 def test_without_any_length_the_session_is_refused():
     images = [np.zeros((16, 16), np.uint8)] * 3
     with pytest.raises(InputError, match="marker_side_m"):
-        poses_from_markers(images, list("abc"), SessionInfo(), progress=False)
+        poses_from_markers(images, list("abc"), SessionInfo())

@@ -57,7 +57,7 @@ def largest_errors(poses, truth):
 @pytest.mark.parametrize(("method", "largest_deg", "largest_m"), [("auto", 0.1, 0.5e-3), ("colmap", 0.2, 1e-3)])
 def test_markers_give_the_poses_and_help_features(pear, from_features, method, largest_deg, largest_m):
     images, names, truth, intrinsics = pear
-    poses = find_poses(images, names, pear_info(), method, progress=False, from_features=from_features)
+    poses = find_poses(images, names, pear_info(), method, from_features=from_features)
     assert poses.method == {"auto": "markers"}.get(method, method)
     assert poses.metric
     assert poses.used.all()
@@ -80,7 +80,7 @@ def test_without_markers_and_a_known_distance_there_is_no_scale(pear, from_featu
         camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])),
     )
     unknown = replace(by_hand, camera_distance_m=None)
-    options = {"method": "angles", "progress": False, "from_features": from_features}
+    options = {"method": "angles", "from_features": from_features}
     metric, free = (find_poses(images, names, info, **options) for info in (by_hand, unknown))
     assert metric.method == "angles"
     np.testing.assert_allclose(metric.angles_deg, np.arange(FRAMES) * 360.0 / FRAMES, atol=1e-6)
@@ -120,7 +120,7 @@ def test_auto_says_why_not():
 def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
     camera = replace(CAMERA, direction=before)
     info = SessionInfo(frame_angles_deg=(10.0, 20.0, 35.0, 90.0), direction=told)
-    poses = find_poses(BLANK, list("abcd"), info, "angles", camera=camera, progress=False)
+    poses = find_poses(BLANK, list("abcd"), info, "angles", camera=camera)
     np.testing.assert_allclose(poses.angles_deg, sign * np.array([0.0, 10.0, 25.0, 80.0]))
     for pose, angle in zip(poses.camera_to_world, poses.angles_deg, strict=True):
         np.testing.assert_allclose(pose, rotation_about_z(-angle) @ CAMERA.camera_to_world, atol=1e-12)
@@ -141,11 +141,11 @@ def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
 def test_angles_that_do_not_do_with_a_camera_are_refused(info, direction, side_px, message):
     images, camera = [image[:side_px] for image in BLANK], replace(CAMERA, direction=direction)
     with pytest.raises(InputError, match=message):
-        find_poses(images, list("abcd"), info, "angles", camera=camera, progress=False)
+        find_poses(images, list("abcd"), info, "angles", camera=camera)
 
 
 def test_a_camera_that_no_one_has_is_not_believed():
-    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
+    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA)
     for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
         found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
         options = {"method": "colmap", "from_features": lambda *_, found=found, **__: found}
@@ -157,7 +157,7 @@ def test_a_camera_that_no_one_has_is_not_believed():
 
 
 def test_the_figures_in_words():
-    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA, progress=False)
+    poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA)
     words = ", ".join(describe_poses(poses, pose_report(poses, STEPS)))
     assert words.startswith("4 of 4 frames, one axis, axis leans ")
     assert words.endswith("scale as given")

@@ -199,7 +199,7 @@ def test_the_best_picture_is_sharp_quiet_and_well_exposed(pear, tmp_path, kinds,
     for frame in frames:
         assert frame.ranking[0] in best
         assert all(frame.scores[name] < 0.75 * frame.scores[frame.ranking[0]] for name in worse)
-    found = observe(SessionPictures(frames), DICTIONARY, progress=False).observations
+    found = observe(SessionPictures(frames), DICTIONARY).observations
     assert len(found) >= 15
     true = np.array([truth[i][m] for i, m in zip(found.frame, found.marker, strict=True)])
     assert np.sqrt(np.mean((found.corners_px - true) ** 2)) < 0.1
@@ -229,7 +229,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     for image in glare:
         image[:, 56:] = 100
     alone, whole, joined = (
-        observe(SessionPictures.of(shown), DICTIONARY, progress=False).observations
+        observe(SessionPictures.of(shown), DICTIONARY).observations
         for shown in (glare, images, two_pictures(glare, images))
     )
     assert len(alone) < len(whole) == len(joined)
@@ -244,7 +244,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     first, again = np.array(taken).T
     np.testing.assert_allclose(joined.corners_px[again], alone.corners_px[first], atol=0.05)
     np.testing.assert_array_equal(
-        observe(two_pictures(blank, images), DICTIONARY, progress=False).observations.corners_px, whole.corners_px
+        observe(two_pictures(blank, images), DICTIONARY).observations.corners_px, whole.corners_px
     )
 
 
@@ -265,9 +265,7 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
             x, y = np.rint(project(scene.corners_m[marker], pose, scene.intrinsics)[0].mean(axis=0)).astype(int)
             image[max(0, y - 3) : y + 3, max(0, x - 3) : x + 3] = 255
     info = SessionInfo(marker_dictionary=DICTIONARY, marker_side_m=scene.marker_side_m)
-    alone, joined = (
-        poses_from_markers(shown, scene.names(), info, progress=False) for shown in (spot, two_pictures(spot, images))
-    )
+    alone, joined = (poses_from_markers(shown, scene.names(), info) for shown in (spot, two_pictures(spot, images)))
     more = np.subtract(joined.markers_per_frame, alone.markers_per_frame)
     assert more[:2].min() > 0
     assert not more[2:].any()
@@ -275,10 +273,7 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     # Where the best picture is exposed well something hides the marker: the others are not asked.
     hidden = two_pictures([np.where(image == 255, 128, image).astype(np.uint8) for image in spot], images)
     ill_exposed = [replace(frame, flagged=image == 255) for frame, image in zip(hidden.frames, spot, strict=True)]
-    well, ill = (
-        poses_from_markers(shown, scene.names(), info, progress=False)
-        for shown in (hidden, SessionPictures(ill_exposed))
-    )
+    well, ill = (poses_from_markers(shown, scene.names(), info) for shown in (hidden, SessionPictures(ill_exposed)))
     more = np.subtract(ill.markers_per_frame, well.markers_per_frame)
     assert more[:2].min() > 0
     assert not more[2:].any()
