@@ -1,4 +1,8 @@
-"""What a check of a session found: a level, one sentence, and the figures behind it."""
+"""What was found of a session.
+
+A finding of a check has a level, one sentence, and the figures behind it. An effect that a session calls for, or not,
+is decided by its evidence (docs/validation/effects.md).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,11 @@ from hsi_sc_nerf.errors import InputError
 
 Level = Literal["green", "amber", "red"]
 """green: as it should be; amber: usable, and worth a look; red: results would be wrong."""
+
+CERTAIN = 3.0
+"""Multiple of the noise that the evidence of an effect has to exceed."""
+EFFECT_COLUMNS = ("effect", "found", "evidence", "noise", "threshold", "unit")
+"""Columns of a table; a sentence may follow."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +86,43 @@ def judged(name: str, value: float, limits: tuple[float, float], sentence: str, 
     good, usable = limits
     level: Level = "green" if value <= good else "amber" if value <= usable else "red"
     return Finding(name, level, f"{sentence}{'' if level == 'green' else f'; {advice}'}.", {"value": float(value)})
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: how strong it is in a session, and whether it is to be simulated.
+
+    Attributes:
+        name: as in `hsi-sc-nerf simulate`, where both have the effect.
+        present: the decision.
+        evidence: how strong the effect is; None where it could not be measured.
+        noise: standard deviation of what is found where the effect is absent, in the same unit; None if unknown.
+        threshold: the effect is present where the evidence exceeds it; None where something else decided.
+        unit: of these three.
+        sentence: what is so, and what follows from it.
+    """
+
+    name: str
+    present: bool
+    evidence: float | None
+    noise: float | None
+    threshold: float | None
+    unit: str
+    sentence: str
+
+
+def effect_rows(effects: Sequence[Effect]) -> list[list[str]]:
+    """Rows of a table under `EFFECT_COLUMNS`."""
+
+    def text(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2g}" if abs(value) >= 1e-4 else "0"
+
+    return [
+        [
+            effect.name,
+            "yes" if effect.present else "no",
+            *(text(value) for value in (effect.evidence, effect.noise, effect.threshold)),
+            effect.unit,
+        ]
+        for effect in effects
+    ]

@@ -14,9 +14,9 @@ from rich.console import Console
 
 from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
 from hsi_sc_nerf.packed.cube import PixelFlag
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.packed.effects import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
 from hsi_sc_nerf.plotting import new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses

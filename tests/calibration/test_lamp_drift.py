@@ -192,15 +192,6 @@ def test_static_pixels_are_found_and_their_sum_is_the_drift():
     np.testing.assert_array_equal(drift.standard_error[0], 0.0)
 
 
-def test_order_in_the_file_does_not_matter():
-    counts = drawn()
-    expected = measure(counts)
-    for axes in ((0, 1, 3, 2), (0, 3, 1, 2)):
-        back = np.argsort(axes)
-        lying = np.ascontiguousarray(counts.transpose(axes)).transpose(back)
-        np.testing.assert_allclose(measure(lying).factor, expected.factor, rtol=1e-6)
-
-
 def test_dark_of_each_frame():
     level = np.random.default_rng(3).uniform(0.0, 300.0, (FRAMES, SAMPLES, BANDS)).round()
     counts = (drawn() + level[:, None] - 100.0).astype(np.uint16)

@@ -83,15 +83,6 @@ def test_scores_from_a_few_bands_are_those_of_all(many_bands, tmp_path):
     assert frame.ranking[0] == "near infrared"
 
 
-def test_pictures_are_the_means_of_all_their_bands(many_bands, tmp_path):
-    cube, wavelengths_nm = many_bands
-    frame = pictures_of(cube, wavelengths_nm, tmp_path)
-    red = bands(wavelengths_nm, *BAND_GROUPS_NM["red"])
-    np.testing.assert_allclose(frame.picture("red"), 255.0 * cube[..., red].mean(-1), atol=0.51)
-    assert frame.picture("red") is frame.picture("red")
-    assert set(frame.ranking) == {GRAY, *BAND_GROUPS_NM}
-
-
 def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anyway(many_bands, tmp_path):
     cube, wavelengths_nm = many_bands
     cube = cube.copy()

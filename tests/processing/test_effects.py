@@ -11,8 +11,8 @@ import pytest
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.cli.sessions import InspectCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import effect_rows
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
-from hsi_sc_nerf.packed.effects import effect_rows
 from hsi_sc_nerf.poses.result import Uncertainty
 from hsi_sc_nerf.processing.effects import (
     LEAST_POSE_ERROR_PX,
