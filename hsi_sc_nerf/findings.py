@@ -37,10 +37,6 @@ class Finding:
     sentence: str
     values: Mapping[str, object] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, object]:
-        """The finding as an entry of a JSON file."""
-        return {"name": self.name, "level": self.level, "sentence": self.sentence, "values": dict(self.values)}
-
 
 def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> None:
     """Stop at findings that would spoil the results.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -78,6 +79,8 @@ def read_session_info(path: Path) -> SessionInfo:
             expected = "a positive number"
         elif key == "image_rotation_deg" and value not in (0, 90, 180, 270):
             expected = "0, 90, 180 or 270 degrees"
+        elif key == "marker_dictionary" and not (value.startswith("DICT_") and hasattr(cv2.aruco, value)):
+            expected = "OpenCV's name of a dictionary, such as DICT_5X5_50"
         elif value == "":
             expected = "a text"
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -55,7 +55,7 @@ class Inspection:
         """Content of ``inspection.json``."""
         return {
             "session": str(self.session.path),
-            "findings": [finding.as_json() for finding in self.findings],
+            "findings": [asdict(finding) for finding in self.findings],
             "session_json": self.session_json,
         }
 
@@ -77,8 +77,7 @@ def inspect_session(
         skip_damaged: whether the user has chosen to do without damaged captures.
 
     Raises:
-        InputError: the session does not have that source of white, a cube cannot be read, or ``session.json`` names
-            an unknown marker dictionary.
+        InputError: the session does not have that source of white, or a cube cannot be read.
 
     Example:
         >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Num, UInt8
+from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.calibration.detector import (
     SOME_LINES,
@@ -122,8 +123,8 @@ def reflectance_noise(session: Session) -> float:
     """
     first, second = (light_of_some_lines(frame.cube, frame.dark) for frame in session.frames[:2])
     change = (second - first) / white_level(session)
-    away = np.abs(change - np.median(change, axis=(0, 1)))
-    return float(np.median(1.4826 * np.median(away, axis=(0, 1))) / np.sqrt(2.0))
+    deviation = median_abs_deviation(change.reshape(-1, change.shape[-1]), scale="normal")
+    return float(np.median(deviation) / np.sqrt(2.0))
 
 
 def saturation_level(session: Session, looks: Sequence[Look]) -> float | None:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
-from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
+from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.model_selection import usable
@@ -83,11 +82,7 @@ class Markers:
 def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
     """Look for markers in all frames, of the stated dictionary or of the one that fits best."""
     grays = [look.gray for look in looks]
-    dictionary = session.info.marker_dictionary
-    if dictionary is None:
-        dictionary = find_dictionary(grays)
-    else:
-        check_dictionary(dictionary, session.info_path)
+    dictionary = session.info.marker_dictionary or find_dictionary(grays)
     detections: list[Detections] = [{} for _ in grays]
     if dictionary is not None:
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -113,18 +108,6 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
         float(np.median(sides)) if sides else float("nan"),
         float(np.median(errors)) if errors else float("nan"),
     )
-
-
-def check_dictionary(name: str, stated_in: Path) -> None:
-    """Refuse a marker dictionary that OpenCV does not have.
-
-    Raises:
-        InputError: it has none of that name.
-    """
-    try:
-        dictionary_by_name(name)
-    except InputError as error:
-        raise InputError(f"{stated_in}: {error}.") from error
 
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:

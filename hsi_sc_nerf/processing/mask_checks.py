@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
+from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
 
@@ -153,7 +154,7 @@ def _hull(
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
     contradiction = _contradiction(masks, silhouettes)
     typical = float(np.median(contradiction[filled]))
-    scatter = 1.4826 * float(np.median(np.abs(contradiction[filled] - typical)))
+    scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
     pixel = outline.sum() / masks.sum()
     if typical > MAX_CONTRADICTION + 0.25 * pixel:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
@@ -114,8 +115,7 @@ def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: flo
     low = np.concatenate([score[score <= threshold] for score in scores])
     if len(low) == 0:
         return 0.0
-    median = np.median(low)
-    return float(median + 6.0 * 1.4826 * np.median(np.abs(low - median)))
+    return float(np.median(low) + 6.0 * median_abs_deviation(low, scale="normal"))
 
 
 def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:

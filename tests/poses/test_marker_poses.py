@@ -5,12 +5,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from exact_turntable import SIDE_M, marker_observations, marker_turntable
+from exact_turntable import SIDE_M, marker_observations, marker_turntable, pose_errors
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
@@ -26,12 +25,6 @@ def solve(scene, observations):
     centre = (scene.size_px / 2, scene.size_px / 2)
     start = initialise(observations, centre, scene.size_px, SIDE_M)
     return Problem(start, MarkerResiduals(start, observations, 3.0)).minimise(start)
-
-
-def pose_errors(found, truth):
-    """Largest rotation error in degrees and largest error of the camera's place in millimetres."""
-    rotation = max(rotation_angle_deg(a, b) for a, b in zip(found, truth, strict=True))
-    return rotation, 1e3 * np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=-1).max()
 
 
 @lru_cache(maxsize=8)
