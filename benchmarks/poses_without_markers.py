@@ -42,8 +42,7 @@ from rich.progress import track
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import poses_from_features
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses

@@ -22,7 +22,7 @@ from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.known_camera import known_angles_deg
+from hsi_sc_nerf.poses.feature_poses import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
 INSPECTION_NAME = "inspection.json"

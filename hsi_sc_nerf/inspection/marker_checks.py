@@ -146,7 +146,9 @@ def _turn(session: Session, markers: Markers) -> Finding:
     step = markers.usual_step_deg
     names = [frame.name for frame in session.frames]
     if step is None or abs(step) < 0.1:
-        return Finding("turn", "amber", "The table's turn is not known before the poses: no marker lies on the disc.")
+        return Finding(
+            "turn", "amber", "The table's turn is not known before the poses: too few frames share markers."
+        )
     direction = "ccw" if step > 0.0 else "cw"
     ordered = np.sort(markers.angles_deg[known] % 360.0)
     gaps = np.diff(np.append(ordered, ordered[0] + 360.0))

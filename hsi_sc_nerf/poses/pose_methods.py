@@ -11,8 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.feature_poses import Images, poses_from_features
-from hsi_sc_nerf.poses.known_camera import KnownCamera, poses_from_known_camera
+from hsi_sc_nerf.poses.feature_poses import Images, KnownCamera, poses_from_features, poses_from_known_camera
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.result import TurntablePoses
 

@@ -18,7 +18,7 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding, refuse_red
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.report import check_poses, describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses

@@ -10,8 +10,7 @@ from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.feature_poses import check_camera, prior_of_angles
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, check_camera, prior_of_angles
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
 
 

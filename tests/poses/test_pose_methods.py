@@ -10,8 +10,7 @@ from exact_turntable import pose_errors
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import poses_from_features
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale

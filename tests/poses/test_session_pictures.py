@@ -25,7 +25,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
