@@ -276,7 +276,7 @@ def _peak_mb() -> float:
 def kinds(folder: Path) -> list[Kind]:
     """Valid files of every kind under ``folder``, and how each is read."""
     from hsi_sc_nerf.analysis.library import read_library
-    from hsi_sc_nerf.calibration.panel import read_panel
+    from hsi_sc_nerf.calibration.white_source import read_panel
     from hsi_sc_nerf.capture.envi import CubeLines, open_cube
     from hsi_sc_nerf.capture.instrument import read_metadata
     from hsi_sc_nerf.capture.session import open_session

@@ -28,10 +28,10 @@ from hsi_sc_nerf.benchmark.configurations import own_configuration
 from hsi_sc_nerf.benchmark.run import HeldOutViews
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.findings import Effect
 from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.packed.effects import Effect
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.process import process_session

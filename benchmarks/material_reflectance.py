@@ -41,7 +41,7 @@ from hsi_sc_nerf.light.observe import LARGEST_INCIDENCE_DEG, observe
 from hsi_sc_nerf.light.of_run import light_of_run
 from hsi_sc_nerf.light.views import Views
 from hsi_sc_nerf.models.trained_run import open_run
-from hsi_sc_nerf.processing.scene_box import DISC_OVER_MARKERS
+from hsi_sc_nerf.processing.voted_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import Truth, load_truth

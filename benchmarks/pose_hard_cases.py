@@ -23,8 +23,8 @@ from results_table import RESULTS, write_results
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
-from hsi_sc_nerf.poses.pose_checks import check_poses
 from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import Scene, load_scene, override
@@ -184,7 +184,7 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
         images = case.alter(images)
     info = known_info(simulation)
     started = time.perf_counter()
-    poses = find_poses(images, simulation.captures, info, "markers", progress=False)
+    poses = find_poses(images, simulation.captures, info, "markers")
     seconds = time.perf_counter() - started
     found, truth = poses.camera_to_world[poses.used], simulation.camera_to_world[poses.used]
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))

@@ -42,10 +42,9 @@ from rich.progress import track
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import poses_from_features
-from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.pose_checks import check_poses
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
 from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -223,7 +222,7 @@ def _cells(
 ) -> tuple[str, ...]:
     try:
         if from_features is None:
-            poses = find_poses(session.images, session.names, info, "markers", progress=False)
+            poses = find_poses(session.images, session.names, info, "markers")
         else:
             poses = find_poses(
                 session.images, session.names, info, "colmap", camera=camera, from_features=from_features

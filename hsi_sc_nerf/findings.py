@@ -1,8 +1,12 @@
-"""What a check of a session found: a level, one sentence, and the figures behind it."""
+"""What was found of a session.
+
+A finding of a check has a level, one sentence, and the figures behind it. An effect that a session calls for, or not,
+is decided by its evidence (docs/validation/effects.md).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -10,6 +14,11 @@ from hsi_sc_nerf.errors import InputError
 
 Level = Literal["green", "amber", "red"]
 """green: as it should be; amber: usable, and worth a look; red: results would be wrong."""
+
+CERTAIN = 3.0
+"""Multiple of the noise that the evidence of an effect has to exceed."""
+EFFECT_COLUMNS = ("effect", "found", "evidence", "noise", "threshold", "unit")
+"""Columns of a table; a sentence may follow."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +36,6 @@ class Finding:
     level: Level
     sentence: str
     values: Mapping[str, object] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, object]:
-        """The finding as an entry of a JSON file."""
-        return {"name": self.name, "level": self.level, "sentence": self.sentence, "values": dict(self.values)}
 
 
 def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> None:
@@ -53,6 +58,17 @@ def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> N
         raise InputError(f"{sentences} (To go on in spite of this: {accept}.)")
 
 
+def names_in_short(names: Sequence[str], most: int = 6) -> str:
+    """Names in a sentence; of many the first ones and their number."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def leave_out(names: Sequence[str]) -> str:
+    """The options that leave captures out."""
+    return " ".join(f"--exclude {name}" for name in names)
+
+
 def judged(name: str, value: float, limits: tuple[float, float], sentence: str, advice: str) -> Finding:
     """The finding on a value: green up to the first limit, amber up to the second, red above.
 
@@ -66,3 +82,43 @@ def judged(name: str, value: float, limits: tuple[float, float], sentence: str, 
     good, usable = limits
     level: Level = "green" if value <= good else "amber" if value <= usable else "red"
     return Finding(name, level, f"{sentence}{'' if level == 'green' else f'; {advice}'}.", {"value": float(value)})
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: how strong it is in a session, and whether it is to be simulated.
+
+    Attributes:
+        name: as in `hsi-sc-nerf simulate`, where both have the effect.
+        present: the decision.
+        evidence: how strong the effect is; None where it could not be measured.
+        noise: standard deviation of what is found where the effect is absent, in the same unit; None if unknown.
+        threshold: the effect is present where the evidence exceeds it; None where something else decided.
+        unit: of these three.
+        sentence: what is so, and what follows from it.
+    """
+
+    name: str
+    present: bool
+    evidence: float | None
+    noise: float | None
+    threshold: float | None
+    unit: str
+    sentence: str
+
+
+def effect_rows(effects: Sequence[Effect]) -> list[list[str]]:
+    """Rows of a table under `EFFECT_COLUMNS`."""
+
+    def text(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2g}" if abs(value) >= 1e-4 else "0"
+
+    return [
+        [
+            effect.name,
+            "yes" if effect.present else "no",
+            *(text(value) for value in (effect.evidence, effect.noise, effect.threshold)),
+            effect.unit,
+        ]
+        for effect in effects
+    ]

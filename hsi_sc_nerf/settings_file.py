@@ -11,7 +11,7 @@ import types
 from collections.abc import Iterator
 from dataclasses import field
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -86,7 +86,7 @@ def _read_value(expected: Any, value: Any, source: str, key: str) -> Any:
     """Check one value against its declared type; integers are accepted as floats, lists become tuples."""
     if get_origin(expected) is dict:
         return value
-    if get_origin(expected) is types.UnionType:
+    if get_origin(expected) in (Union, types.UnionType):
         expected = _union_member(expected, value, source, key)
     if dataclasses.is_dataclass(expected):
         return read_dataclass(expected, value, source, key + ".")

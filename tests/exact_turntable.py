@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Tracks, Turntable, project, rotations_about_z
 
 SIDE_M, NOISE_PX = 0.03, 0.03
@@ -58,6 +59,21 @@ def point_turntable(turntable, points, seed=0):
     radius = rng.uniform(0.1, 0.16, points)
     points_3d = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1) * turntable.distance
     return replace(turntable, points=np.arange(points), points_3d=points_3d)
+
+
+def points_alone(turntable):
+    """The turntable without markers, in distances of the camera, as features leave it."""
+    return replace(
+        turntable.resized(1.0 / turntable.distance),
+        markers=turntable.markers[:0],
+        marker_poses=turntable.marker_poses[:0],
+    )
+
+
+def pose_errors(found, truth):
+    """Largest rotation error in degrees and largest error of the camera's place in millimetres."""
+    away_m = np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    return rotation_angle_deg(found, truth).max(), 1e3 * away_m.max()
 
 
 def point_tracks(turntable, noise_px=0.0, seed=1):

@@ -1,16 +1,49 @@
-"""Can the calibration be believed? The lamps' drift, clipped and saturated values, and the noise, as findings."""
+"""Can white and calibration be believed? As findings.
+
+A white is flat, brighter than what the frames show in its place, and not one of the frames. Of the calibration the
+lamps' drift, clipped and saturated values, and the noise are judged.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
+from jaxtyping import Bool, Float
 
+from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
+from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
-from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
+from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, white_exposure_ratio, white_source
+from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.morphology import largest_component
 
-FRAMES, LINES = 12, 16
-"""Frames, and lines of each, on which clipped values are counted."""
+ABOVE_WHITE = 1.05
+"""Reflectance above the white's: noise and uneven light alone take a white wall's values just above 1."""
+ABOVE_AMBER, ABOVE_RED = 0.01, 0.05
+"""Fractions of values above the white's, which will be clipped."""
+OUTSHONE, OUTSHONE_FRACTION = 2.0, 0.05
+"""A white is too dark, or coloured, if this fraction of a band's values exceeds it by this factor; highlights cover
+less of the image."""
+ROUGHNESS = 0.1
+"""Largest median difference between neighbouring pixels of a white (relative)."""
+UNEVENNESS = 0.5
+"""Largest range (10th to 90th percentile, relative) along a column of a WHITEREF cube."""
+MOVING = 0.3
+"""Range of a pixel's brightness over the frames (relative) from which something moves in it."""
+MARGIN = 1.1
+"""Factor by which brightness may leave the range that it has in the frames, or exceed it."""
+MIN_MOVING_PX = 50
+"""With fewer moving pixels, all pixels are compared."""
+ALIKE, BRIGHTER = 0.5, 0.2
+"""A capture is one of the frames if at least this fraction of the moving pixels looks like the frames, and less than
+this fraction of its brightest region is brighter than the frames there."""
+WHITE_FRACTION = 0.25
+"""A capture that outshines the others in this fraction of the pixels looks like a white."""
 MAX_ERROR = 0.003
 """Largest standard error of a known drift."""
 LARGE_DRIFT, IMPLAUSIBLE_DRIFT = 0.3, 0.6
@@ -25,17 +58,183 @@ MAX_SCATTER = 0.02
 """Scatter of the still wall from frame to frame that noise and rounding do not explain."""
 
 
-def check_calibration(session: Session, calibration: SessionCalibration) -> list[Finding]:
-    """Check a calibrated session on a few lines of some frames.
+def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+    """Check the white of a session on a few lines of each cube.
+
+    Args:
+        session: its captures.
+        source: where the white is. A target inside the frames is not checked, because its place is a setting.
 
     Returns:
-        The findings ``drift``, ``clipped`` and ``noise``.
+        The findings ``white`` (red if the white is none) and ``white-clipped`` (values above the white's: amber from
+        1 %, red from 5 %).
+
+    Raises:
+        InputError: the session does not have that source of white.
+
+    Example:
+        >>> refuse_red(check_white(open_session(Path("captures"))))
+    """
+    found = white_source(session, "auto" if source == "target" else source, None)
+    if found == "product":
+        return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
+    fault, clipped, values = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
+    white = f"the capture {session.white.name}" if session.white and found == "tarp" else "the white of each capture"
+    if fault is None:
+        of_white = Finding("white", "green", f"White: {white} looks like a white.", values)
+    else:
+        of_white = Finding("white", "red", f"{session.path}: {fault}.", values)
+    level: Level = "red" if clipped > ABOVE_RED else "amber" if clipped > ABOVE_AMBER else "green"
+    told = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
+    if level != "green":
+        told = f"{session.path}: {told} and will be clipped; check that it is a white, in the frames' light"
+    return [of_white, Finding("white-clipped", level, f"{told}.", {"fraction": clipped})]
+
+
+def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]:
+    """What is wrong with the tarp (None for nothing), the fraction of clipped values, and the figures behind it."""
+    tarp, frames = session.white, session.frames
+    assert tarp is not None
+    light = light_of_some_lines(tarp.cube, tarp.dark)
+    image = light.mean(axis=-1)
+    brightest = np.percentile(image, 99.0)
+    region = largest_component(image >= TARP_BRIGHTNESS * brightest)
+    if not brightest > 0.0:
+        return f"the white {tarp.name} is dark; take it again", 0.0, {}
+    white = np.median(light[region], axis=0)
+    live = ~unlit_bands(white[None]) & tarp.cube.good_bands
+    exposures = np.array([exposure_ratio(tarp, frame) for frame in frames])
+    images, clipped, outshone = _compare_with_white(frames, [white[None] / ratio for ratio in exposures], live)
+    differences = np.abs(np.diff(image, axis=1)) / np.maximum(image[:, 1:], 1e-9)
+    roughness = float(np.median(differences[region[:, 1:]])) if region[:, 1:].any() else np.inf
+    brighter, alike, looks_white = 1.0, 0.0, None
+    if images.shape[1:] == image.shape:
+        image = light[..., live].mean(axis=-1)
+        brighter, alike, best = _compare_with_frames(image, region, images * exposures[:, None, None])
+        looks_white = None if best is None else frames[best].name
+    fault = None
+    if brighter < BRIGHTER and alike >= ALIKE:
+        fault = "shows the same as the frames, and nothing in it is brighter than there"
+    elif outshone > OUTSHONE_FRACTION:
+        fault = "is too dark or coloured: the frames are over twice as bright in some bands"
+    elif roughness > ROUGHNESS:
+        fault = f"is not flat: neighbouring pixels differ by {100.0 * roughness:.0f} %"
+    if fault is not None:
+        advice = "no other capture looks like a white, so take one"
+        if looks_white is not None:
+            advice = f"{looks_white} looks most like a white, so name it as 'white_reference' in session.json"
+        fault = f"the white {tarp.name} {fault}; {advice}"
+    return (
+        fault,
+        clipped,
+        {
+            "white": tarp.name,
+            "looks_most_like_a_white": tarp.name if fault is None else looks_white,
+            "area_fraction": float(region.mean()),
+            "roughness": roughness,
+            "brighter_than_frames_fraction": brighter,
+            "like_the_frames_fraction": alike,
+            "outshone_fraction": outshone,
+        },
+    )
+
+
+def _compare_with_frames(
+    image: Float[np.ndarray, "lines samples"],
+    region: Bool[np.ndarray, "lines samples"],
+    frames: Float[np.ndarray, "frames lines samples"],
+) -> tuple[float, float, int | None]:
+    """Compare the white's brightness with that of the frames, pixel by pixel.
+
+    Returns:
+        The fraction of the white's region that is brighter than the frames there; the fraction of the moving pixels
+        that look like the frames; and the frame that looks like a white, if one does.
+    """
+    usual = np.median(np.concatenate([frames, image[None]]), axis=0)
+    outshines = (frames > MARGIN * usual).mean(axis=(1, 2))
+    best = int(outshines.argmax()) if len(frames) > 2 and outshines.max() >= WHITE_FRACTION else None
+    others = frames if best is None else np.delete(frames, best, axis=0)
+    low, high = others.min(axis=0), others.max(axis=0)
+    moving = high - low > MOVING * np.abs(usual)
+    if moving.sum() < MIN_MOVING_PX:
+        moving = np.ones_like(moving)
+    inside = (image >= low / MARGIN) & (image <= high * MARGIN)
+    return float((image > MARGIN * high)[region].mean()), float(inside[moving].mean()), best
+
+
+def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, object]]:
+    """As `_check_tarp`, for WHITEREF cubes."""
+    whites, uneven, good_bands = [], {}, np.ones(len(session.wavelengths_nm), bool)
+    for frame in session.frames:
+        assert frame.white is not None
+        light = light_of_some_lines(frame.white, frame.white_dark)
+        columns = np.median(light, axis=0)
+        if len(columns) != frame.cube.shape[1]:
+            columns = np.median(columns, axis=0, keepdims=True)
+        whites.append(columns / white_exposure_ratio(session, "capture", frame))
+        low, middle, high = np.percentile(light.mean(axis=-1), [10.0, 50.0, 90.0], axis=0)
+        uneven[frame.name] = float(np.median((high - low) / np.maximum(middle, 1e-9)))
+        good_bands &= frame.cube.good_bands
+    lit = ~unlit_bands(np.stack([np.median(white, axis=0) for white in whites]))
+    _, clipped, outshone = _compare_with_white(session.frames, whites, lit & good_bands)
+    fault, not_flat = None, [name for name, unevenness in uneven.items() if unevenness > UNEVENNESS]
+    if not_flat:
+        fault = f"the WHITEREF of {', '.join(not_flat)} is not flat; take a white that fills the image"
+    elif outshone > OUTSHONE_FRACTION:
+        fault = "the WHITEREF cubes are too dark or coloured: the frames are over twice as bright in some bands"
+    return fault, clipped, {"unevenness": max(uneven.values()), "outshone_fraction": outshone}
+
+
+def _compare_with_white(
+    frames: Sequence[Capture], whites: Sequence[Float[np.ndarray, "columns bands"]], live: Bool[np.ndarray, "bands"]
+) -> tuple[Float[np.ndarray, "frames lines samples"], float, float]:
+    """Brightness of the frames' lines; fraction of values above the white's; and largest fraction far above it.
+
+    The whites are at the frames' exposures, the last fraction is that of the worst of the live bands.
+    """
+    images, clipped, outshone = [], [], []
+    for frame, white in zip(frames, whites, strict=True):
+        light = light_of_some_lines(frame.cube, frame.dark)[..., live]
+        images.append(light.mean(axis=-1))
+        clipped.append((light > ABOVE_WHITE * white[..., live]).mean())
+        outshone.append((light > OUTSHONE * white[..., live]).mean(axis=(0, 1)))
+    return np.stack(images), float(np.mean(clipped)), float(np.mean(outshone, axis=0).max())
+
+
+def check_calibration(session: Session, calibration: SessionCalibration) -> list[Finding]:
+    """The findings ``drift`` and ``noise`` of a calibrated session.
 
     Example:
         >>> session = open_session(Path("captures"))
         >>> refuse_red(check_calibration(session, calibrate_session(session, CalibrationConfig())))
     """
-    return [check(session, calibration) for check in (_check_drift, _check_clipped, _check_noise)]
+    return [_check_drift(session, calibration), _check_noise(session, calibration)]
+
+
+def check_clipped(session: Session, calibration: SessionCalibration, counts: PixelCounts, pixels: int) -> Finding:
+    """The finding ``clipped``, by the values of all frames that were clipped at the upper bound or are saturated.
+
+    Args:
+        session: its bands.
+        calibration: of the session.
+        counts: of all frames.
+        pixels: number of pixels of all frames.
+    """
+    by_band = counts.saturated / pixels
+    worst = int(by_band.argmax())
+    worst_nm = float(session.wavelengths_nm[calibration.bands[worst]])
+    clipped = float(counts.clipped_high.mean() / pixels)
+    values = {"clipped": clipped, "saturated": float(by_band[worst]), "saturated_nm": worst_nm}
+    of_a_band = f"at most {100.0 * by_band[worst]:.2g} % of a band ({worst_nm:.0f} nm) are"
+    told = (
+        f"{100.0 * clipped:.2g} % of the values are clipped at the upper bound, and "
+        f"{of_a_band if by_band[worst] else 'none is'} saturated"
+    )
+    if clipped > CLIPPED_RED or by_band[worst] > SATURATED_RED:
+        return Finding("clipped", "red", f"{session.path}: {told}; check the white and the integration time.", values)
+    if clipped > CLIPPED_AMBER or by_band[worst] > SATURATED_AMBER:
+        return Finding("clipped", "amber", f"{session.path}: {told}; a shorter integration time avoids it.", values)
+    return Finding("clipped", "green", f"Values: {told}.", values)
 
 
 def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
@@ -57,39 +256,6 @@ def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
         sentence = f"{told}, but only to {100.0 * error:.1f} %, from {pixels} pixels; show more of the still chamber."
         return Finding("drift", "amber", f"{session.path}: {sentence}", values)
     return Finding("drift", "green", f"Lamps: {told}, known to {100.0 * error:.2f} %.", values)
-
-
-def _check_clipped(session: Session, calibration: SessionCalibration) -> Finding:
-    numbers = np.unique(np.linspace(0, len(calibration.cubes) - 1, FRAMES).round().astype(int))
-    clipped, saturated = [], []
-    for number in numbers:
-        cube, frame = calibration.cubes[number], calibration.frames[number]
-        rows = np.unique(np.linspace(0, cube.shape[0] - 1, LINES + 2).round().astype(int)[1:-1])
-        counts = np.asarray(cube.memmap()[rows])[..., frame.bands]
-        dark, gain = (np.broadcast_to(part, cube.shape[1:])[:, frame.bands] for part in (frame.dark, frame.gain))
-        reflectance = (counts - dark) * gain
-        if frame.flat is not None:
-            reflectance = reflectance / frame.flat[rows][..., None]
-        live = np.ones(counts.shape, bool) if frame.dead is None else ~frame.dead[None, :, frame.bands]
-        if frame.ignore_value is not None:
-            live = live & (counts != frame.ignore_value)
-        at_top = live & (counts >= (np.inf if frame.saturation_counts is None else frame.saturation_counts))
-        clipped.append((live & ~at_top & (reflectance > frame.bounds[1])).mean())
-        saturated.append(at_top.mean(axis=(0, 1)))
-    by_band = np.mean(saturated, axis=0)
-    worst = int(by_band.argmax())
-    worst_nm = float(session.wavelengths_nm[calibration.bands[worst]])
-    values = {"clipped": float(np.mean(clipped)), "saturated": float(by_band[worst]), "saturated_nm": worst_nm}
-    of_a_band = f"at most {100.0 * values['saturated']:.2g} % of a band ({worst_nm:.0f} nm) are"
-    told = (
-        f"{100.0 * values['clipped']:.2g} % of the values are clipped at the upper bound, and "
-        f"{of_a_band if values['saturated'] else 'none is'} saturated"
-    )
-    if values["clipped"] > CLIPPED_RED or values["saturated"] > SATURATED_RED:
-        return Finding("clipped", "red", f"{session.path}: {told}; check the white and the integration time.", values)
-    if values["clipped"] > CLIPPED_AMBER or values["saturated"] > SATURATED_AMBER:
-        return Finding("clipped", "amber", f"{session.path}: {told}; a shorter integration time avoids it.", values)
-    return Finding("clipped", "green", f"Values: {told}.", values)
 
 
 def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:

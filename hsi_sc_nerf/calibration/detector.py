@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
 from scipy import ndimage
+
+from hsi_sc_nerf.capture.envi import Cube
 
 NEIGHBOURS = 11
 """Width of the median window along the line that an element is compared with."""
@@ -33,6 +35,8 @@ MIN_TOP_PAIRS = 20
 """Fewest readings, and fewest pairs of neighbours, that can be a pile at the largest count."""
 SAME_PATTERN = 1.5
 """Variance of the frames' dark patterns, relative to that of noise, up to which they are the same."""
+SOME_LINES = 16
+"""Lines that are read of a cube, and at most of its dark cube, for a look at it."""
 BRIGHT = 0.5
 """Fraction of the largest count above which readings are bright."""
 
@@ -140,10 +144,10 @@ def elements_without_response(
     return fails & ~follows
 
 
-def unlit_bands(light: Float[np.ndarray, "columns bands"], min_light: float = MIN_LIGHT) -> Bool[np.ndarray, "bands"]:
-    """Bands whose median over the columns is below ``min_light`` times that of the brightest; nan counts as 0."""
+def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "bands"]:
+    """Bands whose median over the columns is below ``MIN_LIGHT`` times that of the brightest; nan counts as 0."""
     typical = np.median(np.where(np.isfinite(light), light, 0.0), axis=0)
-    return ~((typical > 0.0) & (typical >= min_light * typical.max()))
+    return ~((typical > 0.0) & (typical >= MIN_LIGHT * typical.max()))
 
 
 def dark_columns(
@@ -188,6 +192,20 @@ def pooled_darks(
     if bands > 1 and np.mean(of_bands * columns / expected) / (1.0 - 1.0 / bands) <= SAME_PATTERN:
         pattern, level = (stacked - offset).mean(axis=0), offset
     return list(level + pattern)
+
+
+def spread_rows(lines: int, most: int) -> Int[np.ndarray, "rows"]:
+    """Numbers of lines that are evenly spread over a cube, without its first and last if it has many."""
+    return np.unique(np.linspace(0, lines - 1, min(most, lines) + 2).round().astype(int)[1:-1])
+
+
+def light_of_some_lines(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "rows samples bands"]:
+    """Counts above dark of ``SOME_LINES`` lines of a cube (`spread_rows`); 0 for no data."""
+    counts = np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])
+    missing = no_data(counts, cube.ignore_value)
+    dark_lines = None if dark is None else dark.memmap()[:SOME_LINES]
+    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:]).astype(np.float32)
+    return light if missing is None else np.where(missing, np.float32(0.0), light)
 
 
 def no_data(counts: Num[np.ndarray, "*shape"], ignore_value: float | None) -> Bool[np.ndarray, "*shape"] | None:

@@ -34,9 +34,9 @@ BINS = 12
 """Bins of bands in which static pixels are searched for."""
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a band in the curve's fit."""
-DEGREE, MIN_BANDS = 5, 3
-"""Largest degree of the polynomial over 1 / wavelength that tells whether there is a drift, and fewest bands: a
-change of output and of colour temperature is linear in it, but lamps may lose more in the blue alone."""
+TESTED_TERMS, MIN_BANDS = 6, 3
+"""The smoothest terms over 1 / wavelength that tell whether there is a drift, and fewest bands: a change of output
+and of colour temperature is linear in it, but lamps may lose more in the blue alone."""
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
@@ -57,7 +57,6 @@ class LampDriftEstimate:
         static: which of the surveyed pixels are static.
         scatter: of their grey levels, sensor noise included (standard deviation, relative).
         p_value: of such a drift under steady lamps (`drift_p_value`).
-        significant: whether ``p_value`` is below ``SIGNIFICANCE``.
     """
 
     factor: Float[np.ndarray, "frames bands"]
@@ -66,7 +65,11 @@ class LampDriftEstimate:
     static: Bool[np.ndarray, "survey samples"]
     scatter: float
     p_value: float
-    significant: bool
+
+    @property
+    def significant(self) -> bool:
+        """Whether ``p_value`` is below ``SIGNIFICANCE``."""
+        return self.p_value < SIGNIFICANCE
 
     @property
     def static_fraction(self) -> float:
@@ -124,13 +127,17 @@ def measure_lamp_drift(
     measured = np.full(total.shape, np.nan)
     measured[:, lit] = total[:, lit] / total[0, lit]
     log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)
-    curve, variance_of_curve = _common_curves(log_light, variance, grey_error, wavelengths_nm, lit)
+    precision = np.zeros(len(wavelengths_nm))
+    precision[lit] = 1.0 / variance
+    basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)
+    coefficients, covariance = _fit_with_grey_error(log_light, variance, basis[lit], grey_error)
+    curve, variance_of_curve = common_courses(coefficients, covariance, basis, roughness)
     factor = np.exp(curve)
     standard_error = factor * np.sqrt(variance_of_curve + SMALLEST_ERROR**2)
     standard_error[0] = 0.0
-    polynomials = smooth_basis(wavelengths_nm, lit, min(DEGREE, int(lit.sum()) - 1))
-    p_value = drift_p_value(*_fit_with_grey_error(log_light, variance, polynomials[lit], grey_error))
-    return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value, p_value < SIGNIFICANCE)
+    few = slice(None, TESTED_TERMS)
+    p_value = drift_p_value(coefficients[:, few], covariance[few, few], basis[lit, few])
+    return LampDriftEstimate(factor, measured, standard_error, image, scatter, p_value)
 
 
 def correction(
@@ -155,21 +162,6 @@ def survey_lines(lines: int, samples: int) -> Int[np.ndarray, "survey"]:
     return np.unique((denser * (lines - 1)).round().astype(int))
 
 
-def smooth_basis(
-    wavelengths_nm: Float[np.ndarray, "bands"], lit: Bool[np.ndarray, "bands"], degree: int
-) -> Float[np.ndarray, "bands terms"]:
-    """Polynomials in 1 / wavelength, orthogonal and of root mean square 1 over the lit bands; the first is constant.
-
-    By Wien's law, the logarithm of a lamp's light, and so of its drift, is linear in 1 / wavelength.
-    """
-    inverse = 1.0 / wavelengths_nm
-    scaled = (inverse - inverse[lit].mean()) / max(float(np.ptp(inverse[lit])), 1e-12)
-    powers = np.vander(scaled, degree + 1, increasing=True)
-    _, triangle = np.linalg.qr(powers[lit])
-    basis = np.linalg.solve(triangle.T, powers.T).T * np.sqrt(lit.sum())
-    return basis * np.sign(basis[np.flatnonzero(lit)[0], 0])
-
-
 def fit_over_wavelength(
     log_light: Float[np.ndarray, "frames lit"],
     variance: Float[np.ndarray, "lit"],
@@ -192,32 +184,16 @@ def fit_over_wavelength(
 def drift_p_value(
     coefficients: Float[np.ndarray, "frames terms"],
     covariance: Float[np.ndarray, "terms terms"],
-    floor: float = FLOOR,
+    basis: Float[np.ndarray, "lit terms"],
 ) -> float:
     """p-value of the frames' deviations under steady lamps, by a chi-square test.
 
-    ``floor`` is the apparent change of steady lamps, root mean square over the bands; it is distributed evenly over
-    the terms, each of which has root mean square 1.
+    ``FLOOR`` is the apparent change of steady lamps; it is distributed evenly over the terms.
     """
     frames, terms = coefficients.shape
-    expected = covariance + floor**2 / terms * np.eye(terms)
+    expected = covariance + np.diag(FLOOR**2 / terms / np.square(basis).mean(axis=0))
     distance = np.einsum("fi,ij,fj->", coefficients, np.linalg.inv(expected), coefficients)
     return float(stats.chi2.sf(distance, (frames - 1) * terms))
-
-
-def _common_curves(
-    log_light: Float[np.ndarray, "frames lit"],
-    variance: Float[np.ndarray, "lit"],
-    grey_error: float,
-    wavelengths_nm: Float[np.ndarray, "bands"],
-    lit: Bool[np.ndarray, "bands"],
-) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
-    """The frames' logarithmic light relative to the first frame's as smooth curves over all bands; their variance."""
-    precision = np.zeros(len(wavelengths_nm))
-    precision[lit] = 1.0 / variance
-    basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)
-    fitted = _fit_with_grey_error(log_light, variance, basis[lit], grey_error)
-    return common_courses(*fitted, basis, roughness)
 
 
 def _fit_with_grey_error(

@@ -47,21 +47,7 @@ def describe_calibration(session: Session, calibration: SessionCalibration) -> l
     }[calibration.source]
     if calibration.defects is not None:
         sentences.append(f"Detector: {calibration.defects.summary()}.")
-    return [*sentences, _describe_drift(calibration)]
-
-
-def describe_pixel_counts(pixel_counts: PixelCounts, values: int) -> str:
-    """One sentence on the fractions of ``values`` that were clipped and flagged."""
-    reasons = {
-        "clipped_low": "clipped at the lower bound",
-        "clipped_high": "clipped at the upper bound",
-        "saturated": "saturated",
-        "dead": "of dead detector elements",
-        "no_data": "without data",
-    }
-    percent = {reason: 100.0 * int(getattr(pixel_counts, name).sum()) / values for name, reason in reasons.items()}
-    parts = [f"{number:.2g} % {reason}" for reason, number in percent.items() if number > 0.0]
-    return f"Values: {', '.join(parts) or 'none clipped or flagged'}."
+    return sentences
 
 
 def write_calibration(
@@ -222,20 +208,6 @@ def draw_uncertainty(
     axes.grid(color="0.9")
     axes.legend()
     save_figure(figure, path)
-
-
-def _describe_drift(calibration: SessionCalibration) -> str:
-    drift = calibration.drift
-    if isinstance(drift, NotMeasurable):
-        return f"Lamps: their drift was not measured, {drift.reason}."
-    change = 100.0 * (drift.factor[:, calibration.bands] - 1.0)
-    largest = change.flat[np.abs(change).argmax()]
-    if calibration.drift_corrected:
-        return f"Lamps: they drifted by up to {largest:+.2f} %; corrected."
-    why = "as the settings say" if drift.significant else "within its uncertainty"
-    if calibration.source != "tarp" and drift.significant:
-        why = "because every frame has a white of its own"
-    return f"Lamps: a drift of up to {largest:+.2f} % is not corrected, {why}."
 
 
 def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:

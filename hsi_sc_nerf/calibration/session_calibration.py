@@ -19,6 +19,7 @@ from hsi_sc_nerf.calibration.detector import (
     find_defects,
     no_data,
     pooled_darks,
+    spread_rows,
 )
 from hsi_sc_nerf.calibration.flat_field import flat_field
 from hsi_sc_nerf.calibration.lamp_drift import (
@@ -30,13 +31,13 @@ from hsi_sc_nerf.calibration.lamp_drift import (
     survey_lines,
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
-from hsi_sc_nerf.calibration.panel import read_panel
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.calibration.white_reference import Roi, White, WhiteReference, tarp_roi
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
     measure_whites,
+    read_panel,
     white_cubes,
     white_exposure_ratio,
     white_source,
@@ -258,7 +259,7 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     captures = session.frames
     lines, samples, _ = captures[0].cube.shape
     numbers = np.unique(np.linspace(0, len(captures) - 1, DEFECT_FRAMES).round().astype(int))
-    rows = np.unique(np.linspace(0, lines - 1, DEFECT_LINES + 2).round().astype(int)[1:-1])
+    rows = spread_rows(lines, DEFECT_LINES)
     of_frames = []
     for capture in (captures[number] for number in numbers):
         chosen = np.union1d(rows, _brightest_lines(capture.cube))

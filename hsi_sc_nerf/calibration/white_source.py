@@ -1,8 +1,16 @@
-"""Where a session's white is: tarp, WHITEREF cubes, a target in the frames, or none for finished reflectance."""
+"""Where a session's white is, and what it reflects itself.
+
+The white is a tarp, the WHITEREF cubes, a target in the frames, or none for finished reflectance. A certificate gives
+its reflectance.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
 
 from hsi_sc_nerf.calibration.detector import Defects
 from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, white_reference
@@ -11,6 +19,11 @@ from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 
 WhiteSource = Literal["tarp", "capture", "target", "product"]
+LARGEST_FRACTION = 1.5
+"""Reflectances are percent if any is larger than this, and fractions otherwise."""
+SHORTEST_NM = 100.0
+"""No imaging spectrometer measures shorter wavelengths; smaller numbers are no nanometres."""
+_FORMAT = "two columns, wavelength_nm and reflectance"
 
 
 def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: Roi | None) -> WhiteSource:
@@ -82,3 +95,76 @@ def white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture
 
 def _ratio(one_ms: float | None, other_ms: float | None) -> float:
     return 1.0 if one_ms is None or other_ms is None else one_ms / other_ms
+
+
+def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
+    """Reflectance of a panel at the band centres, by linear interpolation.
+
+    Each line of the file has a wavelength in nm and a reflectance, in any order of wavelengths; reflectances are
+    percent if any is above 1.5. The separator is a comma, semicolon or tab; with the latter two, decimal commas are
+    read. A header line, empty lines and lines that begin with # are skipped. The panel may end one band short of the
+    bands; its outermost value is used there.
+
+    Raises:
+        InputError: there is no such file, a line is not two numbers, a value is out of range, a wavelength is given
+            twice, or the panel does not cover the bands.
+
+    Example:
+        >>> reflectance = read_panel(Path("panel.csv"), session.wavelengths_nm)  # (bands,), 0 to 1
+    """
+    path = Path(path)
+    panel_nm, reflectance = _read(path)
+    order = np.argsort(panel_nm)
+    panel_nm, reflectance = panel_nm[order], reflectance[order]
+    twice = np.flatnonzero(np.diff(panel_nm) == 0.0)
+    if len(twice):
+        raise InputError(f"{path}: gives {panel_nm[twice[0]]:g} nm twice; keep one of these lines.")
+    bands_nm = np.sort(wavelengths_nm)
+    first_nm, last_nm = bands_nm[:2].max(), bands_nm[-2:].min()
+    if panel_nm[0] > first_nm or panel_nm[-1] < last_nm:
+        raise InputError(
+            f"{path}: gives the panel's reflectance from {panel_nm[0]:g} to {panel_nm[-1]:g} nm, but the bands lie "
+            f"from {bands_nm[0]:g} to {bands_nm[-1]:g} nm; add the lines that are missing."
+        )
+    return np.interp(wavelengths_nm, panel_nm, reflectance)
+
+
+def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "lines"]]:
+    """Wavelengths (nm) and reflectances (fractions) in the order of the file."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise InputError(f"{path}: the panel's reflectance cannot be read ({reason}); check the path.") from error
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    rows = [_numbers(line) for _, line in lines]
+    if rows and rows[0] is None:  # titles of the columns
+        rows, lines = rows[1:], lines[1:]
+    if not rows:
+        raise InputError(f"{path}: holds no reflectance; write {_FORMAT}.")
+    if None in rows:
+        number, line = lines[rows.index(None)]
+        raise InputError(f"{path}: line {number} ({line!r}) is not two numbers; write {_FORMAT}.")
+    panel_nm, reflectance = np.array(rows, dtype=float).T
+    if panel_nm.min() < SHORTEST_NM:
+        raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")
+    fractions = reflectance / 100.0 if reflectance.max() > LARGEST_FRACTION else reflectance
+    if not (fractions.min() > 0.0 and fractions.max() <= LARGEST_FRACTION):
+        wrong = reflectance.argmin() if fractions.min() <= 0.0 else reflectance.argmax()
+        raise InputError(
+            f"{path}: gives a reflectance of {reflectance[wrong]:g} at {panel_nm[wrong]:g} nm, but a white reflects "
+            "more than nothing and at most about 1, or 100 percent; correct it."
+        )
+    return panel_nm, fractions
+
+
+def _numbers(line: str) -> tuple[float, float] | None:
+    """The two finite numbers of a line, or None."""
+    separator = next((mark for mark in ";\t" if mark in line), ",")
+    parts = line.split(separator)
+    try:
+        wavelength, reflectance = (float(part if separator == "," else part.replace(",", ".")) for part in parts)
+    except ValueError:
+        return None
+    return (wavelength, reflectance) if np.isfinite([wavelength, reflectance]).all() else None

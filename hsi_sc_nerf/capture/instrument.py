@@ -233,19 +233,6 @@ def _camera(header: EnviHeader) -> str:
     return _normalised(" ".join(str(header.fields.get(key, "")) for key in ("sensor type", "description")))
 
 
-def dark_of_white(
-    white_mode: str | None, dark: Cube | None, white_dark: Cube | None, same_exposure: bool
-) -> Cube | None:
-    """The dark cube of a capture's white.
-
-    In "simultaneous" mode this is the capture's own dark. Otherwise it is WHITEDARKREF or, without one, the capture's
-    own dark if white and capture have the same integration time (``same_exposure``).
-    """
-    if white_mode == "simultaneous":
-        return dark
-    return white_dark or (dark if same_exposure else None)
-
-
 def _normalised(text: str) -> str:
     """Lower-case letters and digits of a text, so that spellings of a name agree."""
     return re.sub(r"[^a-z0-9]", "", text.lower())

@@ -18,7 +18,6 @@ from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.capture.instrument import (
     CaptureFiles,
     SpecimMetadata,
-    dark_of_white,
     list_captures,
     read_metadata,
     usual_rotation_deg,
@@ -305,9 +304,10 @@ def _capture(files: CaptureFiles, cubes: dict[str, Cube]) -> Capture:
     capture = Capture(files.name, cube, dark, white, product=product, metadata=metadata)
     if white is None:
         return capture
+    if metadata is not None and metadata.white_mode == "simultaneous":
+        return replace(capture, white_dark=dark)
     same_exposure = capture.white_integration_time_ms == capture.integration_time_ms
-    mode = None if metadata is None else metadata.white_mode
-    return replace(capture, white_dark=dark_of_white(mode, dark, cubes.get("white_dark"), same_exposure))
+    return replace(capture, white_dark=cubes.get("white_dark") or (dark if same_exposure else None))
 
 
 def _consistent(frames: list[Capture], tarp: Capture | None, damaged: dict[str, str]) -> list[Capture]:

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.settings_file import read_dataclass
 
 SESSION_INFO_NAME = "session.json"
-_TEXTS = ("object", "marker_dictionary", "white_reference")
 _FILES = ("band_centres", "panel_reflectance")
+_POSITIVE = (
+    *("nominal_step_deg", "marker_side_m", "camera_distance_m"),
+    *("container_diameter_m", "container_height_m"),
+)
 
 
 @dataclass(frozen=True)
@@ -64,20 +68,29 @@ def read_session_info(path: Path) -> SessionInfo:
     """
     if not os.path.lexists(path):
         return SessionInfo()
-    known = [field.name for field in fields(SessionInfo)]
-    content = read_json(path, f"write {{...}} with keys of {', '.join(known)}, or remove it")
+    known = ", ".join(field.name for field in fields(SessionInfo))
+    content = read_json(path, f"write {{...}} with keys of {known}, or remove it")
     values = {key: value for key, value in content.items() if value is not None}
+    info = read_dataclass(SessionInfo, values, str(path), "")
     for key, value in values.items():
-        if key not in known:
-            raise InputError(f"{path}: does not know the key {key}; the keys are {', '.join(known)}.")
-        _check_value(path, key, value)
-    if ("container_diameter_m" in values) != ("container_height_m" in values):
+        if key in _FILES and not os.path.isfile(path.parent / value):
+            expected = f"the name of a CSV file beside {path.name}"
+        elif key in _POSITIVE and not value > 0.0:
+            expected = "a positive number"
+        elif key == "image_rotation_deg" and value not in (0, 90, 180, 270):
+            expected = "0, 90, 180 or 270 degrees"
+        elif key == "marker_dictionary" and not (value.startswith("DICT_") and hasattr(cv2.aruco, value)):
+            expected = "OpenCV's name of a dictionary, such as DICT_5X5_50"
+        elif value == "":
+            expected = "a text"
+        else:
+            continue
+        raise InputError(f"{path}: {key} is {shown(value)}, but must be {expected}; correct it.")
+    if (info.container_diameter_m is None) != (info.container_height_m is None):
         raise InputError(
             f"{path}: gives one dimension of the container; give its diameter and its height, or neither."
         )
-    if "frame_angles_deg" in values:
-        values["frame_angles_deg"] = tuple(float(angle) for angle in values["frame_angles_deg"])
-    return SessionInfo(**values)
+    return info
 
 
 def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
@@ -96,28 +109,3 @@ def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
     if len(centres_nm) == 0 or not (np.isfinite(centres_nm).all() and centres_nm.min() >= 100.0):
         raise InputError(f"{path}: its band centres are no wavelengths in nm; write one number a line, 100 at least.")
     return centres_nm
-
-
-def _check_value(path: Path, key: str, value: Any) -> None:
-    is_number = _is_finite_number(value)
-    if key == "direction":
-        valid, expected = value in ("ccw", "cw"), "ccw or cw (seen from above)"
-    elif key in _FILES:
-        valid = isinstance(value, str) and os.path.isfile(path.parent / value)
-        expected = f"the name of a CSV file beside {path.name}"
-    elif key in _TEXTS:
-        valid, expected = isinstance(value, str) and value != "", "a text"
-    elif key == "frame_angles_deg":
-        valid = isinstance(value, list) and all(_is_finite_number(angle) for angle in value)
-        expected = "a list with one number a frame"
-    elif key == "image_rotation_deg":
-        valid, expected = is_number and value in (0, 90, 180, 270), "0, 90, 180 or 270 degrees"
-    else:
-        valid, expected = is_number and value > 0.0, "a positive number"
-    if not valid:
-        raise InputError(f"{path}: {key} is {shown(value)}, but must be {expected}; correct it.")
-
-
-def _is_finite_number(value: Any) -> bool:
-    # Integers beyond the largest float are no numbers to compute with.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -18,8 +18,7 @@ from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader
-from hsi_sc_nerf.processing.region_spectra import median_of_smallest
-from hsi_sc_nerf.processing.turntable_silhouette import turntable_silhouette
+from hsi_sc_nerf.processing.chamber import median_of_smallest, turntable_silhouette
 
 MAX_FRAMES = 12
 """Frames that are read, evenly spread over the session: enough for a median."""

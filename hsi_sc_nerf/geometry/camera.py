@@ -99,8 +99,6 @@ def closest_point_to_rays(
     origins: Float[np.ndarray, "*n 3"],
     directions: Float[np.ndarray, "*n 3"],
     index: Int[np.ndarray, "*n"] | None = None,
-    *,
-    regularisation: float = 0.0,
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p"]]:
     """Triangulate points: minimise the sum of squared distances to the rays of each point.
 
@@ -108,7 +106,6 @@ def closest_point_to_rays(
         origins: a point on each ray, metres or any other unit; broadcast against ``directions``.
         directions: unit directions.
         index: the point that each ray belongs to, 0 to p - 1; one point for all rays if not given.
-        regularisation: weight that pulls every point to the origin, for rays that are nearly parallel.
 
     Returns:
         The points, and the smallest eigenvalue of each normal matrix: 0 for parallel rays, at most 2/3 per ray.
@@ -120,7 +117,7 @@ def closest_point_to_rays(
     normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
     np.add.at(normal, index, perpendicular)
     np.add.at(right, index, vectors)
-    eigenvalues, axes = np.linalg.eigh(normal + regularisation * np.eye(3))
+    eigenvalues, axes = np.linalg.eigh(normal)
     along_axes = np.einsum("pij,pi->pj", axes, right)
     # The pseudo-inverse leaves out directions that the rays do not determine.
     known = eigenvalues > 1e-12 * eigenvalues[:, 2:]

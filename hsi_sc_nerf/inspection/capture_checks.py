@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.capture.session import Capture, Session, in_short
-from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.look import Look, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
@@ -70,17 +71,6 @@ def acquisition_day(capture: Capture) -> str | None:
     text = str(capture.cube.fields.get("acquisition date", "")).strip()
     match = _DAY.search(text)
     return match.group() if match else text or None
-
-
-def names_in_short(names: Sequence[str], most: int = 6) -> str:
-    """Names in a sentence; of many the first ones and their number."""
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
-
-
-def leave_out(names: Sequence[str]) -> str:
-    """The options that leave captures out."""
-    return " ".join(f"--exclude {name}" for name in names)
 
 
 def _binning(capture: Capture) -> str | None:
@@ -179,7 +169,7 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     small = np.clip(np.stack(resized), 0.0, 1.5)
     small /= np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
     away = np.abs(small - np.median(small, axis=0))
-    spread = np.maximum(1.4826 * np.median(away, axis=0), LEAST_SPREAD)
+    spread = np.maximum(median_abs_deviation(small, scale="normal"), LEAST_SPREAD)
     deviation = np.minimum(away / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
     return deviation / max(float(np.median(deviation)), 1e-12)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from matplotlib import rc_context
 
-from hsi_sc_nerf.calibration.white_check import check_white
+from hsi_sc_nerf.calibration.calibration_checks import check_white
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -22,15 +22,10 @@ from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.known_camera import known_angles_deg
+from hsi_sc_nerf.poses.feature_poses import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
-from hsi_sc_nerf.poses.upright import rotation_from_corners
 
 INSPECTION_NAME = "inspection.json"
-UPRIGHT_FRAMES = 6
-"""Frames from whose markers the upright direction is measured."""
-FEWEST_SIGHTINGS = 4
-"""Fewest markers, over these frames, that can show it."""
 WHOLE_TURN_DEG = 0.05
 """Frames that fill a turn to this fraction are taken for one whole turn."""
 THUMBNAIL_COLUMNS = 12
@@ -60,7 +55,7 @@ class Inspection:
         """Content of ``inspection.json``."""
         return {
             "session": str(self.session.path),
-            "findings": [finding.as_json() for finding in self.findings],
+            "findings": [asdict(finding) for finding in self.findings],
             "session_json": self.session_json,
         }
 
@@ -82,8 +77,7 @@ def inspect_session(
         skip_damaged: whether the user has chosen to do without damaged captures.
 
     Raises:
-        InputError: the session does not have that source of white, a cube cannot be read, or ``session.json`` names
-            an unknown marker dictionary.
+        InputError: the session does not have that source of white, or a cube cannot be read.
 
     Example:
         >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))
@@ -107,16 +101,7 @@ def inspect_session(
 
 def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
     """The session with the rotation of its images by its markers, unless ``session.json`` states one."""
-    step = max(1, len(markers.detections) // UPRIGHT_FRAMES)
-    sightings = [
-        (frame, marker, corners)
-        for frame, seen in enumerate(markers.detections[::step])
-        for marker, corners in seen.items()
-    ]
-    measured = None
-    if len(sightings) >= FEWEST_SIGHTINGS:
-        frame, marker, corners = (np.array(column) for column in zip(*sightings, strict=True))
-        measured = rotation_from_corners(frame, marker, corners)
+    measured = markers.rotation_deg
     values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
     assumed = session.image_rotation_deg
     if measured is None:

@@ -10,8 +10,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Num, UInt8
+from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.calibration.detector import dark_columns, saturation_counts
+from hsi_sc_nerf.calibration.detector import (
+    SOME_LINES,
+    dark_columns,
+    light_of_some_lines,
+    saturation_counts,
+    spread_rows,
+)
+from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
@@ -19,8 +27,6 @@ PICTURE_NM = (640.0, 550.0, 470.0)
 """Red, green and blue of the pictures; markers' inks are dark in all of them."""
 NEIGHBOURS = 2
 """So many neighbouring bands make one channel of a picture: they lie side by side in the file."""
-LINES = 16
-"""Lines that are read whole, evenly spread."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
 EDGE_FRACTION = 0.02
@@ -35,7 +41,6 @@ class Look:
     Attributes:
         name: of the capture.
         picture: pseudo-RGB, about 1 on white.
-        spectrum: mean light of the lines read, relative to the session's white level.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
         dark_fraction: fraction of the readings that are no light, by band.
@@ -45,7 +50,6 @@ class Look:
 
     name: str
     picture: Float[np.ndarray, "lines samples 3"]
-    spectrum: Float[np.ndarray, "bands"]
     top_counts: float
     at_top_fraction: Float[np.ndarray, "bands"]
     dark_fraction: Float[np.ndarray, "bands"]
@@ -73,11 +77,12 @@ def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
         white: counts of a white above dark, of the same integration time.
     """
     cube = capture.cube
-    counts = cube.memmap()
-    read = _some_lines(counts)
-    light, noise = _light(capture, read)
+    counts, read = cube.memmap(), _some_lines(cube)
+    light, noise = light_of_some_lines(cube, capture.dark), np.zeros(cube.shape[2])
     channels = nearest_bands(cube.wavelengths_nm, PICTURE_NM)
-    dark = None if capture.dark is None else _some_lines(capture.dark.memmap())
+    dark = None if capture.dark is None else _some_lines(capture.dark)
+    if dark is not None:
+        noise = np.asarray(dark, np.float32).std(axis=0).mean(axis=0)
     level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
     bands = [slice(max(0, band - NEIGHBOURS // 2), max(0, band - NEIGHBOURS // 2) + NEIGHBOURS) for band in channels]
     picture = np.stack(
@@ -91,7 +96,6 @@ def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
     return Look(
         name=capture.name,
         picture=picture,
-        spectrum=light.mean(axis=(0, 1)) / white,
         top_counts=float(top),
         at_top_fraction=(read == top).mean(axis=(0, 1)),
         dark_fraction=(light <= DARK_SIGMAS * noise).mean(axis=(0, 1)),
@@ -107,8 +111,7 @@ def white_level(session: Session) -> Float[np.ndarray, "bands"]:
 
 def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
     """Counts above dark of what is brightest in a capture, by band."""
-    light, _ = _light(capture, _some_lines(capture.cube.memmap()))
-    level = np.percentile(light, 95.0, axis=(0, 1))
+    level = np.percentile(light_of_some_lines(capture.cube, capture.dark), 95.0, axis=(0, 1))
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
 
@@ -118,16 +121,16 @@ def reflectance_noise(session: Session) -> float:
     It is measured between the first two frames. A change of the lamps does not count; what turns does, so that the
     limit is 1.3 times the noise where a third of the picture turns, and twice where half does.
     """
-    first, second = (_light(frame, _some_lines(frame.cube.memmap()))[0] for frame in session.frames[:2])
+    first, second = (light_of_some_lines(frame.cube, frame.dark) for frame in session.frames[:2])
     change = (second - first) / white_level(session)
-    away = np.abs(change - np.median(change, axis=(0, 1)))
-    return float(np.median(1.4826 * np.median(away, axis=(0, 1))) / np.sqrt(2.0))
+    deviation = median_abs_deviation(change.reshape(-1, change.shape[-1]), scale="normal")
+    return float(np.median(deviation) / np.sqrt(2.0))
 
 
 def saturation_level(session: Session, looks: Sequence[Look]) -> float | None:
     """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
     brightest = sorted(range(len(looks)), key=lambda index: -looks[index].top_counts)[:3]
-    cubes = [_some_lines(session.frames[index].cube.memmap()) for index in brightest]
+    cubes = [_some_lines(session.frames[index].cube) for index in brightest]
     return saturation_counts(cubes, np.ones(cubes[0].shape[1:], bool))
 
 
@@ -141,17 +144,5 @@ def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
     return float(strongest.mean() / (high - low)) if high > low else 0.0
 
 
-def _some_lines(counts: Num[np.ndarray, "lines samples bands"]) -> Num[np.ndarray, "some samples bands"]:
-    lines = np.linspace(0, len(counts) - 1, min(LINES, len(counts)) + 2)[1:-1] if len(counts) > 2 else [0]
-    return np.asarray(counts[np.unique(np.rint(lines).astype(int))])
-
-
-def _light(
-    capture: Capture, read: Num[np.ndarray, "some samples bands"]
-) -> tuple[Float[np.ndarray, "some samples bands"], Float[np.ndarray, "bands"]]:
-    """Readings above dark, and the standard deviation of readings without light by band."""
-    if capture.dark is None:
-        return np.asarray(read, np.float32), np.zeros(read.shape[-1], np.float32)
-    dark = _some_lines(capture.dark.memmap())
-    light = np.asarray(read, np.float32) - np.asarray(dark_columns(dark, *read.shape[1:]), np.float32)
-    return light, np.asarray(dark, np.float32).std(axis=0).mean(axis=0)
+def _some_lines(cube: Cube) -> Num[np.ndarray, "some samples bands"]:
+    return np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])

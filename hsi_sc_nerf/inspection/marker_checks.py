@@ -1,7 +1,7 @@
 """Checks of the markers: how many are seen, how far the table turned, and what poses to expect of them.
 
-Turns are found without a camera model: the disc keeps its place in the image. One rectification of its plane makes
-the quadrilaterals of all its markers in all frames squares of one size; there, a turn of the table is their rotation.
+The first guess of the poses, from markers as they are detected, tells how the table turned and which way up images
+are.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
-from scipy.optimize import least_squares
+from jaxtyping import Float
 
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Finding, Level
-from hsi_sc_nerf.inspection.capture_checks import names_in_short
+from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
-from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, dictionary_by_name, find_dictionary
+from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
+from hsi_sc_nerf.poses.marker_initialisation import initialise
+from hsi_sc_nerf.poses.model_selection import usable
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations
 
 LEAST_NOISE = 1e-4
 """Reflectance; no smaller noise is told."""
@@ -35,12 +35,12 @@ STOOD_STILL = 0.2
 """The table stood still where it turned by less than this fraction of the usual step."""
 LARGE_GAP = 1.7
 """A step counts as a gap from this factor of the usual step, which unevenness does not reach."""
-FORESHORTENINGS = (1.0, 1.5, 2.5, 4.0)
-"""Starts of the rectification: height over width of a square on the disc, inverted."""
-LARGEST_DEFECT = 0.15
-"""A quadrilateral lies on the disc if it differs from a square by less than this fraction of its side."""
-FEWEST_QUADS = 6
-"""Fewest quadrilaterals that fix the plane."""
+LEAST_TURN_DEG = 20.0
+"""Circles of which less is seen do not tell where their axis is."""
+LOOKS_DOWN_DEG = (5.0, 85.0)
+"""Neither a turntable seen from its side nor one seen from above shows which way up the image is."""
+LARGEST_ROLL_DEG = 30.0
+"""The camera's roll may add so much to a quarter turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,8 @@ class Markers:
         dictionary: that they come from; None if no marker is seen.
         detections: markers of each frame.
         angles_deg: the table's angle by frame, counter-clockwise from above; nan where it is not known.
+        rotation_deg: rotation of the files' images from upright, counter-clockwise: 0, 90, 180 or 270; None where the
+            markers do not tell.
         side_px: median side of a marker; nan without any.
         corner_error_px: standard deviation of a fitted corner; nan where none could be fitted.
     """
@@ -58,6 +60,7 @@ class Markers:
     dictionary: str | None
     detections: list[Detections]
     angles_deg: Float[np.ndarray, "frames"]
+    rotation_deg: int | None
     side_px: float
     corner_error_px: float
 
@@ -79,11 +82,7 @@ class Markers:
 def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
     """Look for markers in all frames, of the stated dictionary or of the one that fits best."""
     grays = [look.gray for look in looks]
-    dictionary = session.info.marker_dictionary
-    if dictionary is None:
-        dictionary = find_dictionary(grays)
-    else:
-        check_dictionary(dictionary, session.info_path)
+    dictionary = session.info.marker_dictionary or find_dictionary(grays)
     detections: list[Detections] = [{} for _ in grays]
     if dictionary is not None:
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -105,22 +104,10 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
     return Markers(
         dictionary if sides else None,
         detections,
-        frame_angles_deg(detections),
+        *turn_and_rotation_deg(detections, grays[0].shape),
         float(np.median(sides)) if sides else float("nan"),
         float(np.median(errors)) if errors else float("nan"),
     )
-
-
-def check_dictionary(name: str, stated_in: Path) -> None:
-    """Refuse a marker dictionary that OpenCV does not have.
-
-    Raises:
-        InputError: it has none of that name.
-    """
-    try:
-        dictionary_by_name(name)
-    except InputError as error:
-        raise InputError(f"{stated_in}: {error}.") from error
 
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:
@@ -159,7 +146,9 @@ def _turn(session: Session, markers: Markers) -> Finding:
     step = markers.usual_step_deg
     names = [frame.name for frame in session.frames]
     if step is None or abs(step) < 0.1:
-        return Finding("turn", "amber", "The table's turn is not known before the poses: no marker lies on the disc.")
+        return Finding(
+            "turn", "amber", "The table's turn is not known before the poses: too few frames share markers."
+        )
     direction = "ccw" if step > 0.0 else "cw"
     ordered = np.sort(markers.angles_deg[known] % 360.0)
     gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
@@ -213,83 +202,39 @@ def _expected(session: Session, markers: Markers) -> Finding:
     return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.", {"reflectance_noise": noise})
 
 
-def frame_angles_deg(detections: Sequence[Detections]) -> Float[np.ndarray, "frames"]:
-    """Angle of the table in each frame relative to the first that has one, good to a few degrees.
+def turn_and_rotation_deg(
+    detections: Sequence[Detections], shape: tuple[int, ...]
+) -> tuple[Float[np.ndarray, "frames"], int | None]:
+    """The table's angle in each frame, and how the images are rotated from upright.
 
     Args:
         detections: markers of each frame.
+        shape: lines and samples of the images.
 
     Returns:
-        Degrees in (-180, 180], counter-clockwise seen from above; nan where no marker on the disc links a frame.
+        Degrees relative to the first frame that has an angle, counter-clockwise seen from above, nan where markers do
+        not link a frame to most others; and the rotation, counter-clockwise: 0, 90, 180 or 270 degrees, None where
+        the markers do not tell.
     """
-    frames = np.array([i for i, seen in enumerate(detections) for _ in seen], int)
-    markers = np.array([marker for seen in detections for marker in seen], int)
-    angles = np.full(len(detections), np.nan)
-    if len(frames) < FEWEST_QUADS:
-        return angles
-    corners = np.stack([corners for seen in detections for corners in seen.values()])
-    centre, size = corners.mean(axis=(0, 1)), np.ptp(corners, axis=(0, 1)).max()
-    edges, on_disc = _rectify((corners - centre) / size)
-    # A marker on the container may look like a square by chance, in a few of the frames.
-    for marker in np.unique(markers):
-        of_marker = markers == marker
-        if on_disc[of_marker].mean() < 0.5:
-            on_disc[of_marker] = False
-    if on_disc.sum() < FEWEST_QUADS:
-        return angles
-    turns = edges[on_disc].conj()  # the image's y axis points down
-    known = _synchronise(frames[on_disc], markers[on_disc], turns / np.abs(turns))
-    for frame, phase in known.items():
-        angles[frame] = np.rad2deg(np.angle(phase))
-    return angles
-
-
-def _rectify(corners: Float[np.ndarray, "n 4 2"]) -> tuple[Complex[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Mean edge of each quadrilateral in the rectified plane (as the first one, complex), and which are squares."""
-
-    def edges_of(parameters: Float[np.ndarray, "4"]) -> Complex[np.ndarray, "n 4"]:
-        tilt, shear = parameters[:2], parameters[2:]
-        scale = 1.0 / np.maximum(1.0 + corners @ tilt, 0.05)
-        plane = corners[..., 0] * scale + 1j * (corners @ shear) * scale
-        # Corners run clockwise: each edge is the one before, turned by a quarter.
-        return (np.roll(plane, -1, axis=1) - plane) * (-1j) ** np.arange(4)
-
-    def residuals(parameters: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n 9"]:
-        edges = edges_of(parameters)
-        mean = edges.mean(axis=1)
-        side = np.abs(mean) + 1e-9
-        unequal = (edges - mean[:, None]) / side[:, None]
-        size = np.log(side / np.median(side))
-        return np.column_stack([unequal.real, unequal.imag, size])
-
-    fits = [
-        least_squares(
-            lambda parameters: residuals(parameters).ravel(), [0.0, 0.0, 0.0, start], loss="soft_l1", f_scale=0.05
-        )
-        for start in FORESHORTENINGS
-    ]
-    best = min(fits, key=lambda fit: fit.cost)
-    defect = np.sqrt(np.square(residuals(best.x)).mean(axis=1))
-    return edges_of(best.x).mean(axis=1), defect < LARGEST_DEFECT
-
-
-def _synchronise(frames: np.ndarray, markers: np.ndarray, turns: Complex[np.ndarray, "n"]) -> dict[int, complex]:
-    """Phase of each frame such that ``turns = frame's phase * marker's phase``; the first frame's is 1.
-
-    Only frames that share markers with the first, directly or through others, are returned.
-    """
-    of_frame: dict[int, complex] = {int(frames[0]): 1.0 + 0.0j}
-    of_marker: dict[int, complex] = {}
-    # A link reaches one frame farther in each round; more rounds average.
-    for _ in range(len(set(frames.tolist())) + 10):
-        for target, keys, others, other_keys in (
-            (of_marker, markers, of_frame, frames),
-            (of_frame, frames, of_marker, markers),
-        ):
-            sums: dict[int, complex] = {}
-            for key, other, turn in zip(keys.tolist(), other_keys.tolist(), turns, strict=True):
-                if other in others:
-                    sums[key] = sums.get(key, 0.0) + turn * np.conj(others[other])
-            target.update({key: value / abs(value) for key, value in sums.items() if abs(value) > 1e-9})
-    first = of_frame[int(frames[0])]
-    return {frame: phase * np.conj(first) for frame, phase in of_frame.items()}
+    seen = [(frame, *marker) for frame, found in enumerate(detections) for marker in sorted(found.items())]
+    unknown = np.full(len(detections), np.nan)
+    if not seen:
+        return unknown, None
+    frame, marker, corners = (np.array(column) for column in zip(*seen, strict=True))
+    linked, _, _ = usable(MarkerObservations(frame, marker, corners, np.zeros((len(frame), 8, 8))))
+    if len(np.unique(linked.frame)) < FEWEST_FRAMES:
+        return unknown, None
+    lines, samples = shape
+    try:
+        turntable = initialise(linked, (samples / 2, lines / 2), samples, side_m=1.0)
+    except InputError:
+        return unknown, None
+    angles_deg = turntable.over_session(turntable.relative_angles_deg(), len(detections))
+    if np.nanmax(angles_deg) - np.nanmin(angles_deg) < LEAST_TURN_DEG:
+        return unknown, None
+    right, down, away = turntable.camera_rotation[:, 2]
+    roll_deg = np.rad2deg(np.arctan2(-down, right)) - 90.0
+    nearest = 90 * round(roll_deg / 90.0)
+    looks_down = LOOKS_DOWN_DEG[0] < np.rad2deg(np.arcsin(np.clip(-away, -1.0, 1.0))) < LOOKS_DOWN_DEG[1]
+    is_clear = looks_down and abs(roll_deg - nearest) <= LARGEST_ROLL_DEG
+    return angles_deg, nearest % 360 if is_clear else None

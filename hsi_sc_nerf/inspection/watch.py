@@ -12,7 +12,6 @@ from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
 from hsi_sc_nerf.inspection.look import Look, look_at, white_counts
-from hsi_sc_nerf.inspection.marker_checks import check_dictionary
 from hsi_sc_nerf.poses.marker_detection import detect_markers, find_dictionary
 
 FEWEST_TO_COMPARE = 3
@@ -54,8 +53,6 @@ class Watch:
         lines = []
         try:
             self._info = read_session_info(self.path / SESSION_INFO_NAME)
-            if self._info.marker_dictionary is not None:
-                check_dictionary(self._info.marker_dictionary, self.path / SESSION_INFO_NAME)
             new = [files for files in list_captures(self.path).captures if files.name not in self._seen]
         except (InputError, OSError) as error:
             self.incomplete = waited_for

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json, read_picture, write_json
+from hsi_sc_nerf.findings import Effect
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
-from hsi_sc_nerf.packed.effects import Effect
 from hsi_sc_nerf.settings_file import read_dataclass
 
 TRANSFORMS_NAME = "transforms.json"

@@ -130,9 +130,9 @@ class Problem:
             by.append(np.zeros((len(distances), c.motion_size + 1)))
             np.add.at(by[-1], (np.arange(len(distances))[:, None], columns), jacobian)
 
-        if free.motion_sigmas is not None:
+        if free.motion_sigmas is not None and turntable.motion is not None:
             sigmas = np.tile(np.repeat(free.motion_sigmas, (2, 3)), len(c.motion))
-            add(turntable.tilts_and_shifts().ravel() / sigmas, c.motion.reshape(-1, 1), 1.0 / sigmas[:, None])
+            add(turntable.motion.ravel() / sigmas, c.motion.reshape(-1, 1), 1.0 / sigmas[:, None])
         if free.known_focal is not None:
             focal_px, sigma = free.known_focal
             sigma *= _HELD
@@ -214,8 +214,8 @@ class Problem:
             radial=(float(radial[0]), float(radial[1])),
         )
         if c.motion.size:
-            motion = turntable.tilts_and_shifts() + step[c.motion]
-            turntable = replace(turntable, tilts_rad=motion[:, :2], shifts=motion[:, 2:])
+            before = 0.0 if turntable.motion is None else turntable.motion
+            turntable = replace(turntable, motion=before + step[c.motion])
         for part, landmark_step in zip(self.residuals, landmark_steps, strict=True):
             turntable = part.moved(turntable, landmark_step) if part.d else turntable
         return turntable
@@ -230,9 +230,8 @@ class Problem:
         Raises:
             InputError: points of the start lie behind the camera.
         """
-        if self.layout.motion.size:
-            motion = turntable.tilts_and_shifts()
-            turntable = replace(turntable, tilts_rad=motion[:, :2], shifts=motion[:, 2:])
+        if self.layout.motion.size and turntable.motion is None:
+            turntable = replace(turntable, motion=np.zeros((len(turntable.frames), 5)))
         cost, damping = self.cost(turntable), _FIRST_DAMPING
         if not np.isfinite(cost):
             raise InputError(

@@ -1,9 +1,14 @@
-"""Poses of a turntable session from features of the object: free poses by COLMAP, or known angles."""
+"""Poses of a turntable session without markers: from features of the object, known angles and a known camera.
+
+Features give free poses by COLMAP, to which one turntable is fitted. Known are, before any image is looked at, the
+camera of an earlier session and the turntable's angles.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,14 +16,14 @@ from jaxtyping import Float, UInt8
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
-from hsi_sc_nerf.poses.container_outline import ContainerOutline, container_outline
-from hsi_sc_nerf.poses.known_camera import KnownCamera, known_angles_deg
+from hsi_sc_nerf.poses.container_outline import container_outline
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
-from hsi_sc_nerf.poses.marker_outliers import usable
+from hsi_sc_nerf.poses.model_selection import usable
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
-from hsi_sc_nerf.poses.posed_session import in_object_frame
+from hsi_sc_nerf.poses.posed_session import in_object_frame, pose_uncertainty
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
@@ -31,7 +36,6 @@ from hsi_sc_nerf.poses.track_adjustment import (
 )
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
-from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
 
 _FOCAL_SIGMA = 0.002
 """Of an earlier session's focal length, as a fraction."""
@@ -45,6 +49,93 @@ MOST_CONTRADICTING = 1 / 3
 
 Images = Sequence[UInt8[np.ndarray, "h w"]]
 """One image per frame, or ``SessionPictures``."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCamera:
+    """A camera before its turntable, calibrated by an earlier session."""
+
+    intrinsics: PinholeIntrinsics
+    distortion: tuple[float, float, float, float]
+    camera_to_world: Float[np.ndarray, "4 4"]
+    """Pose at the angle 0, object frame, metres."""
+    direction: Literal["ccw", "cw"] | None = None
+    """The turntable's turn seen from above; None where the earlier session does not tell."""
+
+    @property
+    def distance_m(self) -> float:
+        """From the turntable's axis."""
+        return float(np.hypot(self.camera_to_world[0, 3], self.camera_to_world[1, 3]))
+
+    def check_size(self, size_px: tuple[int, int]) -> None:
+        """Refuse images of another width and height.
+
+        Raises:
+            InputError: they differ.
+        """
+        if size_px != (self.intrinsics.w, self.intrinsics.h):
+            raise InputError(
+                f"the images have {size_px[0]} x {size_px[1]} pixels, but the camera of the earlier session had "
+                f"{self.intrinsics.w} x {self.intrinsics.h}; give a session of the same camera"
+            )
+
+
+def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] | None:
+    """The frames' angles by ``session.json``, relative to the first; positive where the direction is not known.
+
+    Raises:
+        InputError: not one angle per frame.
+    """
+    sign = -1.0 if info.direction == "cw" else 1.0
+    if info.frame_angles_deg is not None:
+        if len(info.frame_angles_deg) != frames:
+            raise InputError(
+                f"{len(info.frame_angles_deg)} frame angles are given for {frames} frames; give one per frame"
+            )
+        return sign * (np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
+    return None if info.nominal_step_deg is None else sign * info.nominal_step_deg * np.arange(frames)
+
+
+def poses_from_known_camera(
+    names: Sequence[str], size_px: tuple[int, int], info: SessionInfo, camera: KnownCamera
+) -> TurntablePoses:
+    """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
+
+    Args:
+        names: of the frames.
+        size_px: width and height of the images.
+        info: the angles and the direction.
+        camera: of the earlier session; its direction counts where ``info`` has none.
+
+    Raises:
+        InputError: images of another size than the camera's, unknown angles, or an unknown direction, with which the
+            poses would be mirrored as likely as not.
+    """
+    camera.check_size(size_px)
+    direction, n = info.direction or camera.direction, len(names)
+    angles_deg = known_angles_deg(info, n)
+    if angles_deg is None:
+        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    if direction is None:
+        raise InputError(
+            "which way the turntable turns is not known, nor do the angles of the earlier session tell; give "
+            "direction (ccw or cw) in session.json"
+        )
+    if info.direction is None and direction == "cw":
+        angles_deg = -angles_deg
+    return TurntablePoses(
+        names=tuple(names),
+        intrinsics=camera.intrinsics,
+        distortion=camera.distortion,
+        camera_to_world=np.stack([turntable_camera_to_world(camera.camera_to_world, float(a)) for a in angles_deg]),
+        angles_deg=angles_deg,
+        reprojection_error_px=np.full(n, np.nan),
+        used=np.ones(n, bool),
+        markers_per_frame=(0,) * n,
+        overall_error_px=float("nan"),
+        findings=(Finding("poses-given", "amber", "Poses are as given; nothing was measured."),),
+        method="angles",
+    )
 
 
 def poses_from_features(
@@ -127,15 +218,19 @@ def _posed(
     dictionary = info.marker_dictionary or find_dictionary(images)
     markers, per_frame = None, (0,) * n
     if dictionary is not None:
-        markers, _, _ = usable(observe(images, dictionary, progress=False).observations)
+        markers, _, _ = usable(observe(images, dictionary).observations)
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
     adjusted, markers = adjust_together(found, markers, parameters)
     findings: list[Finding] = []
     if camera is not None:
         findings = check_camera(adjusted, found, camera)
+    errors_px, overall_px = turntable.frame_errors_px(found.tracks, n)
     height, width = images[0].shape
-    outline = _container_outline(adjusted.turntable, images, info) if markers is None else None
+    outline = None
+    if markers is None and info.container_diameter_m is not None and info.container_height_m is not None:
+        grays = SessionPictures.of(images).named(GRAY)
+        outline = container_outline(grays, adjusted.turntable, info.container_height_m / info.container_diameter_m)
     if scale_of(adjusted.turntable, info, outline)[0] is None:
         sentence = (
             "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
@@ -152,25 +247,18 @@ def _posed(
         (width, height),
         info,
         outline,
-        reprojection_error_px=turntable.over_session(found.frame_errors_px(), n),
+        reprojection_error_px=errors_px,
         dropped={
             names[i]: "it shares too few features with other frames"
             for i in np.setdiff1d(np.arange(n), turntable.frames).tolist()
         },
         dictionary=None if markers is None else dictionary,
         markers_per_frame=per_frame,
-        overall_error_px=found.overall_error_px,
+        overall_error_px=overall_px,
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
     )
-
-
-def _container_outline(turntable: Turntable, images: Images, info: SessionInfo) -> ContainerOutline | None:
-    if info.container_diameter_m is None or info.container_height_m is None:
-        return None
-    grays = SessionPictures.of(images).named(GRAY)
-    return container_outline(grays, turntable, info.container_height_m / info.container_diameter_m)
 
 
 def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:

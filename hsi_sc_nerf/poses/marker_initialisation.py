@@ -14,6 +14,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from hsi_sc_nerf.poses.bundle_adjustment import Problem
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, rotations_about_z, square_corners
 
 # Fields of view over the width that are tried: from a tele lens to a very wide one.
@@ -25,7 +27,13 @@ _HORIZONTAL_COSINE = 0.95
 def initialise(
     observations: MarkerObservations, centre_px: tuple[float, float], width_px: int, side_m: float
 ) -> Turntable:
-    """Initial turntable from linked observations (``linked_rows``) of markers that each are in two or more frames."""
+    """Initial turntable from linked observations (``linked_rows``) of markers that each are in two or more frames.
+
+    It is adjusted without weights, so that a wrong covariance can do no harm.
+
+    Raises:
+        InputError: the corners are not those of markers before a camera.
+    """
     fields = np.geomspace(*_FOV_RANGE_DEG, _FOV_STEPS)
     focals = width_px / 2 / np.tan(np.deg2rad(fields) / 2)
     errors = [_Circles(observations, f, centre_px, side_m).error_px for f in focals]
@@ -36,7 +44,9 @@ def initialise(
         method="bounded",
         options={"xatol": 1e-3},
     )
-    return _Circles(observations, float(np.exp(finer.x)), centre_px, side_m).turntable()
+    start = _Circles(observations, float(np.exp(finer.x)), centre_px, side_m).turntable()
+    unweighted = np.tile(np.eye(8), (len(observations), 1, 1))
+    return Problem(start, MarkerResiduals(start, observations, 1.0, unweighted)).minimise(start)
 
 
 class _Circles:

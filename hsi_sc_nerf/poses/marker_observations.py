@@ -8,15 +8,13 @@ hidden.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from rich.progress import track
 from scipy.optimize import minimize_scalar
 
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers
@@ -45,9 +43,6 @@ _FARTHEST_FROM_EXPECTED_PX = 1.0
 _MOST_ILL_EXPOSED = 0.05
 
 
-_T = TypeVar("_T")
-
-
 @dataclass(frozen=True)
 class Observed:
     """Markers of all frames, the blur of each frame's best picture, and markers whose pattern was not fitted."""
@@ -57,14 +52,12 @@ class Observed:
     unexplained: tuple[RejectedMarker, ...]
 
 
-def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progress: bool) -> Observed:
+def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str) -> Observed:
     """Detect and refine the markers of every frame."""
     session = SessionPictures.of(images)
     frames = session.frames
     with ThreadPoolExecutor(_WORKERS) as pool:
-        detections = _all(
-            pool.map(lambda frame: _detect(frame, dictionary), frames), "Finding markers", len(frames), progress
-        )
+        detections = list(pool.map(lambda frame: _detect(frame, dictionary), frames))
         # What lenses blur, they blur by wavelength: each name has a blur of its own.
         names = sorted({name for found in detections for name in found})
         of_name = {name: [found.get(name, {}) for found in detections] for name in names}
@@ -80,7 +73,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, progres
                         fitted[marker] = fit_marker(image, dictionary, marker, corners, blurs_px[i][name])
             return sorted(fitted.items())
 
-        fitted = _all(pool.map(refine, range(len(frames))), "Refining corners", len(frames), progress)
+        fitted = list(pool.map(refine, range(len(frames))))
     for i in _out_of_focus(fitted):
         for name, found in detections[i].items():
             blurs_px[i][name] = find_blur([frames[i].picture(name)], dictionary, [found])
@@ -221,10 +214,6 @@ def _facing(turntable: Turntable) -> list[tuple[int, int]]:
     cosine = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1)
     frame, marker = np.nonzero(cosine > _STEEPEST_COSINE)
     return list(zip(turntable.frames[frame].tolist(), turntable.markers[marker].tolist(), strict=True))
-
-
-def _all(work: Iterable[_T], what: str, total: int, progress: bool) -> list[_T]:
-    return list(track(work, what, total=total, disable=not progress, transient=True))
 
 
 def _observations(rows: list[tuple[int, int, FittedMarker]]) -> MarkerObservations:

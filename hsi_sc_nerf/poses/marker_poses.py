@@ -11,19 +11,16 @@ from jaxtyping import UInt8
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
-from hsi_sc_nerf.poses.marker_outliers import adjust_without_outliers, usable, without_uncertain_frames
-from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS, adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
-from hsi_sc_nerf.poses.posed_session import in_object_frame
+from hsi_sc_nerf.poses.posed_session import in_object_frame, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import check_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, require_parallax
-from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
 _SIDE_WITHOUT_SCALE_M = 0.03
@@ -33,8 +30,6 @@ def poses_from_markers(
     images: Sequence[UInt8[np.ndarray, "h w"]],
     names: Sequence[str],
     info: SessionInfo,
-    *,
-    progress: bool = True,
 ) -> TurntablePoses:
     """Poses from markers that turn with the object before a camera that stands still.
 
@@ -48,7 +43,6 @@ def poses_from_markers(
         names: the frames' names, for messages and the report.
         info: the dictionary, found if it is not given; the markers' side or the container's size, which give the
             scale; the nominal step and the direction, which are only compared with the result.
-        progress: show progress bars.
 
     Raises:
         InputError: no markers, too few frames with linked markers to fix an axis, or nothing that gives the scale.
@@ -62,7 +56,7 @@ def poses_from_markers(
     check_frames(images, names)
     _check_scale(info)
     dictionary = info.marker_dictionary or find_dictionary(images)
-    observed = observe(images, dictionary, progress) if dictionary else None
+    observed = observe(images, dictionary) if dictionary else None
     if dictionary is None or observed is None or len(observed.observations) == 0:
         raise InputError(
             f"no marker was found in any of the {len(images)} frames {names[0]} ... {names[-1]}; check that the "
@@ -79,9 +73,6 @@ def poses_from_markers(
             f"markers with others, {FEWEST_FRAMES} are needed; {advice}"
         )
     start = initialise(linked, (width / 2, height / 2), width, info.marker_side_m or _SIDE_WITHOUT_SCALE_M)
-    # The first adjustment is unweighted, so that a wrong covariance can do no harm.
-    unweighted = np.tile(np.eye(8), (len(linked), 1, 1))
-    start = Problem(start, MarkerResiduals(start, linked, 1.0, unweighted)).minimise(start)
     require_parallax(start.distance, np.linalg.norm(start.marker_poses[:, :3, 3] - [start.distance, 0, 0], axis=-1))
     first, _, outliers = adjust_without_outliers(start, linked)
     start = first.turntable
@@ -102,10 +93,7 @@ def poses_from_markers(
     if not lie_on_disc(turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker corner."
         found.append(Finding("poses-origin", "amber", sentence))
-    squared_px2 = ((turntable.reproject(kept) - kept.corners_px) ** 2).sum(-1).mean(-1)
-    seen = np.bincount(kept.frame, minlength=len(names))
-    with np.errstate(invalid="ignore"):
-        errors_px = np.sqrt(np.bincount(kept.frame, squared_px2, len(names)) / seen)
+    errors_px, overall_px = turntable.frame_errors_px(kept, len(names))
     return in_object_frame(
         with_hidden_errors(adjusted),
         kept,
@@ -113,10 +101,10 @@ def poses_from_markers(
         (width, height),
         info,
         reprojection_error_px=errors_px,
-        overall_error_px=float(np.sqrt(squared_px2.mean())),
+        overall_error_px=overall_px,
         dropped=_dropped(names, np.isin(np.arange(len(names)), turntable.frames), rejected),
         dictionary=dictionary,
-        markers_per_frame=tuple(seen.tolist()),
+        markers_per_frame=tuple(np.bincount(kept.frame, minlength=len(names)).tolist()),
         blur_px=float(np.median(observed.blur_px)),
         loop_closure_deg=loop_closure_deg(MarkerResiduals(turntable, kept, LOSS_SIGMAS), turntable),
         findings=tuple(found),

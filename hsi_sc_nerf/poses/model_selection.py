@@ -1,4 +1,7 @@
-"""The simplest turntable model that explains the markers: without or with lens distortion, without or with wobble.
+"""The marker observations that poses rest on, and the simplest turntable model that explains them.
+
+Observations that do not count are named with the reason. The lens is without or with distortion, the table without or
+with wobble.
 
 A model with more parameters is selected where an F-test on the weighted sums of squares rejects the simpler one. The
 variance is that of the richer model's residuals, and at least that of the corners' fit. Where only a few frames call
@@ -7,20 +10,34 @@ for motions of their own, the object, the table or the camera was displaced in t
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import f as f_distribution
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
-from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
+from hsi_sc_nerf.poses.result import RejectedMarker
+from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Turntable
 
+DISPLACED = "object, table or camera was displaced in this frame"
+# An observation is an outlier if its error is above this many pixels, this many times the median error, and this many
+# times what the covariance of its corners explains.
+_OUTLIER_PX = 0.2
+_OUTLIER_MEDIANS = 5.0
+_OUTLIER_SIGMAS = 5.0
+# A marker whose centre moves by less than this fraction of its size over three frames or more does not turn.
+_STATIC_FRACTION = 0.1
+_ROUNDS = 4
+# A frame whose angle is known worse than this is left out.
+_LARGEST_ANGLE_SIGMA_DEG = 0.5
 LOSS_SIGMAS = 3.0
 """Whitened residuals beyond this many standard deviations count by their size, not its square."""
 EVIDENCE_NEEDED = 6.0
@@ -41,15 +58,136 @@ _FEWEST_MARKERS = 2
 _LEAST_FRACTION = 0.5
 
 
-@dataclass(frozen=True)
-class FrameMotions:
-    """Evidence that frames moved beside the turntable."""
+def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[RejectedMarker], list[int]]:
+    """Observations of markers that turn, are seen in two frames or more, and link their frames.
 
-    frames: Int[np.ndarray, "f"]
-    p_value: Float[np.ndarray, "f"]
-    """Probability that chance alone lowers the frame's squares as much as a motion of its own does (F-test)."""
-    rms_error_px: Float[np.ndarray, "f"]
-    """Root mean square distance of the corners from the turntable's at the frame's best angle."""
+    Returns:
+        These observations, the others with the reason, and the markers that stand still in the image.
+    """
+    if len(seen) == 0:
+        return seen, [], []
+    count = Counter(seen.marker.tolist())
+    size_px = np.sqrt(np.median([np.ptp(c, axis=0).prod() for c in seen.corners_px]))
+    static = []
+    for marker, n in count.items():
+        centres = seen.corners_px[seen.marker == marker].mean(1)
+        if n >= FEWEST_FRAMES and np.ptp(centres, axis=0).max() < _STATIC_FRACTION * size_px:
+            static.append(marker)
+    stands = np.isin(seen.marker, static)
+    once = np.array([count[m] < 2 for m in seen.marker.tolist()], bool)
+    rejected = _rejected(seen.select(stands), "it stands still in the image")
+    rejected += _rejected(seen.select(once), "it is seen in no other frame")
+    kept = seen.select(~stands & ~once)
+    if len(kept):
+        linked = linked_rows(kept.frame, kept.marker)
+        rejected += _rejected(kept.select(~linked), "it links its frame with too few others")
+        kept = kept.select(linked)
+    return kept, rejected, sorted(static)
+
+
+def adjust_without_outliers(
+    start: Turntable, observations: MarkerObservations
+) -> tuple[Adjusted, MarkerObservations, list[RejectedMarker]]:
+    """Select a model, adjust it, reject outliers, and repeat until nothing changes.
+
+    A rejected observation comes back where a better model explains it; a displaced frame does not. Frames and markers
+    that the start lacks are rejected.
+
+    Raises:
+        InputError: too few frames are left.
+    """
+    good = start.knows(observations)
+    turntable, errors_px = start, np.full(len(observations), np.nan)
+    displaced: dict[int, float] = {}
+    for last in [False] * _ROUNDS + [True]:
+        best, kept = _select_model(turntable, observations.select(good))
+        turntable = best.turntable
+        displaced |= best.displaced_frames
+        good &= ~np.isin(observations.frame, list(displaced))
+        if last:
+            break
+        known = np.isin(observations.frame, kept.frame) & np.isin(observations.marker, kept.marker)
+        errors_px = np.full(len(observations), np.nan)
+        fits = np.zeros(len(observations), bool)
+        errors_px[known], fits[known] = _fits(best, observations.select(known), good[known])
+        fits[fits] = _linked(observations.select(fits))
+        if len(np.unique(observations.frame[fits])) < FEWEST_FRAMES:
+            raise InputError(
+                "the markers do not move as on one turntable; check that camera and markers were not touched during "
+                "the session and that all markers have the same side"
+            )
+        if (fits == good).all():
+            break
+        good = fits
+    of_displaced = np.isin(observations.frame, list(displaced))
+    outliers = ~good & ~of_displaced
+    rejected = _rejected(observations.select(outliers), "it does not fit the others", errors_px[outliers])
+    return best, kept, rejected + _rejected_frames(observations.select(of_displaced), displaced)
+
+
+def without_uncertain_frames(
+    adjusted: Adjusted, observations: MarkerObservations
+) -> tuple[Adjusted, MarkerObservations, list[RejectedMarker]]:
+    """Leave out frames whose markers hardly determine an angle: too small, too slanted or too noisy.
+
+    Raises:
+        InputError: too few frames are left.
+    """
+    sigmas = adjusted.angle_sigmas_deg(adjusted.covariance())
+    uncertain = sigmas > _LARGEST_ANGLE_SIGMA_DEG
+    if not uncertain.any():
+        return adjusted, observations, []
+    keep = ~np.isin(observations.frame, adjusted.turntable.frames[uncertain])
+    keep[keep] = _linked(observations.select(keep))
+    if len(np.unique(observations.frame[keep])) < FEWEST_FRAMES:
+        raise InputError(
+            f"the markers determine the turntable's angle to {float(np.median(sigmas)):.1f} degrees only; show more "
+            "of them, larger or sharper"
+        )
+    kept = observations.select(keep)
+    better, certain = _select_model(adjusted.turntable, kept)
+    why = f"it determines the angle worse than to {_LARGEST_ANGLE_SIGMA_DEG} degrees"
+    displaced = kept.select(np.isin(kept.frame, list(better.displaced_frames)))
+    rejected = _rejected(observations.select(~keep), why)
+    return better, certain, rejected + _rejected_frames(displaced, better.displaced_frames)
+
+
+def _select_model(start: Turntable, observations: MarkerObservations) -> tuple[Adjusted, MarkerObservations]:
+    """The selected model, and the observations that it rests on."""
+    best = select_model(start.restricted(observations), observations)
+    return best, observations.without_frames(list(best.displaced_frames))
+
+
+def _fits(
+    best: Adjusted, observations: MarkerObservations, good: Bool[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Error of each observation in pixels, and whether it is no outlier, judged by the good ones."""
+    error_px = best.turntable.errors_px(observations)
+    whitened = MarkerResiduals(best.turntable, observations, LOSS_SIGMAS).values(best.turntable)
+    sigmas = np.sqrt((whitened**2).mean(axis=(1, 2)) / best.variance)
+    limit_px = max(_OUTLIER_PX, _OUTLIER_MEDIANS * float(np.median(error_px[good])))
+    return error_px, (error_px < limit_px) | (sigmas < _OUTLIER_SIGMAS)
+
+
+def _linked(observations: MarkerObservations) -> Bool[np.ndarray, "n"]:
+    """Mask of markers in two frames or more, in the largest linked set of frames."""
+    count = Counter(observations.marker.tolist())
+    keep = np.array([count[m] >= 2 for m in observations.marker.tolist()], bool)
+    if keep.any():
+        keep[keep] = linked_rows(observations.frame[keep], observations.marker[keep])
+    return keep
+
+
+def _rejected(
+    observations: MarkerObservations, why: str, errors_px: Float[np.ndarray, "n"] | None = None
+) -> list[RejectedMarker]:
+    errors_px = np.full(len(observations), np.nan) if errors_px is None else errors_px
+    rows = zip(observations.frame.tolist(), observations.marker.tolist(), errors_px.tolist(), strict=True)
+    return [RejectedMarker(f, m, e if np.isfinite(e) else None, why) for f, m, e in rows]
+
+
+def _rejected_frames(observations: MarkerObservations, errors_px: Mapping[int, float]) -> list[RejectedMarker]:
+    return _rejected(observations, DISPLACED, np.array([errors_px[f] for f in observations.frame.tolist()]))
 
 
 _Solve = Callable[[Turntable, FreeParameters], Adjusted]
@@ -79,7 +217,9 @@ def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted
     return _with_lens(wobbling, solve)
 
 
-def frame_motions(turntable: Turntable, observations: MarkerObservations) -> FrameMotions:
+def frame_motions(
+    turntable: Turntable, observations: MarkerObservations
+) -> tuple[Float[np.ndarray, "f"], Float[np.ndarray, "f"]]:
     """Test whether each frame fits the turntable by its angle, or needs tilts and shifts of its own.
 
     Camera, lens and markers are held. Frames of fewer than two markers, or of which fewer than half agree on one
@@ -88,6 +228,10 @@ def frame_motions(turntable: Turntable, observations: MarkerObservations) -> Fra
     Args:
         turntable: without wobble; observations of markers that it lacks are ignored.
         observations: marker corners.
+
+    Returns:
+        Of each frame the probability that chance alone lowers its squares as much as a motion of its own does
+        (F-test), and the root mean square distance of its corners from the turntable's at its best angle, px.
     """
     seen = observations.select(turntable.knows(observations))
     n, frame = len(turntable.frames), np.searchsorted(turntable.frames, seen.frame)
@@ -110,9 +254,8 @@ def frame_motions(turntable: Turntable, observations: MarkerObservations) -> Fra
     variance = max(1.0, float(by_motion[enough].sum()) / max(freedom, 1))
     ratio = np.maximum(by_angle - by_motion, 0.0) / (_FRAME_PARAMETERS - 1) / variance
     p_value = np.where(enough, f_distribution.sf(ratio, _FRAME_PARAMETERS - 1, max(freedom, 1)), 1.0)
-    squared_px2 = ((turned.reproject(seen) - seen.corners_px) ** 2).sum(-1).mean(-1)
-    rms_error_px = np.sqrt(np.bincount(frame[agrees], squared_px2[agrees], n) / np.maximum(markers, 1))
-    return FrameMotions(turntable.frames, p_value, rms_error_px)
+    errors_px, _ = turned.frame_errors_px(seen.select(agrees), int(turntable.frames.max()) + 1)
+    return p_value, np.nan_to_num(errors_px[turntable.frames])
 
 
 def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
@@ -133,7 +276,7 @@ def _solve(observations: MarkerObservations, turntable: Turntable, free: FreePar
 
 def _steady(start: Turntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
     """The model without wobble; and the one with it, if the corners call for it."""
-    steady = solve(replace(start, radial=(0.0, 0.0), tilts_rad=None, shifts=None), FreeParameters())
+    steady = solve(replace(start, radial=(0.0, 0.0), motion=None), FreeParameters())
     steady = _with_lens(steady, solve)
     sigmas = (_FIRST_SPREAD[0], _FIRST_SPREAD[1] * steady.turntable.distance)
     wobbling = solve(steady.turntable, replace(steady.problem.free, motion_sigmas=sigmas))
@@ -153,27 +296,31 @@ def _without_displaced_frames(start: Turntable, observations: MarkerObservations
         return _steady(start.restricted(rest), partial(_solve, rest))
 
     # Displaced frames bend a turntable that is fitted to them: judge by one without the likeliest.
-    likeliest = start.frames[np.sort(np.argsort(frame_motions(start, observations).p_value, kind="stable")[:most])]
+    p_value, _ = frame_motions(start, observations)
+    likeliest = start.frames[np.sort(np.argsort(p_value, kind="stable")[:most])]
     steady, wobbling = steady_without(likeliest)
     if steady is None:
         return None
     angles = start.angles_rad.copy()
     angles[np.isin(start.frames, steady.turntable.frames)] = steady.turntable.angles_rad
-    judged = frame_motions(replace(steady.turntable, frames=start.frames, angles_rad=angles), observations)
-    displaced = judged.p_value < 10.0**-EVIDENCE_NEEDED
+    p_value, rms_error_px = frame_motions(
+        replace(steady.turntable, frames=start.frames, angles_rad=angles), observations
+    )
+    displaced = p_value < 10.0**-EVIDENCE_NEEDED
     if not 0 < displaced.sum() <= most:
         return None
     if not np.array_equal(start.frames[displaced], likeliest):
         steady, wobbling = steady_without(start.frames[displaced])
     if steady is None or wobbling is not None:
         return None
-    errors = zip(start.frames[displaced].tolist(), judged.rms_error_px[displaced].tolist(), strict=True)
+    errors = zip(start.frames[displaced].tolist(), rms_error_px[displaced].tolist(), strict=True)
     return replace(steady, displaced_frames=dict(errors))
 
 
 def _motion_spread(turntable: Turntable) -> tuple[float, float]:
     """Root mean squares of the tilts (rad) and the shifts (m)."""
-    tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.tilts_and_shifts(), [2], axis=1))
+    assert turntable.motion is not None
+    tilt, shift = (float(np.sqrt(np.mean(part**2))) for part in np.split(turntable.motion, [2], axis=1))
     return max(tilt, _LEAST_SPREAD[0]), max(shift, _LEAST_SPREAD[1])
 
 

@@ -11,8 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.feature_poses import Images, poses_from_features
-from hsi_sc_nerf.poses.known_camera import KnownCamera, poses_from_known_camera
+from hsi_sc_nerf.poses.feature_poses import Images, KnownCamera, poses_from_features, poses_from_known_camera
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.result import TurntablePoses
 
@@ -31,7 +30,6 @@ def find_poses(
     method: PoseMethod = "auto",
     *,
     camera: KnownCamera | None = None,
-    progress: bool = True,
     from_markers: Callable[..., TurntablePoses] = poses_from_markers,
     from_features: Callable[..., TurntablePoses] = poses_from_features,
 ) -> TurntablePoses:
@@ -44,7 +42,6 @@ def find_poses(
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
-        progress: show progress bars.
         from_markers: the function behind the method.
         from_features: likewise.
 
@@ -59,7 +56,7 @@ def find_poses(
 
     def by(method: str) -> TurntablePoses:
         if method == "markers":
-            return from_markers(images, names, info, progress=progress)
+            return from_markers(images, names, info)
         if method == "colmap":
             return _checked(from_features(images, names, info, camera=camera))
         if camera is None:

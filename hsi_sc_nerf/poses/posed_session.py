@@ -7,23 +7,32 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.poses.bundle_adjustment import Adjusted
-from hsi_sc_nerf.poses.container_outline import ContainerOutline
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
+from hsi_sc_nerf.poses.container_outline import ContainerOutline, radius_by_camera
 from hsi_sc_nerf.poses.object_frame import (
     apparent_sides,
     container_diameter,
     disc_height,
     disc_tilt_deg,
     lie_on_disc,
+    lowest_landmarks,
     scale_of,
     to_object_frame,
 )
-from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses
-from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
-from hsi_sc_nerf.poses.uncertainty import pose_uncertainty
+from hsi_sc_nerf.poses.residuals import PointResiduals
+from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, project, projection_jacobian
+
+_FIELD_PX = 0.007
+"""Standard deviation of each field's amplitude for corners: print, lens and pixels are that far from the model's."""
+_FEATURE_FIELD_PX = 0.03
+"""The same for features, which creep over a skin as its light and its slope change (docs/validation/poses.md)."""
+_DRAWS = 2000
+"""Of errors by the covariance; the largest of all frames has no closed form."""
 
 
 def in_object_frame(
@@ -50,7 +59,7 @@ def in_object_frame(
     turntable, n = adjusted.turntable.resized(metres), len(names)
     to_object = to_object_frame(turntable, disc_height(turntable) if outline is None else metres * outline.foot)
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
-    on_disc, tilts = lie_on_disc(turntable.corners()), turntable.tilts_rad
+    on_disc, motion = lie_on_disc(turntable.corners()), turntable.motion
     uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, outline)
     return TurntablePoses(
         names=tuple(names),
@@ -63,8 +72,8 @@ def in_object_frame(
         disc_markers=tuple(turntable.markers[on_disc].tolist()),
         disc_by_container=outline is not None,
         disc_tilt_deg=disc_tilt_deg(turntable),
-        model="turntable" if tilts is None else "free poses",
-        wobble_deg=None if tilts is None else float(np.rad2deg(np.sqrt((tilts**2).sum(-1).mean()))),
+        model="turntable" if motion is None else "free poses",
+        wobble_deg=None if motion is None else float(np.rad2deg(np.sqrt((motion[:, :2] ** 2).sum(-1).mean()))),
         evidence=dict(adjusted.evidence),
         metric=source is not None,
         scale=None if source is None else _scale(adjusted, turntable, markers, uncertainty.size, source, info),
@@ -95,3 +104,132 @@ def _scale(
         container_diameter_m=info.container_diameter_m,
         measured_container_diameter_m=container_diameter(turntable, info.container_height_m),
     )
+
+
+def pose_uncertainty(
+    adjusted: Adjusted,
+    covariance: Float[np.ndarray, "p p"],
+    metres: float = 1.0,
+    outline: ContainerOutline | None = None,
+) -> Uncertainty:
+    """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
+
+    Args:
+        adjusted: the turntable.
+        covariance: of its parameters (``Adjusted.covariance``).
+        metres: length of its unit.
+        outline: of the container, where its radius gives the scale and its foot the disc's height.
+    """
+    layout, turntable = adjusted.problem.layout, adjusted.turntable
+    sigmas = np.sqrt(covariance.diagonal())
+    values, axes = np.linalg.eigh(covariance)
+    normal = np.random.default_rng(0).normal(size=(_DRAWS, len(values)))
+    drawn = normal * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+    angles = np.pad(drawn, ((0, 0), (0, 1)))[:, layout.angle]
+    # A small rotation of the camera, and of the object about the axis, in the camera's axes.
+    camera = np.zeros((_DRAWS, 5))
+    camera[:, : len(layout.camera)] = drawn[:, layout.camera]
+    turns = camera[:, None, 1:4] + angles[..., None] * turntable.camera_rotation[:, 2]
+    # The camera over the disc: its distance from the axis, its height, and its way along the circle from the first
+    # frame's. And the size of what turns.
+    height, size = _landmark_gradients(adjusted)
+    radius, radius_variance = np.zeros_like(size), 0.0
+    if outline is not None:
+        height, radius_variance = _foot_gradient(adjusted, outline), outline.radius_sigma**2
+        radius[layout.camera] = radius_by_camera(outline, turntable)[: len(layout.camera)]
+    place = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
+    position = place[:, None] + (turntable.distance * angles) ** 2
+    variance = (metres**2) * position.max(axis=1).mean()
+    distance = float(sigmas[4]) ** 2 if 4 in layout.camera else 0.0
+    if outline is not None:
+        # The container's size is exact: what the camera leaves open in its radius is open in the camera's distance.
+        distance += float(radius @ covariance @ radius) + radius_variance
+        reach_sq = turntable.distance**2 + outline.foot**2
+        variance += metres**2 * (outline.foot_sigma**2 + distance * reach_sq)
+    return Uncertainty(
+        focal=float(sigmas[0]),
+        distance=float(np.sqrt(distance)),
+        size=float(np.sqrt((size - radius) @ covariance @ (size - radius) + radius_variance)),
+        angle_deg=adjusted.angle_sigmas_deg(covariance),
+        rotation_deg=float(np.rad2deg(np.sqrt((turns**2).sum(axis=-1).max(axis=1).mean()))),
+        position_m=float(np.sqrt(variance)),
+    )
+
+
+def _foot_gradient(adjusted: Adjusted, outline: ContainerOutline) -> Float[np.ndarray, "p"]:
+    """Derivatives of the height at which the container's foot, as it is seen, meets the axis' side of the camera."""
+    layout, turntable = adjusted.problem.layout, adjusted.turntable
+    rotations, _ = turntable.motions()
+    nearest = rotations[0].T @ [outline.radius, 0.0, outline.foot]
+    frame = np.zeros(1, int)
+    jacobian = projection_jacobian(turntable, frame, project(turntable, frame, nearest[None]))
+    gradient = np.zeros(layout.motion_size)
+    gradient[layout.camera] = -jacobian.camera[0, 1, : len(layout.camera)] / jacobian.point[0, 1, 2]
+    return gradient
+
+
+def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    """Derivatives of the disc's height, and of the log of the landmarks' distances from the axis (RMS).
+
+    By camera, angles and the rest, with all landmarks following. Markers count where there are any.
+    """
+    turntable = adjusted.turntable
+    equations = adjusted.problem.normal_equations(turntable)
+    # The markers' residuals come last, where there are any.
+    response, residuals = equations.landmark_responses()[-1], adjusted.problem.residuals[-1]
+    if isinstance(residuals, PointResiduals):
+        shifts, places = response, turntable.points_3d
+    else:
+        shifts, places = response[:, 3:6], turntable.marker_poses[:, :3, 3]
+    weight = places[:, :2] / (places[:, :2] ** 2).sum()
+    size = np.einsum("lk,lkp->p", weight, shifts[:, :2])
+    return shifts[lowest_landmarks(turntable), 2].mean(axis=0), size
+
+
+def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
+    """The same turntable with a covariance that counts smooth displacements over the image (``smooth_fields``).
+
+    Residuals hardly show them, for another camera explains most of them. Of features they show some, which then tell
+    how large the others are.
+    """
+    turntable, problem = adjusted.turntable, adjusted.problem
+    parts = [
+        part.with_hidden(
+            (_FEATURE_FIELD_PX if isinstance(part, PointResiduals) else _FIELD_PX) * smooth_fields(part.pixels)
+        )
+        for part in problem.residuals
+    ]
+    counted = Problem(turntable, *parts, free=problem.free)
+    larger = [
+        part.with_hidden(part.hidden * np.sqrt(max(1.0, _shown_variance(counted, turntable, k))))
+        if isinstance(part, PointResiduals) and part.hidden is not None
+        else part
+        for k, part in enumerate(parts)
+    ]
+    return replace(adjusted, problem=Problem(turntable, *larger, free=problem.free))
+
+
+def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
+    """Variance of the amplitudes of one kind's hidden errors, by the method of moments.
+
+    At the solution the derivatives of the cost by the amplitudes are V a + noise: V is what the parameters leave of
+    their information, and the noise is the scatter from point to point.
+    """
+    equations, hidden = problem.normal_equations(turntable), problem.layout.hidden[kind]
+    information, (_, scores) = equations.information(), equations.reduced()[kind]
+    shown = np.setdiff1d(np.arange(len(information)), np.concatenate(problem.layout.hidden))
+    response = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True) @ information[np.ix_(shown, hidden)]
+    left = information[np.ix_(hidden, hidden)] - information[np.ix_(hidden, shown)] @ response
+    scores = scores[:, hidden] - scores[:, shown] @ response
+    gradient = scores.sum(axis=0)
+    return float((gradient @ gradient - (scores**2).sum()) / (left**2).sum())
+
+
+def smooth_fields(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 k"]:
+    """Polynomials of the place up to the third degree along x and along y, each with a root mean square of 1 px."""
+    place = pixels - np.median(pixels, axis=0)
+    x, y = (place / np.abs(place).max()).T
+    shapes = np.stack([x**i * y ** (n - i) for n in (1, 2, 3) for i in range(n + 1)], axis=-1)
+    shapes /= np.sqrt((shapes**2).mean(axis=0))
+    nothing = np.zeros_like(shapes)
+    return np.stack([np.concatenate(pair, axis=-1) for pair in ((shapes, nothing), (nothing, shapes))], axis=1)

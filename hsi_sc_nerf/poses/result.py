@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 
+_STEPS_SHORT_OF_A_TURN = 1.5
+"""A session is a full turn if no more than this many of its steps are missing from 360 degrees."""
+
 
 @dataclass(frozen=True)
 class RejectedMarker:
@@ -127,3 +130,9 @@ class TurntablePoses:
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""
     uncertainty: Uncertainty | None = None
+
+
+def is_full_turn(angles_deg: np.ndarray) -> bool:
+    """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""
+    widest_step = np.abs(np.diff(angles_deg)).max()
+    return bool(abs(angles_deg[-1] - angles_deg[0]) >= 360.0 - _STEPS_SHORT_OF_A_TURN * widest_step)

@@ -77,7 +77,6 @@ def structure_from_motion(
     names: Sequence[str],
     *,
     focal_px: float | None = None,
-    moving: Bool[np.ndarray, "h w"] | None = None,
 ) -> FreePoses:
     """Poses of a camera that goes round the object at rest, from the images of the turning object.
 
@@ -85,14 +84,13 @@ def structure_from_motion(
         images: one gray image per frame in the order of the turn, all of one size.
         names: the frames' names, for messages.
         focal_px: of the camera, where it is known; mapping holds it.
-        moving: where features are detected; by default ``moving_pixels``.
 
     Raises:
         InputError: nothing moves, or the object has too little texture to pose three frames.
         ValueError: images of different sizes, or not one name per image.
     """
     check_frames(images, names)
-    moving = moving_pixels(images) if moving is None else moving
+    moving = moving_pixels(images)
     if not moving.any():
         raise InputError(
             f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "

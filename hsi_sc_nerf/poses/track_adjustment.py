@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
+from hsi_sc_nerf.poses.posed_session import with_hidden_errors
 from hsi_sc_nerf.poses.residuals import (
     MarkerResiduals,
     PointResiduals,
@@ -22,7 +23,6 @@ from hsi_sc_nerf.poses.residuals import (
 )
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
-from hsi_sc_nerf.poses.uncertainty import with_hidden_errors
 
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
@@ -66,26 +66,10 @@ class AdjustedTracks:
     """Rows of the given tracks that were rejected: they do not fit, or too little is left of their point or frame."""
 
     @property
-    def residual_px(self) -> Float[np.ndarray, "m 2"]:
-        """Reprojection errors of the used rows."""
-        return self.turntable.reproject(self.tracks) - self.tracks.pixels
-
-    @property
     def misfit_px(self) -> float:
         """Mean distance of the given rows from their projections; at most 1 px each, as which outliers count."""
-        distances = np.linalg.norm(self.residual_px, axis=-1)
+        distances = self.turntable.errors_px(self.tracks)
         return float((np.minimum(distances, 1.0).sum() + self.outliers.sum()) / len(self.outliers))
-
-    @property
-    def overall_error_px(self) -> float:
-        """Root mean square of the reprojection error."""
-        return float(np.sqrt((self.residual_px**2).sum(-1).mean()))
-
-    def frame_errors_px(self) -> Float[np.ndarray, "f"]:
-        """Root mean square of the reprojection error in each of the turntable's frames."""
-        row = np.searchsorted(self.turntable.frames, self.tracks.frame)
-        squared = (self.residual_px**2).sum(-1)
-        return np.sqrt(np.bincount(row, squared) / np.bincount(row))
 
     def loop_closure_deg(self) -> float | None:
         """What is left of a full turn after adding up the steps between neighbouring frames."""
@@ -143,7 +127,7 @@ def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None 
     for last in [False] * _OUTLIER_ROUNDS + [True]:
         kept = tracks.select(good)
         turntable = _adjusted(turntable, kept, _LOSS_PX, free)
-        size_px = np.linalg.norm(turntable.reproject(kept) - kept.pixels, axis=-1)
+        size_px = turntable.errors_px(kept)
         outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
         if last or not outlier.any():
             break
@@ -174,7 +158,7 @@ def adjust_together(
         The turntable, with markers if they determine their places; and the markers that it was adjusted to.
     """
     start = found.turntable
-    sigma_px = max(float(np.median(np.linalg.norm(found.residual_px, axis=-1))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
+    sigma_px = max(float(np.median(start.errors_px(found.tracks))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
     if markers is not None:
         start = with_markers(start, markers)
         markers = markers.select(start.knows(markers))

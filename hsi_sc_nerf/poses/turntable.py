@@ -107,9 +107,8 @@ class Turntable:
     frames: Int[np.ndarray, "f"]
     angles_rad: Float[np.ndarray, "f"]
     """Counter-clockwise seen from above."""
-    tilts_rad: Float[np.ndarray, "f 2"] | None = None
-    """Rotation vectors (x, y, 0) of a wobbling table; None for a table that does not wobble."""
-    shifts: Float[np.ndarray, "f 3"] | None = None
+    motion: Float[np.ndarray, "f 5"] | None = None
+    """Rotation vectors (x, y, 0; rad) and shifts (3) of a wobbling table; None for a table that does not wobble."""
     side: float = 1.0
     """Of the markers' black square."""
     markers: Int[np.ndarray, "m"] = field(default_factory=_no_numbers)
@@ -123,15 +122,9 @@ class Turntable:
     def motions(self) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
         """Rotation T and shift s of the object in each frame."""
         turns = rotations_about_z(self.angles_rad)
-        if self.tilts_rad is None or self.shifts is None:
+        if self.motion is None:
             return turns, np.zeros((len(turns), 3))
-        return Rotation.from_rotvec(np.pad(self.tilts_rad, ((0, 0), (0, 1)))).as_matrix() @ turns, self.shifts
-
-    def tilts_and_shifts(self) -> Float[np.ndarray, "f 5"]:
-        """Tilts (2, rad) and shifts (3) of each frame, zero for a table that does not wobble."""
-        if self.tilts_rad is None or self.shifts is None:
-            return np.zeros((len(self.frames), 5))
-        return np.concatenate([self.tilts_rad, self.shifts], axis=-1)
+        return Rotation.from_rotvec(_tilts(self.motion)).as_matrix() @ turns, self.motion[:, 2:]
 
     def camera_positions(self) -> Float[np.ndarray, "f 3"]:
         """The camera in the object's axes, frame by frame."""
@@ -181,8 +174,7 @@ class Turntable:
             self,
             frames=self.frames[keep],
             angles_rad=self.angles_rad[keep],
-            tilts_rad=None if self.tilts_rad is None else self.tilts_rad[keep],
-            shifts=None if self.shifts is None else self.shifts[keep],
+            motion=None if self.motion is None else self.motion[keep],
             markers=self.markers[markers],
             marker_poses=self.marker_poses[markers],
             points=self.points[points],
@@ -205,6 +197,18 @@ class Turntable:
         corners = self.corners()[landmark].reshape(-1, 3)
         return project(self, np.repeat(frame, 4), corners).pixels.reshape(-1, 4, 2)
 
+    def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
+        """Distance of each sighting from its projection; of a marker the root mean square over its corners."""
+        away = self.reproject(seen) - (seen.pixels if isinstance(seen, Tracks) else seen.corners_px)
+        return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
+
+    def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
+        """Root mean square error in each of the session's ``size`` frames, nan without sightings; and in all."""
+        squared = self.errors_px(seen) ** 2
+        with np.errstate(invalid="ignore"):
+            of_frames = np.bincount(seen.frame, squared, size) / np.bincount(seen.frame, minlength=size)
+        return np.sqrt(of_frames), float(np.sqrt(squared.mean()))
+
     def resized(self, factor: float) -> Turntable:
         """The turntable with all lengths times a factor: its images stay the same."""
         poses = self.marker_poses.copy()
@@ -215,7 +219,7 @@ class Turntable:
             side=self.side * factor,
             marker_poses=poses,
             points_3d=self.points_3d * factor,
-            shifts=None if self.shifts is None else self.shifts * factor,
+            motion=None if self.motion is None else self.motion * [1.0, 1.0, factor, factor, factor],
         )
 
     def _landmarks(self, seen):
@@ -294,8 +298,8 @@ def projection_jacobian(turntable: Turntable, frame: Int[np.ndarray, "n"], proje
     # A tilted table turns about its own axis: the last column of T.
     by_angle = np.cross(projection.rotation[:, :, 2], projection.rotated)
     motion = None
-    if turntable.tilts_rad is not None:
-        left = _left_jacobian(np.pad(turntable.tilts_rad, ((0, 0), (0, 1))))[frame]
+    if turntable.motion is not None:
+        left = _left_jacobian(_tilts(turntable.motion))[frame]
         motion = np.concatenate([(by_room @ -cross_matrix(projection.rotated) @ left)[..., :2], by_room], axis=-1)
     return Jacobian(
         camera=np.concatenate(camera, axis=-1),
@@ -314,6 +318,11 @@ def square_corners(side_m: float) -> Float[np.ndarray, "4 3"]:
 def rotations_about_z(angles_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
     """Rotations about z, counter-clockwise seen from +z."""
     return Rotation.from_rotvec(np.outer(angles_rad, [0.0, 0.0, 1.0])).as_matrix()
+
+
+def _tilts(motion):
+    """Rotation vectors of the table in each frame."""
+    return np.pad(motion[:, :2], ((0, 0), (0, 1)))
 
 
 def _left_jacobian(rotvec):

@@ -14,16 +14,21 @@ from rich.console import Console
 
 from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
 from hsi_sc_nerf.packed.cube import PixelFlag
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.packed.effects import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
 from hsi_sc_nerf.plotting import new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.sightings import Sightings, sightings
+from hsi_sc_nerf.processing.chamber import background_pixels, picture_of_chamber
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
-from hsi_sc_nerf.processing.still_chamber import background_pixels, picture_of_chamber
-from hsi_sc_nerf.processing.view_changes import Change, change_with_direction, change_with_height
+from hsi_sc_nerf.processing.view_changes import (
+    Change,
+    Sightings,
+    change_with_direction,
+    change_with_height,
+    sightings,
+)
 from hsi_sc_nerf.processing.voted_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
 

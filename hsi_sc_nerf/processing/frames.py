@@ -2,31 +2,35 @@
 
 A frame's cube and pictures are written first and its cache last, so a frame with a cache is finished. An earlier
 cache is deleted before the first of its files is replaced: it would vouch for a cube of other settings.
+Fingerprints of files and settings tell whether an earlier run had the same input.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
 import math
+import os
 import threading
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float16, Num, UInt8, UInt16
 
-from hsi_sc_nerf import paper
+from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, PixelCounts, pack_counts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
-from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
-from hsi_sc_nerf.processing.fingerprint import capture_files, fingerprint
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_width
 from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.terminal import progress_bar
@@ -233,3 +237,48 @@ def _digest(calibration: FrameCalibration) -> str:
         value = getattr(calibration, field.name)
         digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return digest.hexdigest()
+
+
+def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = ()) -> str:
+    """Fingerprint of a whole session and of the settings that it is processed with.
+
+    Args:
+        session: its files count by name, size and time of last change.
+        config: settings, a dataclass.
+        files: further files that the settings name; those that do not exist are left out.
+    """
+    named = _stamps(session.path, [path for path in files if path.is_file()])
+    return fingerprint([session_files(session), asdict(config), named])
+
+
+def fingerprint(content: Any) -> str:
+    """Hash of JSON content and of this package's version."""
+    text = json.dumps([__version__, content], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
+    """Name, size and time of last change of all files of a session."""
+    return [shared_files(session), *(capture_files(session, frame) for frame in session.frames)]
+
+
+def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, int]]:
+    """The same of the files that belong to one capture."""
+    paths = [path for cube in capture.cubes for path in (cube.header_path, cube.data_path)]
+    if capture.metadata is not None:
+        paths.append(capture.metadata.path)
+    return _stamps(session.path, paths)
+
+
+def shared_files(session: Session) -> list[tuple[str, int, int]]:
+    """The same of the files that every frame's reflectance depends on.
+
+    These are ``session.json``, the files it names, and the tarp.
+    """
+    paths = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
+    stamps = _stamps(session.path, [path for path in paths if path is not None and path.is_file()])
+    return stamps if session.white is None else stamps + capture_files(session, session.white)
+
+
+def _stamps(root: Path, paths: Iterable[Path]) -> list[tuple[str, int, int]]:
+    return [(os.path.relpath(p, root), p.stat().st_size, p.stat().st_mtime_ns) for p in paths]

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
+from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
 
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
@@ -29,7 +30,6 @@ STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
 STANDING_FRACTION = 0.5
 """Fraction of the middle of the lid that what stands on it hides."""
-_MOST_NAMES = 8
 
 
 def check_masks(
@@ -56,14 +56,15 @@ def check_masks(
     empty = np.logical_not(masks.any(axis=(1, 2)))
     found = []
     if empty.any():
+        without = [name for name, is_empty in zip(names, empty, strict=True) if is_empty]
         too_many = empty.mean() > MAX_EMPTY_FRACTION
         found.append(
             Finding(
                 "masks-empty",
                 "red" if too_many else "amber",
-                f"Nothing of the object was found in {_named(names, empty)}; look at report/masks.png and "
-                f"leave these frames out with {_excluding(names, empty)}.",
-                {"frames": _list(names, empty)},
+                f"Nothing of the object was found in {names_in_short(without)}; look at report/masks.png and "
+                f"leave these frames out with {leave_out(without)}.",
+                {"frames": without},
             )
         )
     if empty.all():
@@ -153,7 +154,7 @@ def _hull(
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
     contradiction = _contradiction(masks, silhouettes)
     typical = float(np.median(contradiction[filled]))
-    scatter = 1.4826 * float(np.median(np.abs(contradiction[filled] - typical)))
+    scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
     pixel = outline.sum() / masks.sum()
     if typical > MAX_CONTRADICTION + 0.25 * pixel:
@@ -164,15 +165,16 @@ def _hull(
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
     contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
     odd = (contradiction > typical + max(MAX_ODDITY + 0.125 * pixel, ODDITY_SIGMAS * scatter)) & filled
-    if not odd.any():
+    others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
+    if not others:
         return []
     return [
         Finding(
             "frames-hull",
             "red",
-            f"The object in {_named(names, odd)} has another shape than in the other frames: it is another "
-            f"object, or it was moved; leave these frames out with {_excluding(names, odd)}.",
-            {"frames": {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}},
+            f"The object in {names_in_short([*others])} has another shape than in the other frames: it is another "
+            f"object, or it was moved; leave these frames out with {leave_out([*others])}.",
+            {"frames": others},
         )
     ]
 
@@ -202,19 +204,3 @@ def _contradiction(
     """One minus intersection over union."""
     union = (masks | silhouettes).sum(axis=(1, 2))
     return 1.0 - (masks & silhouettes).sum(axis=(1, 2)) / np.maximum(1, union)
-
-
-def _list(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> list[str]:
-    return [name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen]
-
-
-def _named(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> str:
-    """The chosen names as part of a sentence."""
-    listed = _list(names, chosen)
-    more = f" and {len(listed) - _MOST_NAMES} more" if len(listed) > _MOST_NAMES else ""
-    return ", ".join(listed[:_MOST_NAMES]) + more
-
-
-def _excluding(names: Sequence[str], chosen: Bool[np.ndarray, "frames"]) -> str:
-    """The options that leave the chosen frames out."""
-    return " ".join(f"--exclude {name}" for name in _list(names, chosen))

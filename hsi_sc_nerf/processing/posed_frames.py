@@ -18,10 +18,9 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding, refuse_red
 from hsi_sc_nerf.geometry.camera import turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame
-from hsi_sc_nerf.poses.known_camera import KnownCamera
-from hsi_sc_nerf.poses.pose_checks import check_poses
+from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
-from hsi_sc_nerf.poses.report import describe_poses, draw_poses, pose_report
+from hsi_sc_nerf.poses.report import check_poses, describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
 from hsi_sc_nerf.processing.frames import FramePaths
@@ -67,14 +66,8 @@ def pose_frames(
         paths = [FramePaths.of(output_dir, name) for name in names]
         pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm)
     try:
-        poses = find_poses(
-            pictures or images,
-            names,
-            info=info,
-            method=method,
-            camera=camera,
-            progress=not console.quiet,
-        )
+        with console.status("finding poses"):
+            poses = find_poses(pictures or images, names, info=info, method=method, camera=camera)
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
     findings = check_poses(poses, info)
@@ -95,8 +88,14 @@ def pose_frames(
         if best.keys() != {GRAY}:
             seen_in = ", ".join(f"{name} ({count} frames)" for name, count in best.most_common())
             console.print(f"Markers stand out best in {seen_in}.", highlight=False)
-    for warning in _lying_on_its_side(session, report["axis_tilt_in_image_deg"]):
-        console.print(f"Warning: {warning}", highlight=False)
+    # The tilt counts clockwise from the picture's upright.
+    if quarter_turns := round(-report["axis_tilt_in_image_deg"] / 90.0):
+        rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
+        console.print(
+            "Warning: The turntable lies on its side in the pictures; set image_rotation_deg to "
+            f"{rotation_deg} in {session.info_path} to have them upright.",
+            highlight=False,
+        )
     for name in np.array(names)[~poses.used]:
         _log.warning("%s: this frame could not be posed and is left out (see poses.json)", name)
     check(findings)
@@ -146,15 +145,3 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
         direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
     )
-
-
-def _lying_on_its_side(session: Session, axis_tilt_in_image_deg: float) -> list[str]:
-    """A warning where the turntable's axis, clockwise from the picture's upright, points to another side."""
-    quarter_turns = round(-axis_tilt_in_image_deg / 90.0)
-    if quarter_turns == 0:
-        return []
-    rotation_deg = (session.image_rotation_deg + 90 * quarter_turns) % 360
-    return [
-        f"The turntable lies on its side in the pictures; set image_rotation_deg to {rotation_deg} in "
-        f"{session.info_path} to have them upright."
-    ]

@@ -12,12 +12,11 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.calibration_checks import check_calibration
+from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import (
     REPORT_NAME,
     describe_calibration,
-    describe_pixel_counts,
     draw_calibration,
     write_calibration,
 )
@@ -26,6 +25,7 @@ from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import require_writable, write_png
 from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session, suggestion
+from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
     Container,
@@ -38,9 +38,9 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
-from hsi_sc_nerf.processing.fingerprint import session_fingerprint
-from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames
+from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import (
@@ -50,11 +50,12 @@ from hsi_sc_nerf.processing.posed_frames import (
     pose_frames,
     posed_frames,
 )
-from hsi_sc_nerf.processing.region_spectra import background_spectrum, object_spectrum
-from hsi_sc_nerf.processing.scene_box import assumed_disc, object_box, scene_box
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
-from hsi_sc_nerf.processing.voted_hull import VotedHull, voted_hull
+from hsi_sc_nerf.processing.voted_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
+
+OBJECT_PIXELS = 2000
+"""Pixels of a frame, or a few more, that the object's mean spectrum is taken from."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,8 @@ def process_session(
         progress=progress,
     )
     pixel_counts = PixelCounts.total(cache.pixel_counts for cache in caches)
-    num_values = sum(cache.gray.size for cache in caches) * len(calibration.bands)
-    console.print(describe_pixel_counts(pixel_counts, num_values), highlight=False)
+    num_pixels = sum(cache.gray.size for cache in caches)
+    checks.add([check_clipped(session, calibration, pixel_counts, num_pixels)])
     poses = pose_frames(
         session,
         [cache.gray for cache in caches],
@@ -176,7 +177,7 @@ def process_session(
     object_box_m, scene_box_m = _boxes(session, hull, poses, container, console)
     typical = None
     if calibration.uncertainty is not None:
-        typical = calibration.uncertainty.standard_deviation(object_spectrum(frames, masks))
+        typical = calibration.uncertainty.standard_deviation(_object_spectrum(frames, masks))
     write_calibration(output_dir / REPORT_NAME, session, calibration, pixel_counts, typical)
 
     wavelengths_nm = session.wavelengths_nm[calibration.bands]
@@ -303,6 +304,25 @@ def _write_masks(
     console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
     checks.add(findings)
     return masks, hull
+
+
+def _object_spectrum(
+    frames: Sequence[PackedFrame], masks: Bool[np.ndarray, "frames h w"]
+) -> Float[np.ndarray, "bands"]:
+    """Mean over frames of the mean reflectance in the mask; 0 in a band that no frame measured there.
+
+    At most `OBJECT_PIXELS` or a few more pixels of a frame are read, evenly spread over the mask.
+    """
+    total = np.zeros(frames[0].cube().shape[-1])
+    number = np.zeros_like(total)
+    for frame, mask in zip(frames, masks, strict=True):
+        pixels = np.flatnonzero(mask)
+        chosen = np.unravel_index(pixels[:: max(1, len(pixels) // OBJECT_PIXELS)], mask.shape)
+        reflectance, valid = unpack(frame.cube()[chosen])
+        measured = valid.sum(axis=0)
+        total += reflectance.sum(axis=0) / np.maximum(measured, 1)
+        number += measured > 0
+    return total / np.maximum(number, 1)
 
 
 def _boxes(

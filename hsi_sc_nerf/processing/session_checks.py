@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from hsi_sc_nerf.errors import InputError
@@ -85,4 +86,4 @@ class SessionChecks:
         Raises:
             InputError: the file cannot be written.
         """
-        write_json(self._path, {**self._report, "findings": [finding.as_json() for finding in self._findings]})
+        write_json(self._path, {**self._report, "findings": [asdict(finding) for finding in self._findings]})

@@ -20,6 +20,8 @@ from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 
 MIN_SPECTRA = 64
 """Fewer spectra determine neither noise nor rank."""
+MAX_RANK = 16
+"""Largest number of directions above the noise that is taken."""
 _NOISE_DRAWS = 3
 # Bands on each side that predict a band where its noise is estimated from the spectra alone.
 _NEIGHBOUR_BANDS = 12
@@ -78,7 +80,6 @@ def find_subspace(
     spectra: Float[np.ndarray, "n bands"],
     noise: Float[np.ndarray, "*n bands"] | None = None,
     valid: Bool[np.ndarray, "n bands"] | None = None,
-    max_rank: int = 16,
 ) -> SpectralSubspace:
     """The subspace of spectra above their noise.
 
@@ -89,7 +90,6 @@ def find_subspace(
         spectra: reflectance.
         noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
         valid: which values are measurements; spectra with any other are left out. All if not given.
-        max_rank: largest number of directions above the noise that is taken.
 
     Raises:
         InputError: too few spectra have all bands.
@@ -113,7 +113,7 @@ def find_subspace(
     # The triangle of a QR decomposition has the singular values and directions of the whole.
     _, singular, directions = np.linalg.svd(np.linalg.qr(sample / noise_scale, mode="r"))
     above_noise = int((singular > _largest_noise_value(deviation / noise_scale)).sum())
-    rank = max(1, min(above_noise, max_rank))
+    rank = max(1, min(above_noise, MAX_RANK))
 
     span, _ = np.linalg.qr((directions[:rank] * band_noise).T)
     _, _, rotation = np.linalg.svd(sample @ span, full_matrices=False)

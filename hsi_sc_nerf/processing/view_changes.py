@@ -1,5 +1,7 @@
 """How the brightness of the object's points changes, from view to view and from place to place, before any training.
 
+The points are those of the masks' hull, looked up in the frames.
+
 What changes with the direction that a point faces in the camera's frame is light or gloss that stands still with the
 camera. It is fitted beside each frame's own brightness, and each sector of the object is predicted by the others: the
 object's texture, which wrong poses and a hull beside the surface shift, and noise then count for nothing.
@@ -10,11 +12,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.processing.sightings import Sightings
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics, project
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.processing.voted_hull import VotedHull
 
 NORMAL_CELLS = 6
 """Cells of the normals' directions to the right and upwards in the camera's frame."""
@@ -24,6 +30,17 @@ ALIKE = 12
 """A point's brightness is compared with that of so many others of the most similar spectra."""
 _RIDGE = 1e-6
 _LEAST_RIDGE = 1e-12
+COLOURS = 6
+"""Neighbouring bins of bands are averaged to this number of colours."""
+MAX_POINTS = 2000
+MAX_FRAMES = 60
+MAX_INCIDENCE_DEG = 60.0
+"""Points are looked up where they are seen at less than this: towards the outline, pixels mix with the chamber."""
+OUTLINE_PX = 2
+"""Pixels within this of the mask's edge are left out."""
+SECTORS = 8
+"""Sectors of the object about its axis, of which each can be predicted by the others."""
+_SMOOTH_VOXELS = 1.5
 
 
 @dataclass(frozen=True)
@@ -137,3 +154,135 @@ def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]],
         explained.append(covariance)
         sizes.append(size)
     return change_of(explained, sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Points of the object as the frames see them; one row a sighting.
+
+    Attributes:
+        point: number of the point.
+        frame: number of the frame.
+        normal: of the point in the camera's frame: right, up, towards the camera.
+        reflectance: by colour.
+        positions_m: of the points, object frame.
+        normals: of the points, object frame.
+    """
+
+    point: Int[np.ndarray, "n"]
+    frame: Int[np.ndarray, "n"]
+    normal: Float[np.ndarray, "n 3"]
+    reflectance: Float[np.ndarray, "n colours"]
+    positions_m: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "points 3"]
+
+    @property
+    def sector(self) -> Int[np.ndarray, "points"]:
+        """Sector of each point about the object's axis."""
+        x, y = (self.positions_m - self.positions_m.mean(axis=0))[:, :2].T
+        return np.minimum(((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int), SECTORS - 1)
+
+
+def sightings(
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"],
+    hull: VotedHull,
+) -> Sightings:
+    """Look the hull's points up in the frames.
+
+    Args:
+        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
+        masks: true on the object.
+        camera_to_worlds: poses, OpenGL axes.
+        intrinsics: of the one camera.
+        distortion: k1, k2, p1, p2 (OpenCV).
+        hull: of the masks.
+    """
+    distance_m = float(np.linalg.norm(camera_to_worlds[:, :3, 3] - hull.core.mean(axis=0), axis=1).mean())
+    # The hull is that of masks which were dilated by this.
+    excess_m = (hull.voxel_px - 1) / 2.0 * distance_m / intrinsics.fl_x
+    everywhere, normals = _surface(hull, excess_m)
+    rng = np.random.default_rng(0)
+    lid_m = hull.core[:, 2].min() + 2.0 * hull.sides_m[2]
+    chosen = rng.permutation(np.flatnonzero(everywhere[:, 2] > lid_m))[:MAX_POINTS]
+    points, normals = everywhere[chosen], normals[chosen]
+    found: list[tuple[np.ndarray, ...]] = []
+    for frame in range(0, len(masks), -(-len(masks) // MAX_FRAMES)):
+        pose = camera_to_worlds[frame]
+        pixels, depth = through_lens(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
+        to_eye = pose[:3, 3] - points
+        facing = (normals * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
+        inside = ~dilate(~masks[frame], 2 * OUTLINE_PX + 1)
+        x, y = np.floor(pixels).astype(int).T
+        in_image = (x >= 0) & (y >= 0) & (x < intrinsics.w) & (y < intrinsics.h)
+        seen = in_image & (facing > np.cos(np.deg2rad(MAX_INCIDENCE_DEG)))
+        seen[seen] = inside[y[seen], x[seen]]
+        seen &= _nearest(everywhere, points, depth, pose, intrinsics, hull)
+        rows = np.flatnonzero(seen)
+        at = pixels[rows].T[::-1] - 0.5
+        image = colours_of(bins[frame])
+        values = np.stack([ndimage.map_coordinates(colour, at, order=1) for colour in image], axis=-1)
+        found.append((rows, np.full(len(rows), frame), normals[rows] @ pose[:3, :3], values))
+    point, frames, normal, reflectance = map(np.concatenate, zip(*found, strict=True))
+    return Sightings(point, frames, normal, reflectance, points, normals)
+
+
+def through_lens(
+    points: Float[np.ndarray, "n 3"],
+    pose: Float[np.ndarray, "4 4"],
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"],
+) -> Float[np.ndarray, "n 2"]:
+    """Pixel coordinates of points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
+    to_camera = np.linalg.inv(pose @ OPENCV_TO_OPENGL)
+    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]
+
+
+def _surface(hull: VotedHull, inwards_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points on the hull's smoothed surface, moved inwards, and their normals."""
+    low = hull.core.min(axis=0)
+    index = np.rint((hull.core - low) / hull.sides_m).astype(int) + 4
+    full = np.zeros(index.max(axis=0) + 5, np.float32)
+    full[tuple(index.T)] = 1.0
+    border = index[~ndimage.binary_erosion(full)[tuple(index.T)]]
+    smooth = ndimage.gaussian_filter(full, _SMOOTH_VOXELS)
+    gradient = np.stack([part[tuple(border.T)] for part in np.gradient(smooth)], axis=-1) / hull.sides_m
+    steepness = np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-9)
+    normals = -gradient / steepness
+    level = (smooth[tuple(border.T)] - 0.5)[:, None] / steepness
+    outwards_m = np.clip(level, -hull.sides_m.max(), hull.sides_m.max()) - inwards_m
+    return low + (border - 4) * hull.sides_m + outwards_m * normals, normals
+
+
+def _nearest(
+    everywhere: Float[np.ndarray, "m 3"],
+    points: Float[np.ndarray, "n 3"],
+    depth: Float[np.ndarray, "n"],
+    pose: Float[np.ndarray, "4 4"],
+    intrinsics: PinholeIntrinsics,
+    hull: VotedHull,
+) -> Bool[np.ndarray, "n"]:
+    """Points that no other part of the surface hides from a camera."""
+    cell_px = hull.voxel_px
+    shape = (intrinsics.h // cell_px + 1, intrinsics.w // cell_px + 1)
+
+    def cells(seen: Float[np.ndarray, "k 3"]) -> tuple[np.ndarray, np.ndarray]:
+        pixels, depths = project(seen, pose, intrinsics)
+        column, line = (pixels / cell_px).astype(int).clip(0, (shape[1] - 1, shape[0] - 1)).T
+        return line * shape[1] + column, depths
+
+    front = np.full(shape[0] * shape[1], np.inf)
+    cell, depths = cells(everywhere)
+    np.minimum.at(front, cell, depths)
+    # Across a cell, a surface seen obliquely recedes by up to twice its width.
+    return depth < front[cells(points)[0]] + 3.0 * float(np.linalg.norm(hull.sides_m))
+
+
+def colours_of(bins: Float[np.ndarray, "bins h w"]) -> Float[np.ndarray, "colours h w"]:
+    """Means of neighbouring bins."""
+    parts = np.array_split(np.asarray(bins, np.float32), min(COLOURS, len(bins)))
+    return np.stack([part.mean(axis=0) for part in parts])

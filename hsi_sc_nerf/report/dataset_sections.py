@@ -12,9 +12,8 @@ from markupsafe import Markup
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json
-from hsi_sc_nerf.findings import Finding, judged
+from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.packed.effects import EFFECT_COLUMNS, effect_rows
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 

@@ -1,15 +1,17 @@
-"""Findings of the calibration, on a small session whose calibration is then spoilt in one way."""
+"""Whites and what is none, and a small session whose calibration is spoilt in one way."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from capture_factory import BANDS, SIZE_PX, write_session
+from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, expose, write_capture, write_session
 
-from hsi_sc_nerf.calibration.calibration_checks import check_calibration
+from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped, check_white
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.calibration.noise import NoiseModel
+from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
+from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
 
 
@@ -22,7 +24,7 @@ def calibrated(tmp_path_factory):
 def level_of(name, calibrated, **changes):
     session, calibration = calibrated
     findings = {finding.name: finding for finding in check_calibration(session, replace(calibration, **changes))}
-    assert list(findings) == ["drift", "clipped", "noise"]
+    assert list(findings) == ["drift", "noise"]
     assert all(finding.sentence.count(". ") == 0 for finding in findings.values())
     return findings[name].level
 
@@ -30,7 +32,7 @@ def level_of(name, calibrated, **changes):
 def drift(change=0.05, error=0.001, scatter=0.003):
     factor = 1.0 - change * np.linspace(0.0, 1.0, 4)[:, None] * np.ones(BANDS)
     static = np.ones((8, SIZE_PX), bool)
-    return LampDriftEstimate(factor, factor, np.full(factor.shape, error), static, scatter, 0.0, True)
+    return LampDriftEstimate(factor, factor, np.full(factor.shape, error), static, scatter, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -49,32 +51,19 @@ def test_drift(calibrated, measured, level):
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "changes", "level"),
-    [
-        (0, {}, "green"),
-        # The wall has 0.8 of the white's light.
-        (4, {"gain": 1.4}, "red"),
-        (4, {"gain": 1.4, "bounds": (0.0, 1.3)}, "green"),
-        (1, {"saturation_counts": 1000.0}, "amber"),
-        (4, {"saturation_counts": 1000.0}, "red"),
-        (4, {"saturation_counts": 1000.0, "dead": np.ones((SIZE_PX, BANDS), bool)}, "green"),
-    ],
+    ("clipped", "saturated", "level"),
+    [(0, 0, "green"), (2, 0, "amber"), (30, 0, "red"), (0, 2, "amber"), (0, 60, "red")],
 )
-def test_clipped(calibrated, spoilt, changes, level):
-    frames = list(calibrated[1].frames)
-    for number, frame in enumerate(frames[:spoilt]):
-        frames[number] = replace(frame, **{**changes, "gain": frame.gain * changes.get("gain", 1.0)})
-    assert level_of("clipped", calibrated, frames=tuple(frames)) == level
-
-
-def test_saturation_is_told_of_a_band_only_where_there_is_some(calibrated):
-    def told(**changes):
-        frames = tuple(replace(frame, **changes) for frame in calibrated[1].frames)
-        findings = check_calibration(calibrated[0], replace(calibrated[1], frames=frames))
-        return next(finding.sentence for finding in findings if finding.name == "clipped")
-
-    assert " nm)" not in told()
-    assert " nm)" in told(saturation_counts=1000.0)
+def test_clipped(calibrated, clipped, saturated, level):
+    """Percent of the values, and of one band; lower values and dead elements do no harm."""
+    session, calibration = calibrated
+    pixels, none = 1000, np.zeros(BANDS, int)
+    of_one_band = none.copy()
+    of_one_band[2] = 10 * saturated
+    counts = PixelCounts(none + 500, none + 10 * clipped, of_one_band, none + 300, none)
+    finding = check_clipped(session, calibration, counts, pixels)
+    assert (finding.name, finding.level) == ("clipped", level)
+    assert (f"{WAVELENGTHS_NM[2]:.0f} nm" in finding.sentence) == (saturated > 0)
 
 
 @pytest.mark.parametrize(
@@ -91,3 +80,146 @@ def test_noise(calibrated, slope, measured, scatter, level):
     noise = NoiseModel(np.full(BANDS, 2.0), slope, measured, True)
     assert level_of("noise", calibrated, noise=noise, drift=drift(scatter=scatter)) == level
     assert level_of("noise", calibrated, noise=None, white=None) == "green"
+
+
+LINES, SAMPLES, FRAMES = 40, 60, 6
+LEAF = np.where(WAVELENGTHS_NM < 700.0, 0.08, 0.8)
+
+
+def frame(number, wall=0.6, light=0.5):
+    """A wall, and before it an object with dark and bright stripes that turn."""
+    reflectance = np.full((LINES, SAMPLES, BANDS), wall)
+    x = np.arange(20, 42)
+    stripes = np.where(np.sin(2.0 * np.arccos((x - 30.5) / 11.0) * 3 + number) > 0.0, light, 0.05)
+    reflectance[10:34, 20:42] = stripes[:, None]
+    return reflectance
+
+
+def tarp():
+    """A tarp that does not fill the image, in uneven light, with weave, dust and a fold."""
+    rng = np.random.default_rng(0)
+    white = np.full((LINES, SAMPLES, BANDS), 0.1)
+    white[3:-3, 3:-3] = np.linspace(0.75, 1.05, SAMPLES - 6)[:, None]
+    white *= 1.0 + 0.04 * rng.standard_normal((LINES, SAMPLES, 1))
+    white[rng.random((LINES, SAMPLES)) < 0.02] *= 0.6
+    white[20:23] *= 0.8
+    return white
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Writes a session with the given white and opens it; returns its findings and itself."""
+
+    def write(white, frames=None, **header):
+        frames = [frame(number) for number in range(FRAMES)] if frames is None else frames
+        for number, reflectance in enumerate(frames):
+            write_capture(tmp_path, f"pear_{number}", expose(reflectance))
+        write_capture(tmp_path, "white_reference", expose(white))
+        opened = open_session(tmp_path)
+        return {finding.name: finding for finding in check_white(opened)}, opened
+
+    return write
+
+
+def levels(findings):
+    return findings["white"].level, findings["white-clipped"].level
+
+
+@pytest.mark.parametrize("wall", [0.1, 0.6, 0.95])
+def test_a_worn_tarp_is_a_white(session, wall):
+    findings, opened = session(tarp(), [frame(number, wall) for number in range(FRAMES)])
+    assert findings["white"].level == "green"
+    # Before a white wall, uneven light takes values above the white's.
+    assert findings["white-clipped"].level == ("green" if wall < 0.9 else "red")
+    # Nothing is clipped that the exposure explains.
+    assert levels({f.name: f for f in check_white(replace(opened, frames=opened.frames[:2]))})[0] == "green"
+
+
+def test_a_tarp_beside_the_object_is_a_white(session):
+    white = frame(FRAMES)
+    white[:, 46:] = 1.0
+    assert levels(session(white)[0]) == ("green", "green")
+
+
+@pytest.mark.parametrize("count", [3, FRAMES])
+@pytest.mark.parametrize("wall", [0.1, 0.6])
+def test_a_frame_is_no_white(session, wall, count):
+    findings, _ = session(frame(FRAMES, wall), [frame(number, wall) for number in range(count)])
+    assert findings["white"].level == "red"
+    assert findings["white"].values["looks_most_like_a_white"] is None
+
+
+def test_a_frame_of_another_object_is_no_white(session):
+    assert session(frame(20, light=0.35))[0]["white"].level == "red"
+
+
+def test_the_capture_that_looks_like_a_white_is_named(session):
+    frames = [frame(number) for number in range(FRAMES)]
+    frames[4] = tarp()
+    white = session(frame(FRAMES), frames)[0]["white"]
+    assert white.level == "red"
+    assert white.values["looks_most_like_a_white"] == "pear_4"
+    assert "pear_4" in white.sentence
+
+
+@pytest.mark.parametrize(
+    ("white", "clipped"),
+    [
+        (0.2 * np.ones((LINES, SAMPLES, BANDS)), "red"),
+        (np.broadcast_to(LEAF, (LINES, SAMPLES, BANDS)), "red"),
+        (np.zeros((LINES, SAMPLES, BANDS)), "green"),
+        (np.random.default_rng(1).uniform(0.3, 1.0, (LINES, SAMPLES, 1)) * np.ones(BANDS), "amber"),
+    ],
+    ids=["dim", "leaf", "dark", "gravel"],
+)
+def test_what_is_dark_coloured_or_rough_is_no_white(session, white, clipped):
+    findings, _ = session(white)
+    assert findings["white"].level == "red"
+    assert clipped in ("amber", findings["white-clipped"].level)
+
+
+def test_a_longer_exposure_of_the_frames_is_taken_into_account(session):
+    _, opened = session(tarp())
+    for capture in opened.frames:
+        counts = np.rint((capture.cube.read().astype(float) - DARK) * 3.0 + DARK).astype(np.uint16)
+        write_cube(capture.cube.header_path, counts, wavelengths_nm=WAVELENGTHS_NM, extra_header={"tint": 30})
+    unknown = {finding.name: finding for finding in check_white(open_session(opened.path))}
+    assert unknown["white-clipped"].level == "red"
+    assert opened.white is not None
+    write_cube(
+        opened.white.cube.header_path,
+        opened.white.cube.read(),
+        wavelengths_nm=WAVELENGTHS_NM,
+        extra_header={"tint": 10},
+    )
+    known = {finding.name: finding for finding in check_white(open_session(opened.path))}
+    assert levels(known) == ("green", "green")
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "expected"),
+    [
+        (np.ones((3, SAMPLES, BANDS)), ("green", "green")),
+        (0.5 * np.ones((3, SAMPLES, BANDS)), ("green", "red")),
+        (0.1 * np.ones((3, SAMPLES, BANDS)), ("red", "red")),
+        (frame(1), ("red", "amber")),
+    ],
+    ids=["white", "shaded", "dim", "a frame"],
+)
+def test_a_white_of_each_capture(session, spoilt, expected):
+    _, opened = session(tarp())
+    for capture in opened.frames:
+        counts = np.rint(spoilt * LAMP).astype(np.uint16)
+        header = capture.cube.header_path
+        write_cube(header.with_name(f"WHITEREF_{header.name}"), counts, wavelengths_nm=WAVELENGTHS_NM)
+    own = open_session(opened.path)
+    findings = {finding.name: finding for finding in check_white(own, "capture")}
+    assert findings["white"].level == expected[0]
+    assert expected[1] in ("amber", findings["white-clipped"].level)
+    assert levels({finding.name: finding for finding in check_white(own)}) == ("green", "green")
+
+
+def test_finished_reflectance_needs_no_white(session):
+    _, opened = session(tarp())
+    frames = tuple(replace(capture, product=capture.cube) for capture in opened.frames)
+    assert [f.level for f in check_white(replace(opened, white=None, frames=frames))] == ["green"]

@@ -217,7 +217,7 @@ def test_bad_bands_are_listed_unlit_or_mostly_dead():
     defects = find_defects(Readings(light[None] + 100.0, np.full((1, 50, 20), 100.0)), good_bands=listed)
     np.testing.assert_array_equal(np.flatnonzero(defects.bad_bands), [4, 5, 6, 17])
     assert not defects.dead.any()
-    np.testing.assert_array_equal(unlit_bands(np.array([[5.0, 0.0, np.nan, 1000.0]]), 0.01), [1, 1, 1, 0])
+    np.testing.assert_array_equal(unlit_bands(np.array([[0.9, 0.0, np.nan, 1000.0]])), [1, 1, 1, 0])
 
 
 def test_session_without_dark_cubes():

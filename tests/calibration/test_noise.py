@@ -145,11 +145,6 @@ def test_real_white_reference_follows_the_line():
     assert np.median(np.abs(seen / noise.variance(mean) - 1.0)) < 0.1
 
 
-def test_variance_of_a_reading():
-    noise = NoiseModel(np.array([3.0, 4.0]), 0.5, True, True)
-    np.testing.assert_allclose(noise.variance(np.array([[10.0, 20.0], [-5.0, 0.0]])), [[14.0, 26.0], [9.0, 16.0]])
-
-
 # The uncertainty of a reflectance, against exposures drawn again and again with the simulator's noise.
 
 DARK_LEVEL, ELECTRONS_PER_COUNT, READ_ELECTRONS = 120.0, 7.3, 40.0

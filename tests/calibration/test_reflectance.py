@@ -95,13 +95,6 @@ def plain(rng) -> FrameCalibration:
     )
 
 
-def test_plain(rng, plain):
-    result = check(make_counts(rng), plain)
-    assert result.pixel_counts.clipped_low.sum() > 0
-    assert result.pixel_counts.clipped_high.sum() > 0
-    assert not result.flags.any()
-
-
 def test_counts_equal_to_dark_are_not_clipped(plain):
     dark = np.rint(plain.dark)
     counts = np.broadcast_to(dark, (LINES, SAMPLES, BANDS)).astype(np.uint16)
@@ -162,17 +155,6 @@ def test_floats_that_are_not_finite_are_no_data(rng, plain):
     assert result.pixel_counts.no_data.sum() == 2
 
 
-def test_finished_reflectance(rng):
-    product = rng.uniform(-0.1, 1.2, (LINES, BANDS, SAMPLES)).astype(np.float32).transpose(0, 2, 1)
-    unit = FrameCalibration(dark=np.zeros((1, BANDS)), gain=np.ones((1, BANDS)), bands=np.arange(BANDS))
-    check(product, unit)
-
-
-@pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.05, 0.8), (-0.2, 5.0)])
-def test_bounds(rng, plain, bounds):
-    check(make_counts(rng, high=8000), replace(plain, bounds=bounds))
-
-
 def test_calibration_that_is_not_finite(rng, plain):
     for wrong in (
         replace(plain, gain=np.full((1, BANDS), np.inf)),
@@ -202,7 +184,7 @@ def test_any_calibration(data):
         dark=rng.uniform(50.0, 150.0, (columns, bands)),
         gain=rng.uniform(0.2, 1.5, (columns, bands)) / 900.0,
         bands=kept,
-        bounds=data.draw(st.sampled_from([(0.0, 1.0), (0.1, 0.7), (0.0, 1.3)])),
+        bounds=data.draw(st.sampled_from([(0.0, 1.0), (0.1, 0.7), (-0.2, 5.0)])),
         flat=rng.uniform(0.5, 1.5, (lines, samples)) if optional["flat"] else None,
         saturation_counts=900.0 if optional["sat"] else None,
         dead=rng.random((samples, bands)) < 0.2 if optional["dead"] else None,

@@ -234,30 +234,6 @@ def test_other_sources_of_white(tmp_path):
     assert not by_target.drift_corrected
 
 
-@pytest.mark.slow
-def test_finished_reflectance_as_input(tmp_path):
-    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["image_rotation"])
-    folder = simulate_session(scene, tmp_path / "session", progress=False)
-    truth = load_truth(folder)
-    session = open_session(folder)
-    for capture in session.frames:
-        finished = truth.light(capture.name).radiance()
-        results = folder / capture.name / "results"
-        write_cube(
-            results / f"REFLECTANCE_{capture.name}.hdr",
-            finished.astype(np.float32),
-            wavelengths_nm=truth.wavelengths_nm,
-            data_suffix=".dat",
-        )
-    session = open_session(folder)
-    calibration = calibrate_session(session, CalibrationConfig(white_source="product"))
-    assert calibration.uncertainty is None
-    pack_frames(session, calibration, tmp_path / "data")
-    name = session.frames[0].name
-    reflectance, _ = unpack(open_cube(FramePaths.of(tmp_path / "data", name).cube).memmap())
-    np.testing.assert_allclose(reflectance, np.clip(truth.reflectance(name), 0.0, 1.0), atol=2e-4)
-
-
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Session:
     scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=[])

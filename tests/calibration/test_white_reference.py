@@ -13,7 +13,6 @@ from hsi_sc_nerf.calibration.white_reference import (
     ElementSums,
     column_white,
     deviation_map,
-    find_coarse_roi,
     mean_over_columns,
     smooth_spectrum,
     white_mask,
@@ -61,15 +60,6 @@ def tarp_scene(level: float = 10.0) -> np.ndarray:
     counts[8:32, 10:16] -= 0.3 * LAMP
     counts[20, 30] += 0.5 * LAMP
     return counts
-
-
-def test_roi_is_the_largest_bright_region():
-    brightness = np.zeros((40, 60))
-    brightness[8:32, 10:50] = 1.0
-    brightness[36:39, 2:5] = 1.0
-    assert find_coarse_roi(brightness) == (10, 8, 50, 32)
-    assert find_coarse_roi(np.ones((4, 5))) == (0, 0, 5, 4)
-    assert find_coarse_roi(np.zeros((4, 5))) is None
 
 
 def test_deviation_is_the_mean_of_ratios():
@@ -270,13 +260,6 @@ def test_white_of_one_line_leaves_no_data_out(tmp_path, gap, header):
     expected = np.broadcast_to(LAMP, (5, 7)).copy()
     expected[4, 2] = np.nan
     np.testing.assert_allclose(white.spectrum, expected)
-
-
-def test_dark_columns_by_sample_or_by_band():
-    dark = np.arange(2 * 3 * 4).reshape(2, 3, 4)
-    np.testing.assert_allclose(dark_columns(dark, 3, 4), dark.mean(axis=0))
-    np.testing.assert_allclose(dark_columns(dark, 9, 4), dark.mean(axis=(0, 1))[None])
-    np.testing.assert_array_equal(dark_columns(None, 3, 4), np.zeros((1, 4)))
 
 
 def test_real_maize_kernel():

@@ -93,15 +93,6 @@ def test_micrometres_become_nm(header, unit):
     np.testing.assert_allclose(cube.fwhm_nm, [2.0, 2.0, 2.0, 3.0])
 
 
-def test_real_maize_kernel_opens():
-    cube = open_cube(MAIZE / "4-22-22_right_same_B73_top_00.hdr")
-    assert cube.shape == (31, 43, 580)
-    assert cube.wavelengths_nm[[0, -1]].tolist() == [366.551, 1048.421]
-    assert cube.dtype == np.dtype("<u2")
-    stored = np.fromfile(cube.data_path, "<u2").reshape(31, 580, 43)
-    np.testing.assert_array_equal(cube.memmap()[7, 11], stored[7, :, 11])
-
-
 def test_header_without_data(header):
     header.with_suffix(".raw").unlink()
     with pytest.raises(InputError, match=r"cube\.hdr.*data file cube\.raw"):

@@ -11,7 +11,7 @@ from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.instrument import read_metadata
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.processing.fingerprint import capture_files, session_files, shared_files
+from hsi_sc_nerf.processing.frames import capture_files, session_files, shared_files
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <properties><metadata>

@@ -17,7 +17,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, 
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack, unpack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, open_packed
-from hsi_sc_nerf.processing.turntable_silhouette import turntable_cylinders, turntable_silhouette
+from hsi_sc_nerf.processing.chamber import turntable_cylinders, turntable_silhouette
 
 LENS = PinholeIntrinsics(48, 40, 70.0, 70.0, 24.0, 20.0)
 FIRST_POSE = look_at([0.5, 0.0, 0.35], [0.0, 0.0, 0.05])

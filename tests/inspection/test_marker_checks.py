@@ -1,40 +1,60 @@
+"""Turns and the upright direction of made-up machines, by the corners of their markers."""
+
 import numpy as np
 import pytest
+from exact_turntable import marker_observations, marker_turntable
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.inspection.marker_checks import frame_angles_deg
+from hsi_sc_nerf.inspection.marker_checks import turn_and_rotation_deg
+
+SIZE_PX = 256
 
 
-def exact_detections(scene: MarkerScene, noise_px: float = 0.0) -> list[dict]:
-    """Corners of the disc's markers, and of the container's that face the camera."""
-    rng = np.random.default_rng(0)
-    detections = []
-    for pose in scene.camera_to_world:
-        seen = {}
-        for marker, corners_m in scene.corners_m.items():
-            outwards = corners_m.mean(0)[:2] @ (pose[:3, 3] - corners_m.mean(0))[:2]
-            if marker >= scene.side_markers or outwards > 0.02:
-                pixels, _ = project(corners_m, pose, scene.intrinsics)
-                seen[marker] = pixels + rng.normal(0, noise_px, (4, 2)) if noise_px else pixels
-        detections.append(seen)
-    return detections
+def detections(noise_px: float = 0.3, rotation_deg: float = 0.0, **options) -> tuple[MarkerScene, list[dict]]:
+    """Corners of the markers that face the camera, in images that are turned counter-clockwise."""
+    scene = MarkerScene(size_px=SIZE_PX, **options)
+    seen = marker_observations(marker_turntable(scene), noise_px)
+    angle = np.deg2rad(rotation_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])  # y points down
+    found: list[dict] = [{} for _ in scene.angles_deg]
+    for frame, marker, corners in zip(seen.frame, seen.marker, seen.corners_px, strict=True):
+        found[frame][int(marker)] = (corners - SIZE_PX / 2) @ turn + SIZE_PX / 2
+    return scene, found
 
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("distance_m", [0.45, 2.0])
 def test_angles_come_back(direction, distance_m):
     fov_deg = 31.0 * 0.45 / distance_m
-    scene = MarkerScene(frames=18, direction=direction, jitter_deg=2.0, distance_m=distance_m, fov_deg=fov_deg)
-    angles_deg = frame_angles_deg(exact_detections(scene, noise_px=0.1))
-    error_deg = (angles_deg - scene.angles_deg + 180.0) % 360.0 - 180.0
-    assert np.abs(error_deg - error_deg.mean()).max() < 3.0
+    scene, found = detections(
+        0.1, frames=18, direction=direction, jitter_deg=2.0, distance_m=distance_m, fov_deg=fov_deg
+    )
+    angles_deg, _ = turn_and_rotation_deg(found, (SIZE_PX, SIZE_PX))
+    error_deg = angles_deg - scene.angles_deg
+    assert np.abs(error_deg - error_deg.mean()).max() < 0.5
+
+
+@pytest.mark.parametrize("elevation_deg", [12.0, 30.0, 60.0])
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize(
+    "options",
+    [{"turn_deg": 40.0}, {"side_markers": 0, "disc_markers": 5}, {"side_markers": 12, "disc_markers": 4}],
+)
+def test_the_rotation_is_found_at_many_views_with_a_rolled_camera(elevation_deg, rotation_deg, options):
+    _, found = detections(frames=4, elevation_deg=elevation_deg, rotation_deg=rotation_deg + 8.0, **options)
+    assert turn_and_rotation_deg(found, (SIZE_PX, SIZE_PX))[1] == rotation_deg
+
+
+def test_a_view_from_the_side_or_of_a_small_turn_tells_no_direction():
+    for view in ({"elevation_deg": 0.0, "disc_markers": 0}, {"turn_deg": 10.0}):
+        _, found = detections(frames=6, **view)
+        assert turn_and_rotation_deg(found, (SIZE_PX, SIZE_PX))[1] is None
 
 
 def test_a_frame_that_shares_no_marker_has_no_angle():
-    detections = exact_detections(MarkerScene(frames=12))
-    detections[4] = {}
-    detections[5] = {marker + 100: corners for marker, corners in detections[5].items()}
-    angles_deg = frame_angles_deg(detections)
+    _, found = detections(frames=12)
+    found[4] = {}
+    found[5] = {marker + 100: corners for marker, corners in found[5].items()}
+    angles_deg, _ = turn_and_rotation_deg(found, (SIZE_PX, SIZE_PX))
     assert np.flatnonzero(np.isnan(angles_deg)).tolist() == [4, 5]
-    assert np.isnan(frame_angles_deg([{}, {}])).all()
+    assert np.isnan(turn_and_rotation_deg([{}, {}], (SIZE_PX, SIZE_PX))[0]).all()

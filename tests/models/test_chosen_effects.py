@@ -11,10 +11,10 @@ from small_trainer import trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf_paper
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import Effect
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting, require_effects
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
-from hsi_sc_nerf.packed.effects import Effect
 
 
 def effect(name, present):

@@ -138,11 +138,6 @@ def test_cubes_open_in_spy_as_reflectance(dataset):
     np.testing.assert_allclose(np.asarray(cube.load()), expected, atol=1e-5)
 
 
-def test_widths_of_the_bands_are_in_the_header(tmp_path):
-    write_packed_cube(tmp_path / "c.hdr", pack(np.ones((2, 2, 3))), WAVELENGTHS_NM, np.array([7.0, 7.125, 8.0]))
-    assert spy.open(str(tmp_path / "c.hdr")).bands.bandwidths == [7.0, 7.125, 8.0]
-
-
 def test_spy_shows_a_red_thing_red(tmp_path):
     wavelengths_nm = np.arange(400.0, 1000.0, 5.0)
     red = np.where(wavelengths_nm > 580.0, 0.9, 0.1)

@@ -104,14 +104,6 @@ def test_memory_does_not_grow_with_the_pixels_that_were_read(tmp_path):
     assert resident_mib() < before + 50
 
 
-def test_a_batch_holds_the_reflectance_of_its_pixels(sampler, counts, masks):
-    batch = sampler(64).sample(0)
-    frame, line, sample = batch["indices"].T
-    np.testing.assert_allclose(batch["spectral"], counts[frame, line, sample] / REFLECTANCE_SCALE, rtol=1e-6)
-    assert batch["spectral"].dtype == np.float32
-    np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
-
-
 def test_batches_tell_which_values_are_measurements_only_where_some_are_not(sampler, counts):
     assert "valid" not in sampler(64).sample(0)
     counts[:, ::2, :, 1] = FLAGGED
@@ -129,13 +121,6 @@ def test_a_step_always_gives_the_same_batch_and_another_step_another(sampler):
     for key in first:
         np.testing.assert_array_equal(first[key], again[key])
     assert (first["indices"] != other["indices"]).any()
-
-
-def test_foreground_fraction_is_kept(sampler, masks):
-    batch = sampler(200).sample(0, foreground_ray_fraction=0.75)
-    frame, line, sample = batch["indices"].T
-    np.testing.assert_array_equal(batch["mask"][:, 0], masks[frame, line, sample])
-    assert batch["mask"].sum() == 150
 
 
 def test_a_fraction_of_the_background_lies_on_the_boundary(tmp_path):
@@ -167,11 +152,6 @@ def test_pixels_are_drawn_evenly(sampler, masks, fraction):
     else:
         expected = drawn * np.where(masks, fraction / masks.sum(), (1.0 - fraction) / (~masks).sum())
     assert (abs(counts - expected) <= 6 * np.sqrt(expected)).all()
-
-
-def test_the_background_is_found_without_a_list_of_it(sampler, masks):
-    rest = np.flatnonzero(~masks)
-    np.testing.assert_array_equal(sampler(1)._background(np.arange(len(rest))), rest)
 
 
 @pytest.mark.parametrize(

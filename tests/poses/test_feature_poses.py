@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
+from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable, points_alone
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.feature_poses import check_camera, prior_of_angles
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, check_camera, prior_of_angles
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
 
 
@@ -24,7 +23,7 @@ def session():
     tracks = point_tracks(true)
     noise = np.random.default_rng(0).normal(0.0, 0.05, tracks.pixels.shape)
     tracks = replace(tracks, pixels=biased.reproject(tracks) + noise)
-    alone = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+    alone = points_alone(true)
     found = adjust_tracks(alone, tracks)
     assert found.turntable.focal_px < 0.995 * true.focal_px
     return scene, true, found
@@ -70,7 +69,7 @@ def test_known_angles_are_trusted_as_far_as_they_are_even(session, sign):
 def test_of_known_angles_none_is_held_for_exact():
     """A first frame that stopped off its mark does not turn all others."""
     true = point_turntable(marker_turntable(MarkerScene(size_px=256, frames=18)), 200)
-    true = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+    true = points_alone(true)
     off_rad = np.zeros(18)
     off_rad[0] = 0.01
     known = (true.angles_rad + off_rad - off_rad[0], 0.002)

@@ -5,20 +5,18 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from exact_turntable import SIDE_M, marker_observations, marker_turntable
+from exact_turntable import SIDE_M, marker_observations, marker_turntable, pose_errors
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.model_selection import linked_rows
 from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
-from hsi_sc_nerf.poses.pose_checks import check_poses
-from hsi_sc_nerf.poses.report import draw_poses, is_full_turn, pose_report
+from hsi_sc_nerf.poses.report import check_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.result import is_full_turn
 
 INFO = SessionInfo(marker_side_m=SIDE_M)
 
@@ -29,16 +27,10 @@ def solve(scene, observations):
     return Problem(start, MarkerResiduals(start, observations, 3.0)).minimise(start)
 
 
-def pose_errors(found, truth):
-    """Largest rotation error in degrees and largest error of the camera's place in millimetres."""
-    rotation = max(rotation_angle_deg(a, b) for a, b in zip(found, truth, strict=True))
-    return rotation, 1e3 * np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=-1).max()
-
-
 @lru_cache(maxsize=8)
 def estimated(**options):
     scene = MarkerScene(**options)
-    return scene, poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
+    return scene, poses_from_markers(scene.render(), scene.names(), INFO)
 
 
 @pytest.mark.slow
@@ -62,29 +54,6 @@ def test_exact_corners_give_exact_poses(options):
     assert position < 1e-1
     turned = np.rad2deg(np.unwrap(turntable.angles_rad))
     np.testing.assert_allclose(turned, scene.angles_deg, atol=1e-2)
-
-
-def test_first_guess_is_all_but_exact_on_exact_corners():
-    scene = MarkerScene(frames=9, turn_deg=100.0)
-    observations = marker_observations(marker_turntable(scene), 0.0)
-    start = initialise(observations, (64.0, 64.0), scene.size_px, SIDE_M)
-    error = start.reproject(observations) - observations.corners_px
-    assert np.abs(error).max() < 0.05
-
-
-def test_noisy_corners_give_close_poses():
-    scene = MarkerScene(frames=12)
-    turntable = solve(scene, marker_observations(marker_turntable(scene), 0.05))
-    found = to_object_frame(turntable, disc_height(turntable)) @ turntable.camera_to_world()
-    rotation, position = pose_errors(found, scene.camera_to_world)
-    assert rotation < 0.2
-    assert position < 1.0
-
-
-def test_frames_without_a_shared_marker_are_not_linked():
-    frame = np.array([0, 0, 1, 1, 2, 3, 4])
-    marker = np.array([5, 6, 6, 7, 7, 8, 8])
-    np.testing.assert_array_equal(linked_rows(frame, marker), [True] * 5 + [False] * 2)
 
 
 @pytest.mark.slow
@@ -162,20 +131,19 @@ def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
 def test_frames_without_markers_are_refused_with_names_and_advice():
     noise = list(np.random.default_rng(0).integers(0, 255, (4, 64, 64)).astype(np.uint8))
     with pytest.raises(InputError, match=r"first \.\.\. last.*dictionary"):
-        poses_from_markers(noise, ["first", "b", "c", "last"], INFO, progress=False)
+        poses_from_markers(noise, ["first", "b", "c", "last"], INFO)
     scene = MarkerScene(frames=18)
     with pytest.raises(InputError, match="DICT_4X4_50"):
         poses_from_markers(
             scene.render()[:3],
             scene.names()[:3],
             SessionInfo(marker_dictionary="DICT_4X4_50", marker_side_m=SIDE_M),
-            progress=False,
         )
 
 
 def test_a_single_frame_is_refused():
     with pytest.raises(InputError, match="3 or more frames"):
-        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO, progress=False)
+        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO)
 
 
 @pytest.mark.slow
@@ -183,4 +151,4 @@ def test_a_camera_before_a_still_table_is_refused():
     scene = MarkerScene(frames=18, noise=0.01)
     still = [scene.render()[0]] * 4
     with pytest.raises(InputError, match="share"):
-        poses_from_markers(still, list("abcd"), INFO, progress=False)
+        poses_from_markers(still, list("abcd"), INFO)

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.poses.marker_detection import detect_markers, dictionary_by_name, find_dictionary, marker_pattern
+from hsi_sc_nerf.poses.marker_detection import detect_markers, dictionary_by_name, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 from hsi_sc_nerf.poses.marker_observations import find_blur
 
@@ -120,22 +119,3 @@ def test_dictionary_is_found(name):
             book, marker, 8 * cells
         )
     assert find_dictionary([page, page, page]) == name
-
-
-@pytest.mark.slow
-def test_no_dictionary_where_there_is_no_marker():
-    noise = np.random.default_rng(0).integers(0, 255, (3, 96, 96)).astype(np.uint8)
-    assert find_dictionary(list(noise)) is None
-    assert detect_markers(noise[0], DICTIONARY) == {}
-
-
-def test_unknown_dictionary_is_refused():
-    with pytest.raises(InputError, match="DICT_5X5_50"):
-        dictionary_by_name("DICT_9X9")
-
-
-def test_pattern_has_a_black_border():
-    pattern = marker_pattern(DICTIONARY, 3)
-    assert pattern.shape == (7, 7)
-    assert pattern[[0, -1]].sum() == pattern[:, [0, -1]].sum() == 0
-    assert set(np.unique(pattern)) == {0, 1}

@@ -25,7 +25,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import refuse_red
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
@@ -81,15 +81,6 @@ def test_scores_from_a_few_bands_are_those_of_all(many_bands, tmp_path):
         assert inside.sum() >= 10
         assert frame.scores[name] == pytest.approx(edge_precision(cube[..., inside].mean(-1)), rel=0.2)
     assert frame.ranking[0] == "near infrared"
-
-
-def test_pictures_are_the_means_of_all_their_bands(many_bands, tmp_path):
-    cube, wavelengths_nm = many_bands
-    frame = pictures_of(cube, wavelengths_nm, tmp_path)
-    red = bands(wavelengths_nm, *BAND_GROUPS_NM["red"])
-    np.testing.assert_allclose(frame.picture("red"), 255.0 * cube[..., red].mean(-1), atol=0.51)
-    assert frame.picture("red") is frame.picture("red")
-    assert set(frame.ranking) == {GRAY, *BAND_GROUPS_NM}
 
 
 def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anyway(many_bands, tmp_path):
@@ -199,7 +190,7 @@ def test_the_best_picture_is_sharp_quiet_and_well_exposed(pear, tmp_path, kinds,
     for frame in frames:
         assert frame.ranking[0] in best
         assert all(frame.scores[name] < 0.75 * frame.scores[frame.ranking[0]] for name in worse)
-    found = observe(SessionPictures(frames), DICTIONARY, progress=False).observations
+    found = observe(SessionPictures(frames), DICTIONARY).observations
     assert len(found) >= 15
     true = np.array([truth[i][m] for i, m in zip(found.frame, found.marker, strict=True)])
     assert np.sqrt(np.mean((found.corners_px - true) ** 2)) < 0.1
@@ -229,7 +220,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     for image in glare:
         image[:, 56:] = 100
     alone, whole, joined = (
-        observe(SessionPictures.of(shown), DICTIONARY, progress=False).observations
+        observe(SessionPictures.of(shown), DICTIONARY).observations
         for shown in (glare, images, two_pictures(glare, images))
     )
     assert len(alone) < len(whole) == len(joined)
@@ -244,7 +235,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     first, again = np.array(taken).T
     np.testing.assert_allclose(joined.corners_px[again], alone.corners_px[first], atol=0.05)
     np.testing.assert_array_equal(
-        observe(two_pictures(blank, images), DICTIONARY, progress=False).observations.corners_px, whole.corners_px
+        observe(two_pictures(blank, images), DICTIONARY).observations.corners_px, whole.corners_px
     )
 
 
@@ -265,9 +256,7 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
             x, y = np.rint(project(scene.corners_m[marker], pose, scene.intrinsics)[0].mean(axis=0)).astype(int)
             image[max(0, y - 3) : y + 3, max(0, x - 3) : x + 3] = 255
     info = SessionInfo(marker_dictionary=DICTIONARY, marker_side_m=scene.marker_side_m)
-    alone, joined = (
-        poses_from_markers(shown, scene.names(), info, progress=False) for shown in (spot, two_pictures(spot, images))
-    )
+    alone, joined = (poses_from_markers(shown, scene.names(), info) for shown in (spot, two_pictures(spot, images)))
     more = np.subtract(joined.markers_per_frame, alone.markers_per_frame)
     assert more[:2].min() > 0
     assert not more[2:].any()
@@ -275,22 +264,10 @@ def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
     # Where the best picture is exposed well something hides the marker: the others are not asked.
     hidden = two_pictures([np.where(image == 255, 128, image).astype(np.uint8) for image in spot], images)
     ill_exposed = [replace(frame, flagged=image == 255) for frame, image in zip(hidden.frames, spot, strict=True)]
-    well, ill = (
-        poses_from_markers(shown, scene.names(), info, progress=False)
-        for shown in (hidden, SessionPictures(ill_exposed))
-    )
+    well, ill = (poses_from_markers(shown, scene.names(), info) for shown in (hidden, SessionPictures(ill_exposed)))
     more = np.subtract(ill.markers_per_frame, well.markers_per_frame)
     assert more[:2].min() > 0
     assert not more[2:].any()
-
-
-def test_plain_images_are_sessions_of_one_picture_a_frame():
-    images = [np.full((4, 5), k, np.uint8) for k in range(3)]
-    session = SessionPictures.of(images)
-    assert SessionPictures.of(session) is session
-    assert len(session) == 3
-    assert [int(image[0, 0]) for image in session] == [0, 1, 2]
-    assert session.named(GRAY)[2] is images[2]
 
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)

@@ -11,8 +11,8 @@ import pytest
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.cli.sessions import InspectCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import effect_rows
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
-from hsi_sc_nerf.packed.effects import effect_rows
 from hsi_sc_nerf.poses.result import Uncertainty
 from hsi_sc_nerf.processing.effects import (
     LEAST_POSE_ERROR_PX,
@@ -69,7 +69,7 @@ def test_uncertain_poses_are_refined_by_what_they_move_the_surface():
 def test_what_calibration_and_poses_decided_is_reported():
     factor = np.ones((3, 4))
     factor[2] = 0.95
-    drift = LampDriftEstimate(factor, factor, 0.001 * factor, np.ones((1, 1), bool), 0.0, 1e-8, True)
+    drift = LampDriftEstimate(factor, factor, 0.001 * factor, np.ones((1, 1), bool), 0.0, 1e-8)
     assert (lamp_drift(drift, True).present, lamp_drift(drift, False).present) == (True, False)
     assert lamp_drift(drift, True).evidence == pytest.approx(8.0)
     assert "-5.00 %" in lamp_drift(drift, True).sentence

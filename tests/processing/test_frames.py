@@ -110,13 +110,6 @@ def test_a_frame_that_lacks_a_file_is_not_finished(cube, tmp_path, kind):
     assert read_cache(paths, "made") is None
 
 
-def test_a_cache_of_an_earlier_version_is_not_finished(cube, tmp_path):
-    paths, cache = process(cube, tmp_path / "data")
-    with paths.cache.open("wb") as file:
-        np.savez(file, fingerprint="made", gray=cache.gray)
-    assert read_cache(paths, "made") is None
-
-
 @pytest.mark.parametrize("kind", ["cache", "bins"])
 def test_a_damaged_note_is_not_believed(cube, tmp_path, kind):
     paths, _ = process(cube, tmp_path / "data")

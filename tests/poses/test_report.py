@@ -7,7 +7,7 @@ import pytest
 from capture_factory import true_poses
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.poses.pose_checks import check_poses
+from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import Scale
 
 GOOD = true_poses([None] * 4, list("abcd"))

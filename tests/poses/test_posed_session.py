@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable
+from exact_turntable import marker_observations, marker_turntable, point_tracks, point_turntable, points_alone
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.posed_session import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
-from hsi_sc_nerf.poses.uncertainty import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
 
 SEEDS = 12
 
@@ -62,7 +62,7 @@ def test_features_that_creep_are_covered(markers):
     for seed in range(4):
         true = point_turntable(marker_turntable(scene), 200, seed)
         seen = marker_observations(true, seed=seed) if markers else None
-        alone = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+        alone = points_alone(true)
         true = true if markers else alone
         tracks = point_tracks(true, noise_px=0.05, seed=seed)
         # Every feature creeps its own way while it passes, and all creep along a little.
@@ -81,7 +81,7 @@ def test_points_that_err_together_in_their_frames_are_covered_by_their_scatter()
     scene, found = MarkerScene(size_px=256, frames=18), []
     for seed in range(SEEDS):
         true = point_turntable(marker_turntable(scene), 150, seed)
-        true = replace(true.resized(1.0 / true.distance), markers=true.markers[:0], marker_poses=np.zeros((0, 4, 4)))
+        true = points_alone(true)
         tracks = point_tracks(true, noise_px=0.01, seed=seed)
         rng = np.random.default_rng(100 + seed)
         phase = 2.0 * true.angles_rad[tracks.frame] + rng.uniform(0.0, 2.0 * np.pi, 150)[tracks.point]

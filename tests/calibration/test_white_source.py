@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.panel import read_panel
+from hsi_sc_nerf.calibration.white_source import read_panel
 from hsi_sc_nerf.errors import InputError
 
 BANDS_NM = np.array([400.0, 410.0, 455.0, 500.0])
