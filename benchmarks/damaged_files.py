@@ -282,7 +282,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.capture.session import open_session
     from hsi_sc_nerf.capture.session_info import read_band_centres
     from hsi_sc_nerf.evaluation.comparison import read_surface
-    from hsi_sc_nerf.export.ply import read_spectral_ply
+    from hsi_sc_nerf.export.cloud import read_spectral_ply
     from hsi_sc_nerf.export.sample_points import read_points
     from hsi_sc_nerf.models.checkpoints import read_checkpoint
     from hsi_sc_nerf.models.run_settings import read_config
@@ -290,7 +290,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.processing.frames import FramePaths, read_cache
     from hsi_sc_nerf.rendering.views import views_of_path
     from hsi_sc_nerf.report.dataset_sections import calibration_section, inspection_section, poses_section
-    from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
+    from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
     from hsi_sc_nerf.settings_file import read_yaml
     from hsi_sc_nerf.simulate.own_mesh import load as load_mesh
     from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene

@@ -16,13 +16,12 @@ import numpy as np
 import tyro
 from results_table import RESULTS, write_results
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, size_of
-from hsi_sc_nerf.analysis.size_uncertainty import combined, pixel_on_object_m, shared_errors, size_uncertainty
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.size import combined, pixel_on_object_m, shared_errors, size_of, size_uncertainty
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, read_spectral_ply
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.true_surface import TrueSurface

@@ -14,8 +14,7 @@ import yaml
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.export.ply import write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import look_at
 from hsi_sc_nerf.models.checkpoints import CHECKPOINT_KEYS, write_checkpoint

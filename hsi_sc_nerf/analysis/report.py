@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.closed_mesh import Size
-from hsi_sc_nerf.analysis.size_uncertainty import combined
+from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.terminal import markdown_table, markdown_text

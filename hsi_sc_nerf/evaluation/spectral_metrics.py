@@ -24,13 +24,16 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from hsi_sc_nerf.evaluation.band_scores import (
+    Image,
+    Mask,
+    Valid,
     band_scores,
     decibel,
+    image_blocks,
     per_band_psnr,
     per_band_ssim,
     per_band_windowed_ssim,
 )
-from hsi_sc_nerf.evaluation.image_blocks import Image, Mask, Valid, image_blocks
 from hsi_sc_nerf.numerics import masked_mean, narrow, safe_sqrt, select_pixels, spectral_angle
 
 MIN_BANDS_OF_AN_ANGLE = 2

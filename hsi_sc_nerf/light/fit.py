@@ -17,9 +17,17 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.directions import even_directions, harmonic_degrees, tangents
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
-from hsi_sc_nerf.light.standing_light import DEGREE, TERMS, StandingLight, even_light, units_on
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors, robust_std, scatter_beyond, tukey_weights
+from hsi_sc_nerf.light.standing_light import (
+    DEGREE,
+    TERMS,
+    StandingLight,
+    even_directions,
+    even_light,
+    harmonic_degrees,
+    tangents,
+    units_on,
+)
 from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
 
 MOST_LAMPS = 4
@@ -50,9 +58,6 @@ COLOUR_STD = 0.3
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
 """Lamps that give the white reference less than this part of its light have no colour of their own."""
-TUKEY = 4.685
-"""Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
-SMALLEST_SCATTER = 0.002
 OCCLUSION_ERROR = 0.1
 """Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
 touch."""
@@ -267,10 +272,10 @@ class _Fit:
     def _weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
         told = self.views.tells_light
-        self.scatter = max(1.4826 * float(np.median(np.abs(residual[told]))), SMALLEST_SCATTER)
+        self.scatter = robust_std(residual[told])
         beyond = scatter_beyond(residual[told], self._own_std[told])
         std = np.hypot(beyond, self._own_std)
-        self.weights = np.where(told, _tukey(residual / std), 1.0)
+        self.weights = np.where(told, tukey_weights(residual / std), 1.0)
         self._precision = self.weights * told / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -340,20 +345,3 @@ class _Fit:
         colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
         chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
         self.light = replace(light, lamp_colour=colour, chamber_colour=chamber_colour)
-
-
-def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, "m"]) -> float:
-    """The standard deviation that residuals have in common beyond their own ones; by their median, against gloss."""
-    low, high = SMALLEST_SCATTER, 1.0
-    for _ in range(20):
-        middle = np.sqrt(low * high)
-        if 1.4826 * np.median(np.abs(residual) / np.hypot(middle, own_std)) > 1.0:
-            low = middle
-        else:
-            high = middle
-    return float(middle)
-
-
-def _tukey(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Tukey's biweight; never quite 0, so that no element is left without a measurement."""
-    return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

@@ -9,11 +9,10 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.directions import even_directions
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
 from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
-from hsi_sc_nerf.light.transfer import transfer
-from hsi_sc_nerf.light.views import TurningElements, Views
+from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.views import TurningElements, Views, transfer
 
 RAY_DIRECTIONS = 2048
 """Over the sphere: 4.5 degrees apart."""

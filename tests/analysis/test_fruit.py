@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges, size_of
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.cli.clouds import TraitsCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder

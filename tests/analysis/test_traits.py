@@ -23,8 +23,13 @@ from hsi_sc_nerf.analysis.traits import (
     mean_and_sd,
 )
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
-from hsi_sc_nerf.export.ply import band_property_names, material_spectra, read_spectral_ply
+from hsi_sc_nerf.export.cloud import (
+    INCIDENCE,
+    SpectralCloud,
+    band_property_names,
+    material_spectra,
+    read_spectral_ply,
+)
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hsi_sc_nerf.evaluation import band_scores, image_blocks
+from hsi_sc_nerf.evaluation import band_scores
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 
 H, W, BANDS = 17, 23, 5
@@ -277,7 +277,7 @@ def test_errors_of_valid_values_are_not_hidden(metric) -> None:
 def test_blocks_of_valid_values_change_nothing(metric, monkeypatch: pytest.MonkeyPatch) -> None:
     predicted, target = pair()
     whole = metric(predicted, target, blob(), some_valid())
-    monkeypatch.setattr(image_blocks, "BLOCK_VALUES", 2 * H * W)
+    monkeypatch.setattr(band_scores, "BLOCK_VALUES", 2 * H * W)
     torch.testing.assert_close(metric(predicted, target, blob(), some_valid()), whole, rtol=1e-6, atol=0)
 
 

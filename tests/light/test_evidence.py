@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from light_on_a_ball import FACING, measured, turning_ball
 
-from hsi_sc_nerf.light.evidence import shading_evidence
 from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.of_run import shading_evidence
 
 
 def shaded_ball():

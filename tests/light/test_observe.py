@@ -4,8 +4,7 @@ import numpy as np
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import Elements
-from hsi_sc_nerf.light.observe import MISPLACED_PX, observe
+from hsi_sc_nerf.light.elements import MISPLACED_PX, Elements, observe
 
 SIZE, DISTANCE_M, PIXEL_M = 32, 1.0, 0.01
 EDGE = 20

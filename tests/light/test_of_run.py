@@ -8,9 +8,8 @@ import pytest
 from hsi_sc_nerf.cli.light import bands_of, sentences, summary, with_material
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.export.cloud import SpectralCloud, stream
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import write_cloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.of_run import light_of_run
 from hsi_sc_nerf.models.trained_run import open_run

@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.directions import even_directions
 from hsi_sc_nerf.light.elements import Elements, shown_points, spread_elements, support_mesh
-from hsi_sc_nerf.light.transfer import Transfer, transfer
+from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.views import Transfer, transfer
 
 RADIUS_M = 0.03
 DIRECTIONS = even_directions(1024)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from headless_browser import launch, needs_browser
 
-from hsi_sc_nerf.analysis.closed_mesh import Size
 from hsi_sc_nerf.analysis.report import trait_content
+from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -28,7 +28,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.page import Section, html_page
-from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
+from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 SECTIONS = ["inspection", "object", "views", "bands", "spectra", "comparison", "traits", "training"]
