@@ -359,7 +359,7 @@ def kinds(folder: Path) -> list[Kind]:
 
 
 def _json(path: Path) -> tuple[dict[str, Any] | None, Path]:
-    from hsi_sc_nerf.report.dataset_sections import read_known
+    from hsi_sc_nerf.report.page import read_known
 
     return read_known(path), path
 

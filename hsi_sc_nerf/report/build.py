@@ -21,10 +21,9 @@ from hsi_sc_nerf.report.dataset_sections import (
     inspection_section,
     masks_section,
     poses_section,
-    read_known,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
+from hsi_sc_nerf.report.page import CloudViewer, Section, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
     comparison_section,

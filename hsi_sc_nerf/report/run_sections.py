@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.report import trait_tables
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison_report import comparison_tables
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, content_of, embedded_file
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
 _CORRECTIONS = {
@@ -39,8 +38,6 @@ MOST_POINTS = 400
 _PSNR_RISE_DB = 0.5
 _MM_PER_M = 1000.0
 _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
-# What reading figures from another content, however damaged, ends in.
-_WRONG_CONTENT = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError)
 _F_SCORE_MISSING_PERCENT = (10.0, 30.0)
 _UNSEEN_FRACTION = 0.15
 _DRAWN_THRESHOLDS = 2.0
@@ -203,11 +200,9 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Se
     if comparison is None:
         command = "hsi-sc-nerf compare CLOUD.ply REFERENCE --output-dir RUN"
         return Section("comparison", title, [Missing("The geometry was not compared with a reference.", command)])
-    try:
+    with content_of(source, "comparison", "make one with `hsi-sc-nerf compare`"):
         blocks += _comparison_blocks(comparison)
         findings = judge_comparison(comparison)
-    except _WRONG_CONTENT as error:
-        raise InputError(f"{source}: is no comparison ({error}); make one with `hsi-sc-nerf compare`.") from error
     picture = source.with_name("distances.png")
     if picture.is_file():
         alt = "The cloud and the reference, coloured by the distance to the other"
@@ -274,10 +269,8 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path) -> Section:
     if traits is None:
         command = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
         return Section("traits", "Traits", [Missing("The object's traits were not measured.", command)])
-    try:
+    with content_of(source, "traits", "make them again with `hsi-sc-nerf traits`"):
         tables, findings = trait_tables(traits), judge_traits(traits)
-    except _WRONG_CONTENT as error:
-        raise InputError(f"{source}: holds no traits ({error}); make it again with `hsi-sc-nerf traits`.") from error
     blocks = [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
     return Section("traits", "Traits", blocks, findings)
 

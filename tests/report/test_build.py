@@ -170,7 +170,7 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         write_json(dataset.root / f"{name}.json", content)
         with pytest.raises(InputError, match=rf"{name}\.json: holds no"):
             section(dataset)
-    with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
+    with pytest.raises(InputError, match=r"comparison\.json: holds no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
         traits_section({"settings": {}}, run / "traits.json")
