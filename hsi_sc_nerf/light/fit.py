@@ -61,7 +61,6 @@ LEAST_LAMPS = 0.05
 OCCLUSION_ERROR = 0.1
 """Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
 touch."""
-BOUNCES = 4
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
 SETTLED = 0.01
@@ -91,18 +90,15 @@ class LightFit:
     relative_std: Float[np.ndarray, "m"]
 
 
-def fit_light(
-    elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"], bounces: int = BOUNCES
-) -> LightFit:
+def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]) -> LightFit:
     """Fit light and materials.
 
     Args:
         elements: that were measured.
         views: their measurements.
         white_normal: outward unit normal of the white reference, camera's frame.
-        bounces: diffuse reflections between elements; 0 for none.
     """
-    fit = _Fit(elements, views, white_normal, bounces)
+    fit = _Fit(elements, views, white_normal)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
         before = fit.state()
@@ -124,8 +120,8 @@ def fit_light(
 class _Fit:
     """State of the fit: the light, and what follows from it."""
 
-    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray, bounces: int) -> None:
-        self.elements, self.views, self.white, self.bounces = elements, views, white, bounces
+    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray) -> None:
+        self.elements, self.views, self.white = elements, views, white
         count = len(views.element), len(elements.positions)
         entries = np.ones(count[0]), (views.element, np.arange(count[0]))
         self._sum_by_element = scipy.sparse.csr_array(entries, shape=count[::-1])
@@ -229,12 +225,12 @@ class _Fit:
 
     def _bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
-        for _ in range(1 if self.bounced.any() or not self.bounces else 2):
+        for _ in range(1 if self.bounced.any() else 2):
             material = self._materials(self.irradiance())
             bounced = np.zeros_like(self.bounced)
-            for frame in np.unique(self.views.frame) if self.bounces else ():
+            for frame in np.unique(self.views.frame):
                 rows = np.flatnonzero(self.views.frame == frame)
-                arriving = self.elements.bounced(self.light, material, int(frame), self.bounces)
+                arriving = self.elements.bounced(self.light, material, int(frame))
                 bounced[rows] = arriving[self.views.element[rows]]
             self.bounced = bounced
 

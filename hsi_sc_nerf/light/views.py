@@ -13,6 +13,7 @@ from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.light.standing_light import DEGREE, LOBE_WIDTH_RAD, StandingLight, harmonics, lobes, tangents
 
 RAYS_AT_ONCE = 1 << 21
+BOUNCES = 4
 LEAST_COSINE = 0.15
 """Lamps that graze a surface hardly light it, however near."""
 CELLS_ACROSS = 4
@@ -151,13 +152,13 @@ class TurningElements:
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
-        self, light: StandingLight, material: Float[np.ndarray, "n bands"], frame: int, bounces: int
+        self, light: StandingLight, material: Float[np.ndarray, "n bands"], frame: int
     ) -> Float[np.ndarray, "n bands"]:
-        """Irradiance of all elements in a frame by each other, after up to so many diffuse reflections."""
+        """Irradiance of all elements in a frame by each other, after up to `BOUNCES` diffuse reflections."""
         direct = self.direct(light, frame).astype(np.float32)
         material = material.astype(np.float32)
         arriving = np.zeros_like(direct)
-        for _ in range(bounces):
+        for _ in range(BOUNCES):
             arriving = self.transfer.form_factors @ (material * (direct + arriving))
         return arriving
 

@@ -178,19 +178,16 @@ class TrueSurface:
         scene = self._scene()
         return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
 
-    def cloud(
-        self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0
-    ) -> SpectralCloud:
+    def cloud(self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float) -> SpectralCloud:
         """The cloud of an ideal reconstruction: uniform, visible points with true spectra.
 
         Args:
             count: number of points on the whole surface, invisible ones included.
             eyes_m: positions of the cameras.
             noise_m: standard deviation of the position in each direction; if positive, normals scatter by 0.3 rad.
-            seed: seed of positions and noise.
         """
-        rng = np.random.default_rng(seed)
-        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count, seed)
+        rng = np.random.default_rng(0)
+        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count)
         points = points[self.seen(points, eyes_m)]
         normals, weights, _ = self.nearest(points)
         spectra = (weights @ self.endmembers).astype(np.float32)
