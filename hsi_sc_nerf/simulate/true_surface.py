@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
 from hsi_sc_nerf.evaluation.spatial import sample_surface
@@ -157,9 +158,10 @@ class TrueSurface:
             tuple(columns), truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm
         )
 
-    def reflectance(self, chosen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "n bands"]:
-        """True spectra of the chosen vertices."""
-        return (self.weights[chosen] @ self.endmembers).astype(np.float32)
+    def spectral_mesh(self, eyes_m: Float[np.ndarray, "cameras 3"]) -> SpectralMesh:
+        """The surface with its true spectra; what no camera at these positions sees is unseen."""
+        spectra = (self.weights @ self.endmembers).astype(np.float32)
+        return SpectralMesh(self.mesh, spectra, self.wavelengths_nm, self.seen(self.mesh.vertices, eyes_m))
 
     def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unit normal, material fractions and distance (m) of the nearest surface point of each point."""
