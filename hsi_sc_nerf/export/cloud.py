@@ -59,7 +59,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
-_COLOUR = ("red", "green", "blue")
+_CHANNELS = ("red", "green", "blue")
 _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
 
 
@@ -208,10 +208,10 @@ def write_spectral_ply(
     if isinstance(cloud, SpectralCloud):
         cloud = stream(cloud)
     band_names = band_property_names(cloud.wavelengths_nm)
-    names = [*_GEOMETRY, *_COLOUR, *band_names, *cloud.extra_names]
+    names = [*_GEOMETRY, *_CHANNELS, *band_names, *cloud.extra_names]
     if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
         raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
-    properties = (f"property {'uchar' if name in _COLOUR else 'float'} {name}" for name in names)
+    properties = (f"property {'uchar' if name in _CHANNELS else 'float'} {name}" for name in names)
     comments = (f"comment {line}" for line in comment_lines(names, cloud.run))
     header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {cloud.count}", *properties]
     faces = np.empty(0 if triangles is None else len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
@@ -280,7 +280,7 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
     vertices = read_ply(path)["vertex"].data
     names = vertices.dtype.names
     bands = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
-    missing = [name for name in (*_GEOMETRY, *_COLOUR) if name not in names]
+    missing = [name for name in (*_GEOMETRY, *_CHANNELS) if name not in names]
     if missing or not bands:
         lacking = ", ".join(missing) or "spectral bands (scalar_...nm)"
         raise InputError(f"{path}: has no {lacking}; give a cloud that ns-export wrote from an hsi-sc-nerf run.")
@@ -292,12 +292,12 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
     return SpectralCloud(
         points=columns(_GEOMETRY[:3], np.float32),
         normals=columns(_GEOMETRY[3:], np.float32),
-        colours=columns(_COLOUR, np.uint8),
+        colours=columns(_CHANNELS, np.uint8),
         spectra=columns(tuple(bands), np.float32),
         wavelengths_nm=np.array(list(bands.values())),
         extra={
             name: np.array(vertices[name], np.float32)
             for name in names
-            if name not in bands and name not in (*_GEOMETRY, *_COLOUR)
+            if name not in bands and name not in (*_GEOMETRY, *_CHANNELS)
         },
     )

@@ -20,14 +20,12 @@ from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.geometry.ply_file import read_ply
-from hsi_sc_nerf.simulate.truth import Truth, load_truth
+from hsi_sc_nerf.simulate.truth import COVERED, Truth, load_truth
 from hsi_sc_nerf.spectra import composite, to_8_bit
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
-COVERED = 0.5
-"""Smallest fraction of an object pixel that the object covers."""
 LIFT_M = 1e-5
 """Offset of the origin of a line of sight from the surface."""
 FACET_LIFT_M = 0.0001
