@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from seen_markers import detected_corners
+from turntable_scene import detected_corners
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, rotation_about_z

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 import tyro
-from seen_markers import detected_corners
+from turntable_scene import detected_corners
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.instrument import read_metadata
