@@ -14,6 +14,7 @@ from hsi_sc_nerf.light.standing_light import DEGREE, LOBE_WIDTH_RAD, StandingLig
 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
+"""Diffuse reflections between elements that are followed."""
 LEAST_COSINE = 0.15
 """Lamps that graze a surface hardly light it, however near."""
 CELLS_ACROSS = 4
