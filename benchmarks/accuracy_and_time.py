@@ -35,8 +35,8 @@ from hsi_sc_nerf.benchmark.configurations import own_configuration, split_words
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
 from hsi_sc_nerf.evaluation.comparison import CompareConfig
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
-from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS

@@ -8,7 +8,6 @@ Needs playwright and Chromium. RUN is the folder of a trained run of an apple or
 from __future__ import annotations
 
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -21,6 +20,9 @@ from typing import Any
 
 import tyro
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from headless_browser import launch
+
 from hsi_sc_nerf.report.build import ReportSources, write_report
 
 REPORT_PX, VIEWER_PX = (1200, 1300), (1100, 900)
@@ -30,7 +32,6 @@ CLICKED_PX = (390, 330)
 """Point of the viewer that is clicked."""
 FIRST_PICTURE_S = 300
 """A picture at full size takes a minute or two on two cores."""
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NOTHING = b'<svg xmlns="http://www.w3.org/2000/svg" width="1" height="1"/>'
 
 
@@ -47,8 +48,10 @@ class BrowserPictures:
 
     def main(self) -> None:
         """Write the report, start the viewer, and take a picture of each."""
-        with tempfile.TemporaryDirectory() as folder, browser() as chromium:
-            report = Path(folder) / "report.html"
+        from playwright.sync_api import sync_playwright
+
+        with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+            chromium, report = launch(playwright), Path(folder) / "report.html"
             write_report(self.run, report, ReportSources(self.cloud))
             self._report(chromium, report)
             with viewer(self.run / "config.yml") as address:
@@ -90,18 +93,6 @@ class BrowserPictures:
         answer.scroll_into_view_if_needed()
         page.wait_for_timeout(1000 * FIRST_PICTURE_S // 3)  # until the picture of full size is there
         page.screenshot(path=self.pictures / "viewer.png")
-
-
-@contextmanager
-def browser() -> Iterator[Any]:
-    """Chromium without a screen, which draws WebGL in software."""
-    from playwright.sync_api import sync_playwright
-
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=flags, timeout=120_000)
-        yield chromium
-        chromium.close()
 
 
 @contextmanager

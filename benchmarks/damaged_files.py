@@ -41,69 +41,17 @@ ROOM_BYTES = 3 * 2**30
 """Address space that reading may take beyond what the libraries have."""
 HOSTILE_TEXTS = (
     *("", "0", "-1", "1", "2", "3", "255", "65536", "2147483648", "4294967296", "9" * 14, "9" * 20, "1" + "0" * 400),
-    *(
-        "9" * 5000,
-        "0.5",
-        "-0.0",
-        "1e-320",
-        "1e308",
-        "1e400",
-        "-1e400",
-        "nan",
-        "inf",
-        "1_000",
-        "0x" + "f" * 400,
-        "true",
-    ),
-    *("null", "None", "~", "[]", "{}", "{", "}", "[", "[[[[[[[[", "[" * 3000, "{" * 3000, "{1, 2}", "*a", "&a [*a]"),
-    *("<<: *a", "!!python/name:os.system", "a" * 5000, "../../../../etc/passwd", "/", ".", "..", "a/b", "a|b", "<b>"),
-    *(
-        "\0",
-        "\n",
-        "\r\n",
-        "\t",
-        "\x1b[31m",
-        "\ufeff",
-        "\u2028",
-        "\ud83d",
-        "\u0661\u0662",
-        "é",
-        "%s",
-        "{0}",
-        "$x$",
-        "°",
-        "end_header",
-    ),
-    *(
-        "element vertex 7",
-        "property float x",
-        "property list uchar int vertex_indices",
-        "lines = 7",
-        "&x;",
-        "<a>",
-        "</a>",
-    ),
+    *("9" * 5000, "0.5", "-0.0", "1e-320", "1e308", "1e400", "-1e400", "nan", "inf", "1_000", "0x" + "f" * 400),
+    *("true", "null", "None", "~", "[]", "{}", "{", "}", "[", "[[[[[[[[", "[" * 3000, "{" * 3000, "{1, 2}", "*a"),
+    *("&a [*a]", "<<: *a", "!!python/name:os.system", "a" * 5000, "../../../../etc/passwd", "/", ".", "..", "a/b"),
+    *("a|b", "<b>", "\0", "\n", "\r\n", "\t", "\x1b[31m", "\ufeff", "\u2028", "\ud83d", "\u0661\u0662", "é", "%s"),
+    *("{0}", "$x$", "°", "end_header", "element vertex 7", "property float x", "lines = 7", "&x;", "<a>", "</a>"),
+    "property list uchar int vertex_indices",
 )
 HOSTILE_VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 2, 7, 0.5, -0.0, 1e-320, 1e308, float("nan"), float("inf"), 2**31, 2**63, 10**400),
-    *(
-        "",
-        "a",
-        "1",
-        "nan",
-        "../a",
-        "/etc/passwd",
-        "a\0b",
-        "a\n|b<c>",
-        "\ud800",
-        "a" * 5000,
-        [],
-        {},
-        [[]],
-        [None],
-        [0],
-    ),
-    *([1, [2]], [[1, 2], [3]], {"a": 1}, [{}], [1e308] * 4, ["x"] * 5, {"": None}),
+    *("", "a", "1", "nan", "../a", "/etc/passwd", "a\0b", "a\n|b<c>", "\ud800", "a" * 5000),
+    *([], {}, [[]], [None], [0], [1, [2]], [[1, 2], [3]], {"a": 1}, [{}], [1e308] * 4, ["x"] * 5, {"": None}),
 )
 
 
@@ -282,7 +230,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.capture.session import open_session
     from hsi_sc_nerf.capture.session_info import read_band_centres
     from hsi_sc_nerf.evaluation.comparison import read_surface
-    from hsi_sc_nerf.export.ply import read_spectral_ply
+    from hsi_sc_nerf.export.cloud import read_spectral_ply
     from hsi_sc_nerf.export.sample_points import read_points
     from hsi_sc_nerf.models.checkpoints import read_checkpoint
     from hsi_sc_nerf.models.run_settings import read_config
@@ -290,7 +238,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.processing.frames import FramePaths, read_cache
     from hsi_sc_nerf.rendering.views import views_of_path
     from hsi_sc_nerf.report.dataset_sections import calibration_section, inspection_section, poses_section
-    from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
+    from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
     from hsi_sc_nerf.settings_file import read_yaml
     from hsi_sc_nerf.simulate.own_mesh import load as load_mesh
     from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
@@ -359,7 +307,7 @@ def kinds(folder: Path) -> list[Kind]:
 
 
 def _json(path: Path) -> tuple[dict[str, Any] | None, Path]:
-    from hsi_sc_nerf.report.dataset_sections import read_known
+    from hsi_sc_nerf.report.page import read_known
 
     return read_known(path), path
 

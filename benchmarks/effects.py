@@ -34,9 +34,6 @@ from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, eff
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.scene import EFFECTS, load_scene, override
-from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")
@@ -140,14 +137,8 @@ class Effects(PaperTable):
     def processed(self, case: Case) -> Path:
         """Dataset of a case."""
         session = self.output_dir / case.name.replace(",", "").replace("%", "percent").replace(" ", "-")
-        if not session.exists():
-            own = load_scene(case.scene)
-            effects = (*NOISE, *case.effects)
-            scene = override(own, frames=self.frames, size_px=self.size, bands=self.bands, effects=effects)
-            both = sorted((*own.effects, *scene.effects), key=lambda effect: list(EFFECTS).index(effect.name))
-            simulate_session(replace(scene, effects=tuple(both)), session)
         poses = partial(disturbed_poses, case.pose_error_deg) if case.pose_error_deg else find_poses
-        return process_session(session, session.with_name(f"{session.name}-data"), estimate_poses=poses)
+        return self.simulated(case.scene, session, (*NOISE, *case.effects), poses)
 
     def model_rows(self, case: Case) -> list[list[str]]:
         """A row for each model that is trained on a case: as decided, all effects, and each one changed."""

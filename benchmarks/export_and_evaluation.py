@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from paper_tables import short_training
 from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.benchmark.steps import peak_memory_mib, typed_command
@@ -77,10 +78,7 @@ class ExportAndEvaluation:
         """Processor seconds and memory of the steps of one version, by the step's name."""
         folder = self.output_dir.resolve() / version
         run = folder / "run" / "hsi-sc-nerf" / "run"
-        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "run"]
-        training += ["--timestamp", "run", "--max-num-iterations", self.iterations, "--vis", "tensorboard"]
-        training += ["--evaluate-stages", "False", "--steps-per-eval-batch", 1_000_000]
-        training += ["--steps-per-eval-image", 1_000_000, "--pipeline.datamanager.train-num-rays-per-batch", 1024]
+        training = short_training(data, folder, self.iterations)
         training += ["--pipeline.datamanager.dataparser.train-split-fraction", 1.0 - HELD_OUT_FRACTION]
         if not list(run.glob("stage-masked/*.ckpt")):
             _run(tree, training, folder / "train.log")

@@ -27,10 +27,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
-from hsi_sc_nerf.simulate.processing_score import COVERED
 from hsi_sc_nerf.simulate.scene import Scene, Sphere, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
-from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.simulate.truth import COVERED, load_truth
 
 NOISE = ("photon_noise", "read_noise")
 SHADE = ("chamber_shading", "inter_reflection", *NOISE)

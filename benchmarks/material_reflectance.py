@@ -30,15 +30,12 @@ import tyro
 from jaxtyping import Float
 from results_table import RESULTS, write_results
 
-from hsi_sc_nerf.export.cloud import INCIDENCE
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import Elements, spread_elements, support_mesh
-from hsi_sc_nerf.light.evidence import ShadingEvidence, shading_evidence
+from hsi_sc_nerf.light.elements import LARGEST_INCIDENCE_DEG, Elements, observe, spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
-from hsi_sc_nerf.light.observe import LARGEST_INCIDENCE_DEG, observe
-from hsi_sc_nerf.light.of_run import light_of_run
+from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
 from hsi_sc_nerf.light.views import Views
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.processing.voted_hull import DISC_OVER_MARKERS

@@ -9,7 +9,6 @@ difference.
 from __future__ import annotations
 
 import dataclasses
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,7 +53,6 @@ class Ours:
         materials: their names.
         of_object: which of them are the object's.
         ray_grid: error of our evenly spaced rays (RMS), from two numbers of rays a pixel in even light.
-        seconds: for light and frame together.
     """
 
     radiance: Float[np.ndarray, "lines samples bands"]
@@ -62,7 +60,6 @@ class Ours:
     materials: tuple[str, ...]
     of_object: Bool[np.ndarray, "materials"]
     ray_grid: float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,6 @@ class Agreement:
         bias: mean of Mitsuba minus ours, and its standard error.
         bias_of_object: the same for the object alone.
         bias_of_material: the same for each material, pixels weighted by its fraction.
-        seconds: one rendering of ours, one of Mitsuba's.
     """
 
     ours: Float[np.ndarray, "lines samples bands"]
@@ -89,7 +85,6 @@ class Agreement:
     bias: tuple[float, float]
     bias_of_object: tuple[float, float]
     bias_of_material: dict[str, tuple[float, float]]
-    seconds: tuple[float, float]
 
     @property
     def expected(self) -> float:
@@ -99,11 +94,9 @@ class Agreement:
 
 def render_ours(scene: Scene, frame: int) -> Ours:
     """Render one frame under the scene's effects; with any, the chamber is a lamp of radiance 1 and seen as that."""
-    start = time.perf_counter()
     simulation = Simulation(scene)
     rendered = simulation.frame(frame)
     radiance = rendered.light.radiance().astype(float)
-    seconds = time.perf_counter() - start
     weights = rendered.material_weights
     camera = dataclasses.replace(scene.camera, supersampling=max(1, scene.camera.supersampling - 1))
     plain = Simulation(dataclasses.replace(scene, camera=camera, effects=()))
@@ -112,21 +105,19 @@ def render_ours(scene: Scene, frame: int) -> Ours:
         radiance += weights[..., -1:] * (1.0 - rendered.endmembers[-1])
     ray_grid = _rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
     of_object = np.isin(simulation.materials, simulation.object_part.materials)
-    return Ours(radiance, weights, simulation.materials, of_object, ray_grid, seconds)
+    return Ours(radiance, weights, simulation.materials, of_object, ray_grid)
 
 
 def compare(
     scene: Scene, frame: int, transport: mitsuba_rendering.Transport, ours: Ours, rays_per_pixel: int, repeats: int
 ) -> Agreement:
     """Render one frame with Mitsuba and hold it against ours."""
-    start = time.perf_counter()
     renders = np.stack(
         [
             mitsuba_rendering.render(scene, frame, transport, rays_per_pixel=rays_per_pixel, seed=seed)
             for seed in track(range(repeats), f"{scene.name}, {transport}", transient=True)
         ]
     )
-    seconds = (time.perf_counter() - start) / repeats
     difference = renders - ours.radiance
     seen = ours.weights[..., -1] < 1.0
     return Agreement(
@@ -142,7 +133,6 @@ def compare(
             for i, name in enumerate(ours.materials)
             if ours.weights[..., i].any()
         },
-        seconds=(ours.seconds, seconds),
     )
 
 
@@ -208,12 +198,6 @@ class MitsubaAgreement:
             for material in found["even"].bias_of_material
         ]
         Console().print(screen_table(["bias, 1e-3", *found], materials))
-        print(
-            {
-                transport: f"ours {each.seconds[0]:.1f} s, Mitsuba {each.seconds[1]:.1f} s"
-                for transport, each in found.items()
-            }
-        )
         rows = [[scene.name, transport.replace("_", " "), *_cells(each)] for transport, each in found.items()]
         write_results("mitsuba_agreement", COLUMNS, rows, keys=2, folder=self.results)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from hsi_sc_nerf.benchmark.configurations import Configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
 from hsi_sc_nerf.models.schedule import Clock
+from hsi_sc_nerf.poses.pose_methods import find_poses
+from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.scene import EFFECTS, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
@@ -48,7 +50,9 @@ class PaperTable:
     results: Path = RESULTS
     """Folder of the CSV file."""
 
-    def simulated(self, name: str, session: Path, effects: Sequence[str] = ()) -> Path:
+    def simulated(
+        self, name: str, session: Path, effects: Sequence[str] = (), poses: Callable[..., TurntablePoses] = find_poses
+    ) -> Path:
         """Dataset, ``SESSION-data``, of a scene with more effects than its own, simulated if it is missing."""
         if not session.exists():
             own = load_scene(name)
@@ -56,7 +60,7 @@ class PaperTable:
             # Effects act in a fixed order.
             both = sorted((*own.effects, *scene.effects), key=lambda effect: list(EFFECTS).index(effect.name))
             simulate_session(replace(scene, effects=tuple(both)), session)
-        return process_session(session, session.with_name(f"{session.name}-data"))
+        return process_session(session, session.with_name(f"{session.name}-data"), estimate_poses=poses)
 
     def trained(
         self, configurations: Sequence[Configuration], data: Path, runs: Path, seed: int = 0
@@ -75,6 +79,17 @@ class PaperTable:
             threads=self.threads,
         )
         return train_all(configurations, command)
+
+
+def short_training(data: Path, folder: Path, iterations: int) -> list[object]:
+    """Words that train ``folder/run/hsi-sc-nerf/run`` in so many steps of 1024 rays, without evaluations."""
+    never = 1_000_000
+    return [
+        *("ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "run"),
+        *("--timestamp", "run", "--max-num-iterations", iterations, "--vis", "tensorboard"),
+        *("--evaluate-stages", "False", "--steps-per-eval-batch", never, "--steps-per-eval-image", never),
+        *("--pipeline.datamanager.train-num-rays-per-batch", 1024),
+    ]
 
 
 def mean_and_deviation(values: Sequence[float], digits: int) -> str:

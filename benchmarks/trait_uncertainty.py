@@ -14,24 +14,23 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from paper_tables import short_training
 from results_table import RESULTS, write_results
+from traits_accuracy import EVERY_KTH_CAMERA, SPOTS, spots_on
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, size_of
-from hsi_sc_nerf.analysis.size_uncertainty import combined, pixel_on_object_m, shared_errors, size_uncertainty
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
-from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.size import combined, pixel_on_object_m, shared_errors, size_of, size_uncertainty
+from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
+from hsi_sc_nerf.analysis.traits import analyse
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, read_spectral_ply
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.true_surface import TrueSurface
 from hsi_sc_nerf.simulate.truth import load_truth
 
 TRAITS = {"area_m2": "area", "volume_l": "volume", "height_m": "height", "largest_diameter_m": "largest diameter"}
-SPOTS, SPOT = 12, "brightness of spots of 10 mm"
-SPOT_RADIUS_M = 0.005
-EVERY_KTH_CAMERA = 5
+SPOT = "brightness of spots of 10 mm"
 COARSE = "maize"
 """Its kernels are finer than the pixels, so that its area is not measured: rows are also given without it."""
 COLUMNS = ("trait", "sessions", "within 1 std, %", "within 2 std, %", "median error, %", "median stated std, %")
@@ -86,23 +85,12 @@ class TraitUncertainty:
         folder.mkdir(parents=True, exist_ok=True)
         simulating = ["hsi-sc-nerf", "simulate", scene, session, "--seed", seed, "--size", self.size]
         simulating += ["--frames", self.frames, "--effects", "photon_noise", "read_noise"]
-        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "run"]
-        training += ["--timestamp", "run", "--max-num-iterations", self.iterations, "--vis", "tensorboard"]
-        training += ["--evaluate-stages", "False", "--steps-per-eval-batch", 1_000_000]
-        training += ["--steps-per-eval-image", 1_000_000, "--pipeline.datamanager.train-num-rays-per-batch", 1024]
-        exporting = [
-            "ns-export",
-            "pointcloud",
-            "--load-config",
-            run / "config.yml",
-            "--output-dir",
-            folder / "export",
-        ]
+        exporting = ["ns-export", "pointcloud", "--load-config", run / "config.yml", "--num-points", 60_000]
         steps: list[Sequence[object]] = [
             simulating,
             ["hsi-sc-nerf", "process", session, "--output-dir", data],
-            training,
-            [*exporting, "--num-points", 60_000],
+            short_training(data, folder, self.iterations),
+            [*exporting, "--output-dir", folder / "export"],
         ]
         for words in steps:
             name = str(words[0] if words[0] != "hsi-sc-nerf" else words[1])
@@ -122,13 +110,8 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
         one = getattr(exact, name)
         yield trait, getattr(size, name) / one - 1.0, getattr(std, name) / one
     surface = with_spectra(mesh, cloud, config.smoothing_radius_m, MAX_INCIDENCE_DEG)
-    eyes_m = truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3]
-    seen = true.seen(true.mesh.vertices, eyes_m)
-    ideal = SpectralMesh(true.mesh, true.reflectance(np.ones(len(seen), bool)), true.wavelengths_nm, seen)
-    above_m = true.mesh.vertices[:, 2] - config.base_height_m
-    weights = np.where(seen & (above_m > 2.0 * SPOT_RADIUS_M), ideal.areas_m2, 0.0)
-    centres = true.mesh.vertices[np.random.default_rng(0).choice(len(weights), SPOTS, p=weights / weights.sum())]
-    spots = [RegionOfInterest(f"{number}", tuple(at.tolist()), SPOT_RADIUS_M) for number, at in enumerate(centres)]
+    ideal = true.spectral_mesh(truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3])
+    spots = spots_on(ideal)
     regions = (analyse(one, spots, pixel_m=pixel_on_object_m(dataset)).regions[1:] for one in (surface, ideal))
     for region, real in zip(*regions, strict=True):
         brightness = real.spectrum.mean.mean()

@@ -13,19 +13,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 import tyro
 from results_table import RESULTS, write_results
 from rich.console import Console
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges, size_of
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
-from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
-from hsi_sc_nerf.numerics import spectral_angle
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.terminal import screen_table
@@ -48,9 +46,7 @@ COLUMNS = (
     "spectra of spots, worst RMS",
     *(f"bruise {how}" for how in CLASSIFIED),
 )
-ROI_RADIUS_M = 0.005
-ROIS = 12
-INCIDENCES_DEG = ((0, 50), (50, 70), (70, 90))
+SPOTS, SPOT_RADIUS_M = 12, 0.005
 BLUSH_FRACTIONS = (0.25, 0.5, 0.75)
 LEFT_OUT = ("stem",)
 """Its spectrum lies between those of bruise and skin: the rim of a bruise would be stem."""
@@ -88,22 +84,28 @@ class TraitsAccuracy:
         surface = with_spectra(mesh, cloud, config.smoothing_radius_m, MAX_INCIDENCE_DEG)
         seconds = time.perf_counter() - started
 
-        vertices = true.mesh.vertices
-        everything = np.ones(len(vertices), bool)
-        ideal = SpectralMesh(
-            true.mesh, true.reflectance(everything), true.wavelengths_nm, true.seen(vertices, eyes_m)
-        )
+        ideal = true.spectral_mesh(eyes_m)
         sizes = [*_size_rows(surface, ideal), *_size_of_cloud_alone(cloud, ideal)]
         median, worst, where = _spot_errors(surface, ideal)
         classes = _class_rows(surface, true, ideal)
         details = [*sizes, ["spots", "", "", f"median {median}, worst {worst} {where}"], *classes]
-        details += _incidence_rows(cloud, true)
         title = f"open edges: {open_edges(mesh)}; {len(cloud.points)} points; {seconds:.0f} s"
         Console(width=160).print(screen_table(["trait", "measured", "true", "error"], details, title))
         errors = {name: error for name, _, _, error in (*sizes, *classes)}
         cells = [*(errors[name] for name in SIZES.values()), errors[ALONE], median, worst]
         cells += [errors.get(f"bruise {how}", "") for how in CLASSIFIED]
         write_results("traits_accuracy", COLUMNS, [[self.name, *cells]], keys=1, folder=self.results)
+
+
+def spots_on(ideal: SpectralMesh) -> list[RegionOfInterest]:
+    """Spots all over the seen surface, above the base."""
+    height_m = ideal.mesh.vertices[:, 2] - ideal.mesh.vertices[:, 2].min()
+    weights = np.where(ideal.seen & (height_m > 2.0 * SPOT_RADIUS_M), ideal.areas_m2, 0.0)
+    chosen = np.random.default_rng(0).choice(len(weights), SPOTS, p=weights / weights.sum())
+    return [
+        RegionOfInterest(f"{number}", tuple(centre.tolist()), SPOT_RADIUS_M)
+        for number, centre in enumerate(ideal.mesh.vertices[chosen])
+    ]
 
 
 def _size_row(name: str, measured: float, true: float) -> list[str]:
@@ -126,34 +128,13 @@ def _size_of_cloud_alone(cloud: SpectralCloud, ideal: SpectralMesh) -> list[list
 
 def _spot_errors(surface: SpectralMesh, ideal: SpectralMesh) -> tuple[str, str, str]:
     """Relative RMS of mean spectra of spots all over the seen surface: median, worst, and where."""
-    rng = np.random.default_rng(0)
-    height_m = ideal.mesh.vertices[:, 2] - ideal.mesh.vertices[:, 2].min()
-    weights = np.where(ideal.seen & (height_m > 2.0 * ROI_RADIUS_M), ideal.areas_m2, 0.0)
-    centres = ideal.mesh.vertices[rng.choice(len(weights), ROIS, p=weights / weights.sum())]
-    errors = []
-    for centre in centres:
-        spot = RegionOfInterest("spot", tuple(centre.tolist()), ROI_RADIUS_M)
+    errors, spots = [], spots_on(ideal)
+    for spot in spots:
         measured, true = (region_spectrum(one, spot.of(one)).mean for one in (surface, ideal))
         errors.append(relative_rms(measured, true))
-    x, y, z = 1000.0 * centres[int(np.argmax(errors))]
+    x, y, z = 1000.0 * np.array(spots[int(np.argmax(errors))].centre_m)
     median, worst = 100.0 * np.median(errors), 100.0 * max(errors)
     return f"{median:.2g} %", f"{worst:.2g} %", f"at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
-
-
-def _incidence_rows(cloud: SpectralCloud, true: TrueSurface) -> list[list[str]]:
-    """Spectral angles between points and the true surface beneath them, by how obliquely the points are seen."""
-    if INCIDENCE not in cloud.extra:
-        return []
-    _, weights, _ = true.nearest(cloud.points)
-    truth = torch.from_numpy(weights @ true.endmembers)
-    angles = spectral_angle(torch.from_numpy(cloud.spectra).to(truth), truth).numpy()
-    rows = []
-    for low, high in INCIDENCES_DEG:
-        of = angles[(cloud.extra[INCIDENCE] >= low) & (cloud.extra[INCIDENCE] < high)]
-        if len(of) > 0:
-            told = f"median {np.median(of):.3f}, 90th percentile {np.quantile(of, 0.9):.3f}"
-            rows.append([f"angle of {len(of)} points seen at {low} to {high} degrees, rad", "", "", told])
-    return rows
 
 
 def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -> list[list[str]]:

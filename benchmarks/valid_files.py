@@ -14,8 +14,7 @@ import yaml
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.export.ply import write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import look_at
 from hsi_sc_nerf.models.checkpoints import CHECKPOINT_KEYS, write_checkpoint
@@ -187,7 +186,7 @@ _XML = """<?xml version="1.0" encoding="utf-8"?>
 """
 _SCENE = """object: {shape: mesh, mesh_file: a.ply, materials: [skin, core], height_m: 0.07}
 camera: {elevation_deg: 30, distance_m: 0.5, aim_height_m: 0.1, size_px: 32}
-turntable: {disc_diameter_m: 0.3, frames: 12, direction: cw}
+turntable: {disc_diameter_m: 0.3, frames: 12}
 markers: {side_m: 0.02}
 materials:
   skin: {plant: {plateau: 0.6, water: 1}}

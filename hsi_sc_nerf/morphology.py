@@ -47,10 +47,8 @@ def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lin
 
 
 def draw_outline(
-    image: UInt8[np.ndarray, "lines samples 3"],
-    mask: Bool[np.ndarray, "lines samples"],
-    colour: tuple[int, int, int] = (255, 0, 200),
+    image: UInt8[np.ndarray, "lines samples 3"], mask: Bool[np.ndarray, "lines samples"]
 ) -> UInt8[np.ndarray, "lines samples 3"]:
-    """A copy of the image with the mask's outline drawn over it."""
+    """A copy of the image with the mask's outline drawn over it in magenta."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.ascontiguousarray(image).copy(), contours, -1, colour, 1)
+    return cv2.drawContours(np.ascontiguousarray(image).copy(), contours, -1, (255, 0, 200), 1)

@@ -75,18 +75,12 @@ def safe_sqrt(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def safe_ratio(
-    numerator: Float[Tensor, "*shape"],
-    denominator: Float[Tensor, "*shape"],
-    minimum: float = 0.0,
-    fallback: float = 0.0,
+    numerator: Float[Tensor, "*shape"], denominator: Float[Tensor, "*shape"], minimum: float = 0.0
 ) -> Float[Tensor, "*shape"]:
-    """``numerator / denominator`` where ``|denominator| > minimum``, else ``fallback`` with gradient 0.
-
-    The shapes broadcast. A dead band of a white reference, for example, gives the fallback.
-    """
+    """``numerator / denominator`` where ``|denominator| > minimum``, else 0 with gradient 0. The shapes broadcast."""
     wide = widen(denominator)
     usable = ~(wide.abs() <= minimum)
-    ratio = torch.where(usable, widen(numerator), fallback) / torch.where(usable, wide, 1.0)
+    ratio = torch.where(usable, widen(numerator), 0.0) / torch.where(usable, wide, 1.0)
     return narrow(ratio, numerator, denominator)
 
 
@@ -97,21 +91,21 @@ def safe_log10(values: Float[Tensor, "*shape"], minimum: float = 1e-30) -> Float
     return narrow(torch.where(below, math.log10(minimum), torch.where(below, 1.0, wide).log10()), values)
 
 
-def _direction(spectra: Tensor, dim: int, norm_floor: float) -> tuple[Tensor, Tensor]:
-    """Spectra divided by max(norm, floor), and by how much their squared length falls short of 1 (``dim`` kept).
+def _direction(spectra: Tensor, norm_floor: float) -> tuple[Tensor, Tensor]:
+    """Spectra divided by max(norm, floor), and by how much their squared length falls short of 1 (last axis kept).
 
     The shortfall is exactly 0 for spectra at or above the floor, whatever the rounding of the division.
     """
-    squared = spectra.square().sum(dim, keepdim=True)
+    squared = spectra.square().sum(-1, keepdim=True)
     zero = squared == 0
     norm = torch.where(zero, 1.0, squared).sqrt().clamp_min(norm_floor)
     direction = torch.where(zero, 0.0 * spectra, spectra / norm)
     short = zero | (squared < norm_floor**2)
-    return direction, torch.where(short, 1.0 - direction.square().sum(dim, keepdim=True), 0.0)
+    return direction, torch.where(short, 1.0 - direction.square().sum(-1, keepdim=True), 0.0)
 
 
-def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: int = -1) -> Float[Tensor, "*rest"]:
-    """Angle between spectra along ``dim``, radians in [0, pi] (Kruse et al. 1993; paper, Eq. SAM).
+def spectral_angle(a: Float[Tensor, "*shape bands"], b: Float[Tensor, "*shape bands"]) -> Float[Tensor, "*shape"]:
+    """Angle between spectra, radians in [0, pi] (Kruse et al. 1993; paper, Eq. SAM).
 
     The angle is ``2 atan2(|u - v|, |u + v|)`` of the unit vectors (Kahan, "How Futile are Mindless Assessments of
     Roundoff", 2006), accurate at every angle and independent of the spectra's scale. The arc cosine would lose angles
@@ -123,14 +117,13 @@ def spectral_angle(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: 
         tensor(0.7854)
     """
     if a.device.type == b.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and a.shape == b.shape:
-        last = a.movedim(dim, -1), b.movedim(dim, -1)
-        flat = (spectra.reshape(-1, spectra.shape[-1]).contiguous() for spectra in last)
-        return _CompiledAngle.apply(*flat).reshape(last[0].shape[:-1])
-    u, u_short = _direction(widen(a), dim, 0.0)
-    v, v_short = _direction(widen(b), dim, 0.0)
-    undirected = ((u_short > 0) | (v_short > 0)).squeeze(dim)
-    difference = _root((u - v).square().sum(dim))
-    total = torch.where(undirected, 1.0, _root((u + v).square().sum(dim)))
+        flat = (spectra.reshape(-1, spectra.shape[-1]).contiguous() for spectra in (a, b))
+        return _CompiledAngle.apply(*flat).reshape(a.shape[:-1])
+    u, u_short = _direction(widen(a), 0.0)
+    v, v_short = _direction(widen(b), 0.0)
+    undirected = ((u_short > 0) | (v_short > 0)).squeeze(-1)
+    difference = _root((u - v).square().sum(-1))
+    total = torch.where(undirected, 1.0, _root((u + v).square().sum(-1)))
     angle = torch.where(undirected, math.pi / 2, 2.0 * torch.atan2(difference, total))
     return narrow(angle, a, b)
 
@@ -160,20 +153,19 @@ class _CompiledAngle(torch.autograd.Function):
 
 
 def one_minus_cosine(
-    a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"], dim: int = -1, norm_floor: float = 0.0
-) -> Float[Tensor, "*rest"]:
-    """One minus the cosine of the spectral angle along ``dim``, in [0, 2], without cancellation: ``|u - v|² / 2``.
+    a: Float[Tensor, "*shape bands"], b: Float[Tensor, "*shape bands"], norm_floor: float = 0.0
+) -> Float[Tensor, "*shape"]:
+    """One minus the cosine of the spectral angle, in [0, 2], without cancellation: ``|u - v|² / 2``.
 
     Args:
         a: Spectra.
         b: Spectra of the same shape.
-        dim: The dimension that holds the bands.
         norm_floor: Lower bound of the norms in the denominator, which bounds the gradient. The cosine of a spectrum
             below it shrinks to 0 with the norm; spectra above it are not affected.
     """
-    u, u_short = _direction(widen(a), dim, norm_floor)
-    v, v_short = _direction(widen(b), dim, norm_floor)
-    return narrow(0.5 * ((u - v).square().sum(dim) + (u_short + v_short).squeeze(dim)), a, b)
+    u, u_short = _direction(widen(a), norm_floor)
+    v, v_short = _direction(widen(b), norm_floor)
+    return narrow(0.5 * ((u - v).square().sum(-1) + (u_short + v_short).squeeze(-1)), a, b)
 
 
 def select_pixels(

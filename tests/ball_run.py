@@ -10,8 +10,8 @@ import capture_factory as factory
 import numpy as np
 import torch
 import yaml
+from capture_factory import packed_frame
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from packed_frames import packed_frame
 
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint

@@ -10,6 +10,7 @@ import numpy as np
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
+from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.poses.result import TurntablePoses
 
 BANDS = 12
@@ -92,4 +93,17 @@ def true_poses(images, names, *, unused=(), angles_deg=(0.0, 90.0, 180.0, 270.0)
         disc_markers=(0, 1),
         disc_tilt_deg=0.0,
         loop_closure_deg=0.0,
+    )
+
+
+def packed_frame(root: Path, capture: str, camera_to_world: np.ndarray | None = None, **known) -> PackedFrame:
+    """A frame of a packed dataset whose files lie where `process` puts them; they need not be there."""
+    return PackedFrame(
+        capture=capture,
+        image_path=root / "images" / f"{capture}.png",
+        mask_path=root / "masks" / f"{capture}.png",
+        cube_path=root / "cubes" / f"{capture}.hdr",
+        flags_path=root / "flags" / f"{capture}.png",
+        camera_to_world=np.eye(4) if camera_to_world is None else camera_to_world,
+        **{"angle_deg": 0.0, "reprojection_error_px": None, **known},
     )

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+from capture_factory import packed_frame
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from packed_frames import packed_frame
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube

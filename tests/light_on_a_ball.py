@@ -3,9 +3,8 @@
 import numpy as np
 import scipy.sparse
 
-from hsi_sc_nerf.light.directions import even_directions
-from hsi_sc_nerf.light.transfer import Transfer
-from hsi_sc_nerf.light.views import TurningElements, Views
+from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.views import Transfer, TurningElements, Views
 
 DIRECTIONS = even_directions(2048)
 TO_LAMP = np.array([-0.5, 0.55, 0.67]) / np.linalg.norm([-0.5, 0.55, 0.67])

@@ -1,6 +1,9 @@
-"""A trainer of the tiny dataset, set up for a few steps."""
+"""A trainer of the tiny dataset, set up for a few steps; a pipeline as training would begin with."""
 
 import copy
+from pathlib import Path
+
+import torch
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 
@@ -31,3 +34,11 @@ def trainer(
     made = config.setup(local_rank=0, world_size=1)
     made.setup()
     return made
+
+
+def untrained_pipeline(data: Path):
+    """The pipeline of a dataset, in test mode."""
+    config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
+    config.datamanager.data = config.datamanager.dataparser.data = data
+    torch.manual_seed(0)
+    return config.setup(device="cpu", test_mode="test")

@@ -162,17 +162,11 @@ def test_norm_floor_fades_the_cosine_and_bounds_the_gradient() -> None:
     torch.testing.assert_close(a.grad, torch.tensor([[-1.0, 0.0]]))
 
 
-def test_dim_and_scale_do_not_matter() -> None:
-    a, b = spectra().float(), spectra(1).float()
-    torch.testing.assert_close(spectral_angle(a.T, b.T, dim=0), spectral_angle(a, b))
-    torch.testing.assert_close(one_minus_cosine(a.T, 1e20 * b.T, dim=0), one_minus_cosine(a, b))
-
-
-def test_ratio_falls_back_on_dead_bands() -> None:
+def test_ratio_of_dead_bands_is_zero() -> None:
     numerator = torch.tensor([1.0, 2.0, 3.0, 4.0], requires_grad=True)
     denominator = torch.tensor([0.0, 4.0, 1e-9, -2.0], requires_grad=True)
-    ratio = safe_ratio(numerator, denominator, minimum=1e-6, fallback=-1.0)
-    torch.testing.assert_close(ratio.detach(), torch.tensor([-1.0, 0.5, -1.0, -2.0]))
+    ratio = safe_ratio(numerator, denominator, minimum=1e-6)
+    torch.testing.assert_close(ratio.detach(), torch.tensor([0.0, 0.5, 0.0, -2.0]))
     ratio.sum().backward()
     torch.testing.assert_close(numerator.grad, torch.tensor([0.0, 0.25, 0.0, -0.5]))
     torch.testing.assert_close(denominator.grad, torch.tensor([0.0, -0.125, 0.0, -1.0]))

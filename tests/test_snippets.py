@@ -17,9 +17,8 @@ import tyro
 from random_cloud import random_cloud
 
 from hsi_sc_nerf.cli.commands import command_line
-from hsi_sc_nerf.export.cloud import stream
+from hsi_sc_nerf.export.cloud import read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import write_cloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
 
 ROOT = Path(__file__).parents[1]
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]}
@@ -112,8 +111,8 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
         "export.cloud.comment_lines",
         "export.formats.write_cloud",
         "export.options.select_bands",
-        "export.ply.read_spectral_ply",
-        "export.ply.write_spectral_ply",
+        "export.cloud.read_spectral_ply",
+        "export.cloud.write_spectral_ply",
         "fields.hash_grid.grid_for_resolution",
         "findings.refuse_red",
         "geometry.mesh.Mesh",

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.closed_mesh import Size
-from hsi_sc_nerf.analysis.size_uncertainty import combined
+from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
@@ -115,7 +114,10 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     regions = {name: region["indices"] for name, region in content["regions"].items()}
     names = list(regions[WHOLE])
     if names:
-        rows = [[region, *(_mean_and_sd(values[name]) for name in names)] for region, values in regions.items()]
+        rows = [
+            [region, *(_with_std(values[name]["mean"], values[name]["sd"]) for name in names)]
+            for region, values in regions.items()
+        ]
         note = "Mean ± standard deviation over the surface, weighted by area."
         tables.append(TraitTable("Indices", note, ["region", *names], rows))
     return tables
@@ -231,8 +233,3 @@ def _with_sd(value: float, sd: float) -> str:
         return f"{value:.4g} ± {sd:.2g}"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{sd:.1e}"))))
     return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
-
-
-def _mean_and_sd(value: Mapping[str, Any]) -> str:
-    mean, sd = (float("nan" if value[key] is None else value[key]) for key in ("mean", "sd"))
-    return f"{mean:.3f} ± {sd:.3f}"

@@ -12,8 +12,14 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import INCIDENCE, LIGHT_COLUMNS, SpectralCloud
-from hsi_sc_nerf.export.ply import band_property_names, material_spectra, write_spectral_ply
+from hsi_sc_nerf.export.cloud import (
+    INCIDENCE,
+    LIGHT_COLUMNS,
+    SpectralCloud,
+    band_property_names,
+    material_spectra,
+    write_spectral_ply,
+)
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 

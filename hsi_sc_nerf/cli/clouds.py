@@ -23,7 +23,7 @@ from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.terminal import screen_table
 
 if TYPE_CHECKING:
-    from hsi_sc_nerf.analysis.closed_mesh import Size
+    from hsi_sc_nerf.analysis.size import Size
     from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
     from hsi_sc_nerf.analysis.traits import Traits
     from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -114,17 +114,18 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
-        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh, size_of
+        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.size_uncertainty import (
+        from hsi_sc_nerf.analysis.size import (
             pixel_on_object_m,
             shared_errors,
+            size_of,
             size_uncertainty,
             sizes_to_find,
         )
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
-        from hsi_sc_nerf.export.ply import read_spectral_ply
+        from hsi_sc_nerf.export.cloud import read_spectral_ply
         from hsi_sc_nerf.packed.dataset import open_packed
         from hsi_sc_nerf.terminal import progress_bar
 

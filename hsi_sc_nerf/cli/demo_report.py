@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.benchmark.steps import StepCost
 from hsi_sc_nerf.evaluation.spatial import precision_recall_f_score, sample_surface
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import unpack

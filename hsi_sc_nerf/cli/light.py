@@ -55,9 +55,8 @@ class MaterialCommand:
             InputError: cloud and run do not fit together or cannot be used, or the result cannot be written.
         """
         check_options(self)
-        from hsi_sc_nerf.export.cloud import stream
+        from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
-        from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply
         from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_run
@@ -118,7 +117,7 @@ def bands_of(cloud_nm: Float[np.ndarray, "selected"], run_nm: Float[np.ndarray, 
 
 def with_material(cloud: SpectralCloud, found: RunLight, bands: np.ndarray, *, corrected: bool) -> SpectralCloud:
     """The cloud with the columns of material and irradiance."""
-    from hsi_sc_nerf.export.ply import band_property_names
+    from hsi_sc_nerf.export.cloud import band_property_names
     from hsi_sc_nerf.light.fit import WHITE_STD
 
     # Shade that is found but not corrected is an error of unknown size.

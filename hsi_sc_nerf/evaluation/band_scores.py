@@ -5,23 +5,14 @@ Arguments are those of `spectral_metrics`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.image_blocks import (
-    Image,
-    Mask,
-    Valid,
-    check_shapes,
-    check_valid,
-    cleared,
-    image_blocks,
-)
-from hsi_sc_nerf.numerics import check_mask, narrow, safe_log10, select_pixels
+from hsi_sc_nerf.numerics import check_mask, safe_log10, select_pixels
 
 # The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
 PSNR_DELTA = 1e-10
@@ -32,65 +23,70 @@ SSIM_WINDOW_PX = 11
 SSIM_WINDOW_SIGMA_PX = 1.5
 
 
+# Values of one image in a block: 8 MiB a temporary in float64, of which there are some dozens.
+BLOCK_VALUES = 1 << 20
+Image = Float[Tensor, "h w bands"]
+Mask = Bool[Tensor, "h w"]
+Valid = Bool[Tensor, "h w bands"]
+
+
 def band_scores(
     predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
 ) -> list[tuple[Float[Tensor, "bands"], Float[Tensor, "bands"], Float[Tensor, "bands"]]]:
-    """`per_band_mse`, `per_band_ssim` and `per_band_windowed_ssim` over each of several masks."""
+    """`moment_scores` and `windowed_scores` over each of several masks."""
+    windowed = windowed_scores(predicted, target, masks, valid)
+    by_mask = moment_scores(predicted, target, masks, valid)
+    return [(*scores, windows) for scores, windows in zip(by_mask, windowed, strict=True)]
+
+
+def moment_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
+) -> list[tuple[Float[Tensor, "bands"], Float[Tensor, "bands"]]]:
+    """Mean squared error (paper, MSE_b) and SSIM of each band over each of several masks, float64.
+
+    SSIM takes means, variances and covariance over all the pixels of the mask: one window.
+    """
     if _is_compiled(predicted, target):
-        by_mask = _compiled_moment_scores(predicted, target, masks, valid)
-        windowed = _compiled_windowed_ssim(predicted, target, masks, valid)
-        return [(*scores, windows) for scores, windows in zip(by_mask, windowed, strict=True)]
+        from hsi_sc_nerf.evaluation import band_moments_cpu  # compiles; a GPU does without it
+
+        found = torch.from_numpy(band_moments_cpu.moments(*_for_loops(predicted, target, masks, valid)))
+        return list(zip(found[5], _ssim(*found[:5]), strict=True))
     return [
         (
-            per_band_mse(predicted, target, mask, valid),
-            per_band_ssim(predicted, target, mask, valid),
-            per_band_windowed_ssim(predicted, target, mask, valid),
+            _over_pixels(lambda p, t, v: _band_mean((p - t).square(), v), predicted, target, mask, valid),
+            _over_pixels(_ssim_over_pixels, predicted, target, mask, valid),
         )
         for mask in masks
     ]
 
 
-def per_band_mse(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, "bands"]:
-    """Mean squared error over the pixels of each band, float64 (paper, MSE_b)."""
+def windowed_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
+) -> list[Float[Tensor, "bands"]]:
+    """SSIM of each band over 11 x 11 Gaussian windows (sigma 1.5 px), float64: the usual index of Wang et al. 2004.
+
+    A window counts if its centre lies in the mask and is valid; what it covers may lie outside the mask. At the
+    image's border the window is cut, values that are not valid are cut out of it, and its weights are scaled to sum
+    to 1, so that every valid pixel is a centre.
+    """
     if _is_compiled(predicted, target):
-        return _compiled_moment_scores(predicted, target, [mask], valid)[0][0]
-    return _over_pixels(lambda p, t, v: _band_mean((p - t).square(), v), predicted, target, mask, valid)
+        from hsi_sc_nerf.evaluation import band_moments_cpu
+
+        taps = _gaussian_weights(SSIM_WINDOW_PX, torch.tensor([SSIM_WINDOW_PX // 2]))[0].numpy()
+        loops = _for_loops(predicted, target, masks, valid)
+        counts, sums = map(torch.from_numpy, band_moments_cpu.window_scores(*loops, taps, (SSIM_C1, SSIM_C2)))
+        return list(torch.where(counts > 0, sums / counts.clamp_min(1), 1.0))
+    return [_windowed_score(predicted, target, mask, valid) for mask in masks]
 
 
-def per_band_psnr(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+def _windowed_score(
+    predicted: Image, target: Image, mask: Mask | None, valid: Valid | None
 ) -> Float[Tensor, "bands"]:
-    """Peak signal-to-noise ratio of each band, dB, for a peak of 1; at most ``-10 log10(PSNR_DELTA)`` = 100 dB."""
-    return narrow(decibel(per_band_mse(predicted, target, mask, valid)), predicted)
-
-
-def decibel(mse: Float[Tensor, "bands"]) -> Float[Tensor, "bands"]:
-    """The peak signal-to-noise ratio of mean squared errors, dB."""
-    return -10.0 * safe_log10(mse + PSNR_DELTA)
-
-
-def per_band_ssim(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, "bands"]:
-    """SSIM of each band with means, variances and covariance over all the pixels of the mask: one window."""
-    if _is_compiled(predicted, target):
-        return narrow(_compiled_moment_scores(predicted, target, [mask], valid)[0][1], predicted)
-    return narrow(_over_pixels(_ssim_over_pixels, predicted, target, mask, valid), predicted)
-
-
-def per_band_windowed_ssim(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, "bands"]:
-    """``windowed_ssim`` of each band."""
-    if _is_compiled(predicted, target):
-        return narrow(_compiled_windowed_ssim(predicted, target, [mask], valid)[0], predicted)
     height, width, bands = predicted.shape
     if mask is None:
         mask = torch.ones(height, width, dtype=torch.bool, device=predicted.device)
     if len(select_pixels(predicted[..., :1], mask)) == 0:
-        return narrow(predicted.new_ones(bands), predicted)
+        return predicted.new_ones(bands).double()
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
     weights_rows, weights_columns = _gaussian_weights(height, rows), _gaussian_weights(width, columns)
     centres = mask[rows][:, columns]
@@ -115,7 +111,12 @@ def per_band_windowed_ssim(
         else:
             at_centres = some_valid[mask]
             scores.append(torch.where(at_centres.any(0), _band_mean(cleared(local, at_centres), at_centres), 1.0))
-    return narrow(torch.cat(scores), predicted)
+    return torch.cat(scores)
+
+
+def decibel(mse: Float[Tensor, "bands"]) -> Float[Tensor, "bands"]:
+    """Peak signal-to-noise ratio of mean squared errors, dB, for a peak of 1; at most ``-10 log10(PSNR_DELTA)``."""
+    return -10.0 * safe_log10(mse + PSNR_DELTA)
 
 
 def _over_pixels(
@@ -194,23 +195,40 @@ def _for_loops(
     return (first, second, third), chosen
 
 
-def _compiled_moment_scores(
-    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
-) -> list[tuple[Float[Tensor, "bands"], Float[Tensor, "bands"]]]:
-    """`per_band_mse` and `per_band_ssim` over each mask, float64."""
-    from hsi_sc_nerf.evaluation import band_moments_cpu  # compiles; a GPU does without it
+def image_blocks(
+    predicted: Tensor, target: Tensor, valid: Tensor | None, dim: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """Both images in slices along ``dim``, 0 where not valid, and which of their values are."""
+    check_shapes(predicted, target)
+    step = max(1, BLOCK_VALUES * predicted.shape[dim] // max(1, predicted.numel()))
+    pairs = zip(predicted.split(step, dim), target.split(step, dim), strict=True)
+    if valid is None:
+        yield from ((p, t, None) for p, t in pairs)
+    else:
+        for (p, t), v in zip(pairs, valid.split(step, dim), strict=True):
+            yield cleared(p, v), cleared(t, v), v
 
-    found = torch.from_numpy(band_moments_cpu.moments(*_for_loops(predicted, target, masks, valid)))
-    return list(zip(found[5], _ssim(*found[:5]), strict=True))
+
+def check_shapes(predicted: Tensor, target: Tensor) -> None:
+    """Raise ValueError where the images differ in shape."""
+    if predicted.shape != target.shape:
+        raise ValueError(f"the images differ in shape: {tuple(predicted.shape)} and {tuple(target.shape)}")
 
 
-def _compiled_windowed_ssim(
-    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
-) -> Float[Tensor, "masks bands"]:
-    """`per_band_windowed_ssim` over each mask, float64."""
-    from hsi_sc_nerf.evaluation import band_moments_cpu
+def cleared(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """``values``, 0 where they are not valid: what stood there, NaN included, touches neither values nor gradients.
 
-    taps = _gaussian_weights(SSIM_WINDOW_PX, torch.tensor([SSIM_WINDOW_PX // 2]))[0].numpy()
-    loops = _for_loops(predicted, target, masks, valid)
-    counts, sums = map(torch.from_numpy, band_moments_cpu.window_scores(*loops, taps, (SSIM_C1, SSIM_C2)))
-    return torch.where(counts > 0, sums / counts.clamp_min(1), 1.0)
+    Raises:
+        ValueError: ``valid`` is not boolean or of another shape.
+    """
+    check_valid(values, valid)
+    return torch.where(valid, values, 0.0)
+
+
+def check_valid(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> None:
+    """Raise ValueError where the validity is not boolean, or its shape is not that of the values."""
+    if valid.dtype != torch.bool or valid.shape != values.shape:
+        raise ValueError(
+            f"the validity of values of shape {tuple(values.shape)} is boolean with that shape, not {valid.dtype} "
+            f"with shape {tuple(valid.shape)}"
+        )

@@ -118,13 +118,9 @@ def threshold_curves(
 ) -> ThresholdCurves:
     """Precision and recall: the fractions of distances within each threshold, the threshold itself included.
 
-    The distances are those of the cloud's points to the reference, for the precision, and back, for the recall.
-
-    Raises:
-        ValueError: one side has no points.
+    The distances are those of the cloud's points to the reference, for the precision, and back, for the recall; each
+    holds one at least.
     """
-    if not len(to_reference_m) or not len(to_cloud_m):
-        raise ValueError("threshold_curves: the cloud and the reference need one point each at least")
     precision, recall = (
         100.0 * np.searchsorted(np.sort(distances), thresholds_m, side="right") / len(distances)
         for distances in (to_reference_m, to_cloud_m)

@@ -23,14 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.band_scores import (
-    band_scores,
-    decibel,
-    per_band_psnr,
-    per_band_ssim,
-    per_band_windowed_ssim,
-)
-from hsi_sc_nerf.evaluation.image_blocks import Image, Mask, Valid, image_blocks
+from hsi_sc_nerf.evaluation.band_scores import Image, Mask, Valid, band_scores, decibel, image_blocks
 from hsi_sc_nerf.numerics import masked_mean, narrow, safe_sqrt, select_pixels, spectral_angle
 
 MIN_BANDS_OF_AN_ANGLE = 2
@@ -96,52 +89,16 @@ def spectral_rmse(
     return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else count_bands(valid))), predicted)
 
 
-def pixel_mean_rmse(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, ""]:
-    """Mean over pixels of each pixel's root mean squared error over the bands.
-
-    This is what the paper's released code prints as RMSE; it is never above ``spectral_rmse``, the text's, where all
-    is valid. A pixel without valid bands is left out.
-    """
-    roots = safe_sqrt(squared_error_map(predicted, target, valid))
-    return narrow(_pixel_mean(roots, mask, None if valid is None else valid.any(-1)), predicted)
-
-
-def psnr(predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None) -> Float[Tensor, ""]:
-    """Mean over bands of ``per_band_psnr`` (paper, PSNR_HSI): not the PSNR of the mean error."""
-    return _mean_over_bands(per_band_psnr(predicted, target, mask, valid), mask, valid)
-
-
-def ssim(predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None) -> Float[Tensor, ""]:
-    """Structural similarity, mean over bands, with moments "computed over pixels in Omega" (paper, SSIM_HSI).
-
-    Read to the letter: one window, the whole of Omega, however the pixels lie. It asks whether the object's contrast
-    is right as a whole, not whether details are in place; ``windowed_ssim`` does that.
-    """
-    return _mean_over_bands(per_band_ssim(predicted, target, mask, valid), mask, valid)
-
-
-def windowed_ssim(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, ""]:
-    """Mean SSIM over 11 x 11 Gaussian windows (sigma 1.5 px) and bands: the usual index of Wang et al. 2004.
-
-    A window counts if its centre lies in the mask and is valid; what it covers may lie outside the mask. At the
-    image's border the window is cut, values that are not valid are cut out of it, and its weights are scaled to sum
-    to 1, so that every valid pixel is a centre. The paper's formula, ``ssim``, takes the moments over all pixels at
-    once instead.
-    """
-    return _mean_over_bands(per_band_windowed_ssim(predicted, target, mask, valid), mask, valid)
-
-
 def spectral_metrics(
     predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
 ) -> dict[str, float]:
     """Every metric of one view, by name.
 
-    ``sam`` (rad), ``rmse``, ``ssim`` and ``psnr`` (dB) are the paper's; ``rmse_pixel_mean`` and ``ssim_windowed`` are
-    other usual readings of the same names.
+    ``sam`` (rad), ``rmse``, ``ssim`` and ``psnr`` (dB) are the paper's. ``psnr`` is a mean over bands, not of the
+    mean error. ``ssim`` reads "moments computed over pixels in Omega" to the letter: one window, the whole of
+    Omega, however the pixels lie. It asks whether the object's contrast is right as a whole; ``ssim_windowed`` asks
+    whether details are in place (`windowed_scores`). ``rmse_pixel_mean``, the mean of each pixel's root, is what
+    the paper's released code prints; it is never above ``rmse``, the text's, where all is valid.
     """
     return metrics_of_regions(predicted, target, {"": mask}, valid)
 

@@ -27,10 +27,11 @@ from hsi_sc_nerf.export.cloud import (
     MATERIAL,
     REFLECTANCE,
     CloudStream,
+    band_property_names,
     cloud_attributes,
     comment_lines,
+    write_spectral_ply,
 )
-from hsi_sc_nerf.export.ply import band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, delete_remains, make_folder
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]

@@ -21,8 +21,7 @@ from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, comment_lines, estimate_normals
-from hsi_sc_nerf.export.ply import band_property_names
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, band_property_names, comment_lines, estimate_normals
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.geometry.mesh import Mesh

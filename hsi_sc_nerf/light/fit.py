@@ -17,9 +17,17 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.directions import even_directions, harmonic_degrees, tangents
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
-from hsi_sc_nerf.light.standing_light import DEGREE, TERMS, StandingLight, even_light, units_on
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors, robust_std, scatter_beyond, tukey_weights
+from hsi_sc_nerf.light.standing_light import (
+    DEGREE,
+    TERMS,
+    StandingLight,
+    even_directions,
+    even_light,
+    harmonic_degrees,
+    tangents,
+    units_on,
+)
 from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
 
 MOST_LAMPS = 4
@@ -50,13 +58,9 @@ COLOUR_STD = 0.3
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
 """Lamps that give the white reference less than this part of its light have no colour of their own."""
-TUKEY = 4.685
-"""Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
-SMALLEST_SCATTER = 0.002
 OCCLUSION_ERROR = 0.1
 """Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
 touch."""
-BOUNCES = 4
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
 SETTLED = 0.01
@@ -86,18 +90,15 @@ class LightFit:
     relative_std: Float[np.ndarray, "m"]
 
 
-def fit_light(
-    elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"], bounces: int = BOUNCES
-) -> LightFit:
+def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]) -> LightFit:
     """Fit light and materials.
 
     Args:
         elements: that were measured.
         views: their measurements.
         white_normal: outward unit normal of the white reference, camera's frame.
-        bounces: diffuse reflections between elements; 0 for none.
     """
-    fit = _Fit(elements, views, white_normal, bounces)
+    fit = _Fit(elements, views, white_normal)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
         before = fit.state()
@@ -119,8 +120,8 @@ def fit_light(
 class _Fit:
     """State of the fit: the light, and what follows from it."""
 
-    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray, bounces: int) -> None:
-        self.elements, self.views, self.white, self.bounces = elements, views, white, bounces
+    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray) -> None:
+        self.elements, self.views, self.white = elements, views, white
         count = len(views.element), len(elements.positions)
         entries = np.ones(count[0]), (views.element, np.arange(count[0]))
         self._sum_by_element = scipy.sparse.csr_array(entries, shape=count[::-1])
@@ -224,12 +225,12 @@ class _Fit:
 
     def _bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
-        for _ in range(1 if self.bounced.any() or not self.bounces else 2):
+        for _ in range(1 if self.bounced.any() else 2):
             material = self._materials(self.irradiance())
             bounced = np.zeros_like(self.bounced)
-            for frame in np.unique(self.views.frame) if self.bounces else ():
+            for frame in np.unique(self.views.frame):
                 rows = np.flatnonzero(self.views.frame == frame)
-                arriving = self.elements.bounced(self.light, material, int(frame), self.bounces)
+                arriving = self.elements.bounced(self.light, material, int(frame))
                 bounced[rows] = arriving[self.views.element[rows]]
             self.bounced = bounced
 
@@ -267,10 +268,10 @@ class _Fit:
     def _weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
         told = self.views.tells_light
-        self.scatter = max(1.4826 * float(np.median(np.abs(residual[told]))), SMALLEST_SCATTER)
+        self.scatter = robust_std(residual[told])
         beyond = scatter_beyond(residual[told], self._own_std[told])
         std = np.hypot(beyond, self._own_std)
-        self.weights = np.where(told, _tukey(residual / std), 1.0)
+        self.weights = np.where(told, tukey_weights(residual / std), 1.0)
         self._precision = self.weights * told / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -340,20 +341,3 @@ class _Fit:
         colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
         chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
         self.light = replace(light, lamp_colour=colour, chamber_colour=chamber_colour)
-
-
-def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, "m"]) -> float:
-    """The standard deviation that residuals have in common beyond their own ones; by their median, against gloss."""
-    low, high = SMALLEST_SCATTER, 1.0
-    for _ in range(20):
-        middle = np.sqrt(low * high)
-        if 1.4826 * np.median(np.abs(residual) / np.hypot(middle, own_std)) > 1.0:
-            low = middle
-        else:
-            high = middle
-    return float(middle)
-
-
-def _tukey(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Tukey's biweight; never quite 0, so that no element is left without a measurement."""
-    return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

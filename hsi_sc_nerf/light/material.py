@@ -9,11 +9,10 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.directions import even_directions
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
-from hsi_sc_nerf.light.fit import BOUNCES, LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
-from hsi_sc_nerf.light.transfer import transfer
-from hsi_sc_nerf.light.views import TurningElements, Views
+from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
+from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.views import TurningElements, Views, transfer
 
 RAY_DIRECTIONS = 2048
 """Over the sphere: 4.5 degrees apart."""
@@ -70,7 +69,7 @@ class ObjectLight:
             rows = np.flatnonzero(frames == frame)
             light, material = self.spectral.light, self.spectral.material
             whole = self.turning.direct(light, int(frame))
-            whole = whole + self.turning.bounced(light, material, int(frame), BOUNCES)
+            whole = whole + self.turning.bounced(light, material, int(frame))
             result[rows] = np.einsum("nk,nkb->nb", share[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
         relative = np.sqrt((share * self._relative_variance[nearest]).sum(axis=1))

@@ -1,4 +1,4 @@
-"""What measurements tell if many of them share an error.
+"""What measurements tell if many of them share an error, and some are grossly wrong.
 
 Thousands of measurements with shared errors of mesh, poses and model look far more certain than they are. So the
 spread of their gradients is taken from groups (Liang and Zeger 1986; several ways of grouping as in Cameron, Gelbach
@@ -13,6 +13,9 @@ from jaxtyping import Float, Int
 
 CORRELATED = 8.0
 """At best so many measurements count as one."""
+TUKEY = 4.685
+"""Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
+SMALLEST_SCATTER = 0.002
 
 
 class SharedErrors:
@@ -60,3 +63,25 @@ class SharedErrors:
         sums = self._by_group @ (weighted * (residual[:, None] - columns * factor))
         spread = CORRELATED * square + (sums**2).sum(axis=0)
         return (factor * square) ** 2 / spread
+
+
+def robust_std(residual: Float[np.ndarray, "m"]) -> float:
+    """Standard deviation of normally distributed residuals about 0, by their median; `SMALLEST_SCATTER` at least."""
+    return max(1.4826 * float(np.median(np.abs(residual))), SMALLEST_SCATTER)
+
+
+def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, "m"]) -> float:
+    """The standard deviation that residuals have in common beyond their own ones; by their median, against gloss."""
+    low, high = SMALLEST_SCATTER, 1.0
+    for _ in range(20):
+        middle = np.sqrt(low * high)
+        if robust_std(residual / np.hypot(middle, own_std)) > 1.0:
+            low = middle
+        else:
+            high = middle
+    return float(middle)
+
+
+def tukey_weights(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Tukey's biweight; never quite 0, so that no element is left without a measurement."""
+    return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

@@ -1,9 +1,9 @@
-"""Light that stands still in the camera's frame: an uneven chamber and lamps.
+"""Light that stands still in the camera's frame: an uneven chamber and lamps, as functions of direction.
 
     radiance(direction, band) = chamber(direction) * chamber_colour(band) + lamps(direction) * lamp_colour(band)
 
-``chamber`` is a sum of spherical harmonics of low order, ``lamps`` a sum of a few round lobes. Radiance 1 from all
-sides gives the irradiance 1.
+``chamber`` is a sum of spherical harmonics of low order, ``lamps`` a sum of a few round lobes. Radiance is in units
+of that of an even chamber, in which every unoccluded surface has the irradiance 1.
 """
 
 from __future__ import annotations
@@ -11,14 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-
-from hsi_sc_nerf.light.directions import even_directions, harmonics, lobes
+from jaxtyping import Float, Int
+from scipy.special import sph_harm_y
 
 DEGREE = 2
 """Of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
 FINE_DIRECTIONS = 1 << 13
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+LOBE_WIDTH_RAD = 0.08
+"""Standard deviation of a lobe: that of a lamp of 25 cm at 1 m, and no lobe falls between the directions of rays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,3 +62,51 @@ def units_on(
     cosines = np.maximum(fine @ normal, 0.0)
     cosines /= cosines.sum()
     return cosines @ harmonics(fine, DEGREE), cosines @ lobes(fine, to_lamps)
+
+
+def even_directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Unit vectors spread evenly over the sphere on a Fibonacci spiral; each stands for 4 pi / count sr."""
+    height = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    azimuth = GOLDEN_ANGLE * np.arange(count)
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
+
+
+def harmonics(directions: Float[np.ndarray, "n 3"], degree: int) -> Float[np.ndarray, "n terms"]:
+    """Real spherical harmonics up to ``degree``, (degree + 1)^2 terms by rising degree; their mean square is 1."""
+    polar = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    terms = []
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            term = sph_harm_y(n, abs(m), polar, azimuth)
+            part = term.real if m >= 0 else term.imag
+            terms.append((np.sqrt(2.0) if m else 1.0) * np.sqrt(4.0 * np.pi) * part)
+    return np.stack(terms, axis=-1)
+
+
+def harmonic_degrees(degree: int) -> Int[np.ndarray, "terms"]:
+    """Degree of each term of `harmonics`."""
+    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+
+
+def lobes(
+    directions: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "lamps 3"]
+) -> Float[np.ndarray, "n lamps"]:
+    """Radiance of round lobes (von Mises-Fisher) of irradiance 1 on a surface that faces them.
+
+    Args:
+        directions: evenly spread over the sphere.
+        towards: unit vectors to the middles of the lobes.
+    """
+    cosines = directions @ towards.T
+    radiance = np.exp((cosines - 1.0) / LOBE_WIDTH_RAD**2)
+    return radiance / ((4.0 / len(directions)) * (radiance * np.maximum(cosines, 0.0)).sum(axis=0))
+
+
+def tangents(towards: Float[np.ndarray, "lamps 3"]) -> Float[np.ndarray, "lamps 2 3"]:
+    """Two unit vectors perpendicular to each other and to each of the given ones."""
+    helper = np.eye(3)[np.abs(towards).argmin(axis=1)]
+    first = np.cross(towards, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(towards, first)], axis=1)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.image_blocks import cleared
+from hsi_sc_nerf.evaluation.band_scores import cleared
 from hsi_sc_nerf.evaluation.spectral_metrics import has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG
-from hsi_sc_nerf.export.ply import SpectralCloud, read_spectral_ply
+from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -22,17 +21,18 @@ from hsi_sc_nerf.report.dataset_sections import (
     inspection_section,
     masks_section,
     poses_section,
-    read_known,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, html_page
-from hsi_sc_nerf.report.result_sections import comparison_key_figure, comparison_section, traits_section
+from hsi_sc_nerf.report.page import CloudViewer, Section, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
+    comparison_key_figure,
+    comparison_section,
     flat_settings,
     read_scalars,
     settings_section,
     stage_ends,
     training_section,
+    traits_section,
 )
 from hsi_sc_nerf.report.view_sections import (
     bands_section,

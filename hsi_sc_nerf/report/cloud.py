@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.ply import SpectralCloud
+from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.plotting import INDEX_COLOURS
 from hsi_sc_nerf.spectra import available_composites, available_indices, index_values
 

@@ -10,12 +10,20 @@ import numpy as np
 from jaxtyping import Float, Int
 from markupsafe import Markup
 
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
+from hsi_sc_nerf.report.page import (
+    Block,
+    Figure,
+    Folded,
+    Missing,
+    Section,
+    Table,
+    content_of,
+    embedded_file,
+    read_known,
+)
 
 _PROCESS = "hsi-sc-nerf process SESSION --output-dir DATA"
 _DIRECTIONS = {"ccw": "counter-clockwise", "cw": "clockwise"}
@@ -27,22 +35,10 @@ _FLAGGED = {
     "no_data": "no data",
 }
 _FLAGGED_FRACTION = (0.01, 0.05)
-_AGAIN = "make it again"
-# What reading figures from another content, however damaged, ends in.
-_WRONG_CONTENT = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError)
 # The outline of a convex object changes by a few per cent from frame to frame.
 _MASK_JUMP = 0.1
 # The paper's target.
 _REPROJECTION_PX = 1.0
-
-
-def read_known(path: Path) -> dict[str, Any] | None:
-    """Content of a JSON file; None if it does not exist.
-
-    Raises:
-        InputError: it is no JSON object.
-    """
-    return read_json(path, _AGAIN) if path.is_file() else None
 
 
 def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
@@ -61,15 +57,13 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
     content = read_known(path)
     if content is None:
         return []
-    try:
+    with content_of(path, "findings", "inspect the session again"):
         above = f"{Path(content.get('session', '')).parent}/"
         findings = [
             # The folders of the machine that processed the session tell a reader nothing.
             Finding(one["name"], one["level"], one["sentence"].replace(above, ""))
             for one in content["findings"]
         ]
-    except (AttributeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: holds no findings ({error}); inspect the session again.") from error
     return [Section("inspection", "The session", [], findings)]
 
 
@@ -94,10 +88,8 @@ def calibration_section(dataset: PackedDataset) -> Section:
     """
     path = dataset.root / "calibration.json"
     found = read_known(path)
-    try:
+    with content_of(path, "calibration"):
         return _calibration_section(dataset, found)
-    except _WRONG_CONTENT as error:
-        raise InputError(f"{path}: holds no calibration ({error}); {_AGAIN}.") from error
 
 
 def _calibration_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:
@@ -234,10 +226,8 @@ def poses_section(dataset: PackedDataset) -> Section:
     """
     path = dataset.root / "poses.json"
     found = read_known(path)
-    try:
+    with content_of(path, "poses"):
         return _poses_section(dataset, found)
-    except _WRONG_CONTENT as error:
-        raise InputError(f"{path}: holds no poses ({error}); {_AGAIN}.") from error
 
 
 def _poses_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.band_scores import PSNR_DELTA, per_band_mse, per_band_ssim
+from hsi_sc_nerf.evaluation.band_scores import decibel, moment_scores
 from hsi_sc_nerf.evaluation.spectral_metrics import metrics_of_regions, spectral_angle_map, squared_error_map
 from hsi_sc_nerf.packed.pixels import spread_over
 
@@ -101,13 +101,16 @@ def score_view(
 ) -> ViewScores:
     """Scores of a view, with the paper's metrics (section "Evaluation Metrics")."""
     known = valid[mask].any(0).cpu().numpy()
-    mse = np.where(known, per_band_mse(rendered, measured, mask, valid).cpu().numpy(), np.nan)
+    (scores,) = moment_scores(rendered, measured, [mask], valid)
+    mse, psnr_db, ssim = (
+        np.where(known, score.double().cpu().numpy(), np.nan) for score in (scores[0], decibel(scores[0]), scores[1])
+    )
     return ViewScores(
         name,
         metrics_of_regions(rendered, measured, {"": mask, "full_": None}, valid),
         rmse=np.sqrt(mse),
-        psnr_db=-10.0 * np.log10(mse + PSNR_DELTA),
-        ssim=np.where(known, per_band_ssim(rendered, measured, mask, valid).double().cpu().numpy(), np.nan),
+        psnr_db=psnr_db,
+        ssim=ssim,
         angle_rad=spectral_angle_map(rendered, measured, valid).cpu().numpy(),
         error=squared_error_map(rendered, measured, valid).sqrt().cpu().numpy(),
         mask=mask.cpu().numpy(),

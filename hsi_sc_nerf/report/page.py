@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +18,7 @@ from markupsafe import Markup
 from PIL import Image, UnidentifiedImageError
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.findings import Finding
 
 _PACKAGE = "hsi_sc_nerf.report"
@@ -24,6 +26,7 @@ _SCRIPTS = ("cloud_data.js", "cloud_renderer.js", "cloud_controls.js")
 WIDEST_PX = 1600
 """Wider pictures are downscaled to this."""
 _QUALITY = 82
+_AGAIN = "make it again"
 # Levels of findings as words, because colour alone does not tell everybody.
 _WORDS = {"green": "Good:", "amber": "Check:", "red": "Problem:"}
 _MOST_GOOD = 3
@@ -107,6 +110,28 @@ class Section:
     title: str
     blocks: Sequence[Block]
     findings: Sequence[Finding] = ()
+
+
+def read_known(path: Path) -> dict[str, Any] | None:
+    """Content of a JSON file; None if it does not exist.
+
+    Raises:
+        InputError: it is no JSON object.
+    """
+    return read_json(path, _AGAIN) if path.is_file() else None
+
+
+@contextmanager
+def content_of(path: Path, what: str, advice: str = _AGAIN) -> Iterator[None]:
+    """Refuse a file in one sentence if reading figures from its content fails, however damaged that is.
+
+    Raises:
+        InputError: it does.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: holds no {what} ({error}); {advice}.") from error
 
 
 def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], sections: Sequence[Section]) -> str:

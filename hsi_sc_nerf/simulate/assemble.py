@@ -67,13 +67,12 @@ def first_camera(camera: CameraSettings) -> Float[np.ndarray, "4 4"]:
 def frame_plan(scene: Scene) -> FramePlan:
     """The frames of the scene: even steps of the turntable, changed by the motion effects."""
     frames = scene.turntable.frames
-    sign = 1.0 if scene.turntable.direction == "ccw" else -1.0
     plan = FramePlan(
         room_camera=first_camera(scene.camera),
-        angles_deg=sign * np.arange(frames) * 360.0 / frames,
+        angles_deg=np.arange(frames) * 360.0 / frames,
         elapsed=np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1),
         nominal_step_deg=360.0 / frames,
-        direction=scene.turntable.direction,
+        direction="ccw",
     )
     for effect in of_kind(scene.effects, MotionEffect):
         plan = effect.replan(plan, effect_rng(scene.seed, effect))

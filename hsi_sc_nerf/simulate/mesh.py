@@ -29,13 +29,8 @@ def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:
     Returns:
         A mesh whose first vertex is the lower pole and whose last vertex is the upper pole; vertex
         ``1 + ring * segments + k`` has the azimuth ``360 k / segments`` degrees.
-
-    Raises:
-        ValueError: the profile does not start and end on the axis, or touches it in between.
     """
     profile = np.asarray(profile, float)
-    if len(profile) < 3 or profile[0, 0] != 0.0 or profile[-1, 0] != 0.0 or (profile[1:-1, 0] <= 0.0).any():
-        raise ValueError("revolve: the profile must start and end on the axis and stay off it in between")
     azimuth = 2.0 * np.pi * np.arange(segments) / segments
     radius, height = profile[1:-1].T
     rings = np.stack(

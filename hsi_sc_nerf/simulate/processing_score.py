@@ -17,11 +17,9 @@ from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.frames import FramePaths
-from hsi_sc_nerf.simulate.truth import Truth
+from hsi_sc_nerf.simulate.truth import COVERED, Truth
 from hsi_sc_nerf.spectra import nearest_bands
 
-COVERED = 0.5
-"""Fraction of a pixel that the object must exceed for the pixel to belong to it."""
 MIDDLE_REFLECTANCE = (0.1, 0.9)
 """Range of reflectance, free of clipping, in which errors are compared with the uncertainty."""
 

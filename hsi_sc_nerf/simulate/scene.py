@@ -126,9 +126,7 @@ class TurntableSettings:
 
     disc_diameter_m: float = between(0.01, 2.0)
     frames: int = between(1, 3600, default=36)
-    """Frames in one full turn, evenly spaced."""
-    direction: Literal["ccw", "cw"] = "ccw"
-    """Direction of rotation seen from above."""
+    """Frames in one full turn, evenly spaced and counter-clockwise seen from above."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
 from hsi_sc_nerf.evaluation.spatial import sample_surface
@@ -19,14 +20,12 @@ from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.geometry.ply_file import read_ply
-from hsi_sc_nerf.simulate.truth import Truth, load_truth
+from hsi_sc_nerf.simulate.truth import COVERED, Truth, load_truth
 from hsi_sc_nerf.spectra import composite, to_8_bit
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
-COVERED = 0.5
-"""Smallest fraction of an object pixel that the object covers."""
 LIFT_M = 1e-5
 """Offset of the origin of a line of sight from the surface."""
 FACET_LIFT_M = 0.0001
@@ -157,9 +156,10 @@ class TrueSurface:
             tuple(columns), truth.mesh(), np.stack(list(columns.values()), axis=-1), endmembers, truth.wavelengths_nm
         )
 
-    def reflectance(self, chosen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "n bands"]:
-        """True spectra of the chosen vertices."""
-        return (self.weights[chosen] @ self.endmembers).astype(np.float32)
+    def spectral_mesh(self, eyes_m: Float[np.ndarray, "cameras 3"]) -> SpectralMesh:
+        """The surface with its true spectra; what no camera at these positions sees is unseen."""
+        spectra = (self.weights @ self.endmembers).astype(np.float32)
+        return SpectralMesh(self.mesh, spectra, self.wavelengths_nm, self.seen(self.mesh.vertices, eyes_m))
 
     def nearest(self, points_m: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unit normal, material fractions and distance (m) of the nearest surface point of each point."""
@@ -178,19 +178,16 @@ class TrueSurface:
         scene = self._scene()
         return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
 
-    def cloud(
-        self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float, seed: int = 0
-    ) -> SpectralCloud:
+    def cloud(self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float) -> SpectralCloud:
         """The cloud of an ideal reconstruction: uniform, visible points with true spectra.
 
         Args:
             count: number of points on the whole surface, invisible ones included.
             eyes_m: positions of the cameras.
             noise_m: standard deviation of the position in each direction; if positive, normals scatter by 0.3 rad.
-            seed: seed of positions and noise.
         """
-        rng = np.random.default_rng(seed)
-        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count, seed)
+        rng = np.random.default_rng(0)
+        points = sample_surface(self.mesh.vertices, self.mesh.triangles, count)
         points = points[self.seen(points, eyes_m)]
         normals, weights, _ = self.nearest(points)
         spectra = (weights @ self.endmembers).astype(np.float32)

@@ -24,6 +24,9 @@ from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
 
+COVERED = 0.5
+"""Fraction of a pixel that the object covers, from which on the pixel is the object's."""
+
 
 @dataclass(frozen=True)
 class Truth:

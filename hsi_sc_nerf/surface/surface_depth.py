@@ -9,15 +9,15 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn import functional
 
+from hsi_sc_nerf.fields.ray_marching import cell_of
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.numerics import safe_ratio
-from hsi_sc_nerf.surface.ray_densities import densities_along
 
 MIN_OPACITY = 0.5
 """Rays that collect less opacity than this hit no surface (released settings of the paper)."""
@@ -32,6 +32,9 @@ SEARCH_STEPS = 40
 MIN_COSINE = 0.17
 """Smallest cosine between a ray and the surface normal: pixels smear faces seen at more than 80 degrees."""
 _MIN_RATIO_OPACITY = 1e-3
+OPAQUE = 5.0
+"""Optical depth behind which nothing is asked for: less than a hundredth of the light is left."""
+_STEPS_AT_ONCE = 5
 
 
 @torch.no_grad()
@@ -121,3 +124,53 @@ def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tens
     if model.background is not None:
         spectra = safe_ratio(spectra - background * (1.0 - opacity), opacity, minimum=_MIN_RATIO_OPACITY)
     return outputs, spectra.clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def rendered_density(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
+    """Density at points as it is rendered: 0 where the occupancy grid knows no matter."""
+    return model.field.density_fn(points) * _may_hold_matter(model, points)[..., None]
+
+
+@torch.no_grad()
+def densities_along(
+    model: SpectralModel,
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    edges: Float[Tensor, "rays steps_and_1"],
+) -> Float[Tensor, "rays steps"]:
+    """Density in the middle of each step; 0 where the occupancy grid knows no matter, which is never rendered.
+
+    Without a GPU, it is 0 as well behind an optical depth of ``OPAQUE``.
+
+    Args:
+        model: trained model, in evaluation mode.
+        origins: of the rays.
+        directions: unit vectors.
+        edges: distances that bound the steps, ascending.
+    """
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
+    points = origins[:, None] + directions[:, None] * middles[..., None]
+    known = _may_hold_matter(model, points)
+    if origins.device.type != "cpu":
+        return model.field.density_fn(points)[..., 0] * known
+    densities, lengths = torch.zeros_like(middles), edges.diff(dim=-1)
+    depth = torch.zeros_like(middles[:, 0])
+    for first in range(0, middles.shape[1], _STEPS_AT_ONCE):
+        some = slice(first, first + _STEPS_AT_ONCE)
+        asked = known[:, some] & (depth < OPAQUE)[:, None]
+        found = torch.zeros_like(densities[:, some])
+        if asked.any():
+            found[asked] = model.field.density_fn(points[:, some][asked][:, None])[:, 0, 0]
+        densities[:, some] = found
+        depth += (found * lengths[:, some]).sum(dim=-1)
+    return densities
+
+
+def _may_hold_matter(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
+    """Whether the occupancy grid knows matter at points; everywhere, where there is none."""
+    grid = model.occupancy
+    if grid is None:
+        return torch.ones_like(points[..., 0], dtype=torch.bool)
+    cells, inside = cell_of(points, grid.opacity.shape, grid.lower, grid.cell)
+    return inside & (grid.opacity.flatten()[cells] >= 0.0)

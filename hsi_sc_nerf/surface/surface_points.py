@@ -23,10 +23,9 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
-from hsi_sc_nerf.surface.ray_densities import rendered_density
 from hsi_sc_nerf.surface.regions import EVERYWHERE, Region, in_box
 from hsi_sc_nerf.surface.silhouette_surface import move_to_silhouettes
-from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY
+from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, rendered_density
 from hsi_sc_nerf.terminal import progress_bar
 
 MAX_SHIFT = 0.02

@@ -1,4 +1,4 @@
-"""Plots, colour bars and Markdown for the viewer's control panel."""
+"""What the viewer shows in its panel (plots, colour bars, Markdown), and what each browser sees when it opens it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,10 +14,15 @@ from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from nerfstudio.viewer.viewer_elements import ViewerElement
+from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from viser import GuiMarkdownHandle, ViserServer
 
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+    from nerfstudio.viewer.viewer import Viewer
+    from viser import ClientHandle
 
 _WIDTH_IN = 2.5  # 240 px of the viewer's panel
 _DPI = 3 * 96  # three dots a pixel, sharp on high-resolution screens
@@ -85,3 +90,41 @@ class ViewerMarkdown(ViewerElement[str]):
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         # An image root avoids one warning for each image.
         self.gui_handle = viser_server.gui.add_markdown(self.first(), image_root=Path())
+
+
+class BrowserControl(ViewerControl):
+    """nerfstudio's access to the viewer, which also reports every browser that opens it.
+
+    The training cameras are hidden when their scene is made: their pictures would cover the object and catch clicks.
+    A render for a browser that is closed or reloaded is stopped: nerfstudio would finish it, a minute at full size on
+    two cores, while all other browsers wait for the model and stay black.
+
+    Args:
+        opened: called with the browser, whose initial camera is inside the object.
+    """
+
+    def __init__(self, opened: Callable[[ClientHandle], None]) -> None:
+        self._opened = opened
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        renderers: dict[int, RenderStateMachine] = {}
+
+        def opened(client: ClientHandle) -> None:
+            renderers[client.client_id] = viewer.render_statemachines[client.client_id]
+            self._opened(client)
+
+        def closed(client: ClientHandle) -> None:
+            # nerfstudio has told the thread to end, but not its render.
+            renderers.pop(client.client_id).interrupt_render_flag = True
+
+        viewer.viser_server.on_client_connect(opened)
+        viewer.viser_server.on_client_disconnect(closed)
+        show_scene = viewer.init_scene
+
+        def show_scene_without_cameras(*args: Any, **options: Any) -> None:
+            show_scene(*args, **options)
+            viewer.set_camera_visibility(False)
+            viewer.toggle_cameravis_button()
+
+        viewer.init_scene = show_scene_without_cameras  # type: ignore[method-assign]

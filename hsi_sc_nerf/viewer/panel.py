@@ -36,8 +36,7 @@ from hsi_sc_nerf.spectra import (
     index_values,
     nearest_bands,
 )
-from hsi_sc_nerf.viewer.browsers import BrowserControl
-from hsi_sc_nerf.viewer.drawings import ViewerMarkdown, colour_bar, inline_image, spectra_plot
+from hsi_sc_nerf.viewer.drawings import BrowserControl, ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 from standing_sphere import RADIUS_M, STAND_M, sphere_points
 
-from hsi_sc_nerf.analysis.base import find_base, lower_rim, lowest_edge_m
 from hsi_sc_nerf.analysis.closed_mesh import (
     MeshConfig,
     closed_mesh,
-    feret_diameters,
+    find_base,
+    lower_rim,
+    lowest_edge_m,
     open_edges,
-    size_of,
     smoothed,
     solid_pieces,
     thinned,
 )
+from hsi_sc_nerf.analysis.size import feret_diameters, size_of
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.mesh import cylinder

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges, size_of
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
+from hsi_sc_nerf.analysis.size import size_of
+from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.cli.clouds import TraitsCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.export.ply import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
@@ -51,9 +51,7 @@ def measured_apple(true_apple):
 
 @pytest.fixture(scope="module")
 def ideal_apple(true_apple):
-    everything = np.ones(len(true_apple.mesh.vertices), bool)
-    seen = true_apple.seen(true_apple.mesh.vertices, eyes_around())
-    return SpectralMesh(true_apple.mesh, true_apple.reflectance(everything), NM, seen)
+    return true_apple.spectral_mesh(eyes_around())
 
 
 @pytest.mark.slow

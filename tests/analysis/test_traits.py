@@ -1,4 +1,4 @@
-"""Spectra on a mesh: classes and their areas, regions, pictures, the PLY file."""
+"""Spectra on a mesh: classes and their areas, regions, pictures, the PLY file, tables."""
 
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from hsi_sc_nerf.analysis.classes import (
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
+from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_mesh
 from hsi_sc_nerf.analysis.traits import (
     WHOLE,
@@ -23,8 +24,13 @@ from hsi_sc_nerf.analysis.traits import (
     mean_and_sd,
 )
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud
-from hsi_sc_nerf.export.ply import band_property_names, material_spectra, read_spectral_ply
+from hsi_sc_nerf.export.cloud import (
+    INCIDENCE,
+    SpectralCloud,
+    band_property_names,
+    material_spectra,
+    read_spectral_ply,
+)
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
@@ -260,3 +266,49 @@ def test_ideal_cloud_holds_what_cameras_see():
     expected = np.where(cloud.points[away, 1:2] > 0.0, GREEN, BROWN)
     np.testing.assert_allclose(cloud.spectra[away], expected, atol=1e-4)
     assert relative_rms(1.02 * GREEN, GREEN) == pytest.approx(0.02)
+
+
+SIZES = ("area_m2", "volume_l", "height_m", "largest_diameter_m", "smallest_diameter_m", "equivalent_diameter_m")
+
+
+@pytest.mark.parametrize(
+    ("height_m", "sd_m", "shown"),
+    [
+        (0.078341, 8.5e-6, "78.3410 ± 0.0085"),
+        (0.078341, 3.4e-4, "78.34 ± 0.34"),
+        (0.078341, 9.96e-4, "78.3 ± 1.0"),
+        (0.078341, 0.0123, "78 ± 12"),
+        (0.078341, 0.0, "78.34 ± 0"),
+        (0.078341, None, "78.34"),
+    ],
+)
+def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
+    content = {
+        "size": dict.fromkeys(SIZES, height_m),
+        "size_sd": None if sd_m is None else dict.fromkeys(SIZES, sd_m),
+        "size_sd_by_cause": {} if sd_m is None else {"base": dict.fromkeys(SIZES, sd_m)},
+        "seen_area_m2": 0.01,
+        "watertight": True,
+        "classes": None,
+        "regions": {WHOLE: {"indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
+    }
+    sizes, _ = trait_tables(content)
+    assert ["height", shown, "mm"] in sizes.rows
+    assert ("the unseen base" in sizes.note) == (sd_m is not None)
+    assert ("the scale" in sizes.note) == (sd_m is not None)
+
+
+@pytest.mark.parametrize(("std", "shown"), [(0.021, "0.530 ± 0.021"), (None, "0.530")])
+def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
+    of_spot = {"mean": 0.377, "std": 0.004, "measured": 0.2, "irradiance": 0.53, "irradiance_std": std}
+    content = {
+        "size": dict.fromkeys(SIZES, 0.07),
+        "size_sd": None,
+        "size_sd_by_cause": {},
+        "seen_area_m2": 0.01,
+        "watertight": True,
+        "classes": None,
+        "regions": {name: {"indices": {}, "reflectance": of_spot} for name in (WHOLE, "spot")},
+    }
+    _, brightness = trait_tables(content)
+    assert brightness.rows == [[name, "0.377 ± 0.004", "0.200", shown] for name in (WHOLE, "spot")]

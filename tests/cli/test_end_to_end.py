@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.cli.main import main
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.processing_score import score_processing

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from packed_frames import packed_frame
+from capture_factory import packed_frame
 
 from hsi_sc_nerf.data.background_image import (
     MAX_FRAMES,

@@ -184,8 +184,3 @@ def test_the_threshold_that_reaches_a_score_does_and_the_next_smaller_one_does_n
 
 def test_f_score_of_nothing_is_nothing() -> None:
     np.testing.assert_array_equal(f_score([0, 0, 50, 100], [0, 100, 100, 100]), [0, 0, 100 * 2 / 3, 100])
-
-
-def test_an_empty_side_is_refused() -> None:
-    with pytest.raises(ValueError, match="one point each"):
-        threshold_curves(np.zeros(0), np.zeros(3), np.array([0.1]))

@@ -8,8 +8,7 @@ from random_cloud import BAND_NAMES, assert_equal, random_cloud
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import stream
-from hsi_sc_nerf.export.ply import band_property_names, read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream, write_spectral_ply
 from hsi_sc_nerf.geometry.ply_file import ply_triangles
 
 

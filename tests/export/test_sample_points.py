@@ -13,7 +13,7 @@ from hsi_sc_nerf.cli.trained_runs import SampleCommand
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
-from hsi_sc_nerf.export.ply import read_spectral_ply
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.sample_points import frontal_views, outward_normals, read_points
 from hsi_sc_nerf.models import trained_run
 

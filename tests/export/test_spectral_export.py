@@ -8,8 +8,8 @@ from known_ball import FRAMES, LENS, POSES, RADIUS, SIZE_PX, WAVELENGTHS_NM, Bal
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
-from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.surface.depth_renders import refined_poses, render_depth_maps

@@ -1,25 +1,27 @@
-"""The light on a run's object, and the command: a ball under a lamp, whose irradiance is known in closed form."""
+"""The light on a run's object, the command, and what tells of shading: balls of known irradiance."""
+
+from dataclasses import replace
 
 import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
+from light_on_a_ball import FACING, measured, turning_ball
 
 from hsi_sc_nerf.cli.light import bands_of, sentences, summary, with_material
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.export.cloud import SpectralCloud, stream
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import write_cloud
-from hsi_sc_nerf.export.ply import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import pixel_rays
-from hsi_sc_nerf.light.of_run import light_of_run
+from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.of_run import light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import open_packed
 
 TO_LAMP = np.array([-0.45, 0.3, 0.84]) / np.linalg.norm([-0.45, 0.3, 0.84])
 LAMP = 0.5
-FACING = np.array([0.0, 0.0, 1.0])
 
 
 def irradiance(normals, camera_to_world):
@@ -148,3 +150,33 @@ def test_even_light_is_left_alone(even):
 def test_a_cloud_of_other_bands_is_refused(tmp_path):
     with pytest.raises(InputError):
         bands_of(np.array([500.0, 512.0]), np.array([500.0, 510.0]), tmp_path / "cloud.ply")
+
+
+def shaded_ball():
+    """A ball whose lower elements see less of the sky, by up to 40 %."""
+    ball = turning_ball()
+    visible = (0.8 + 0.2 * ball.normals[:, 2]).astype(np.float32)
+    weights = ball.transfer.open_weights * visible[:, None]
+    return replace(ball, transfer=replace(ball.transfer, open_weights=weights)), visible
+
+
+@pytest.mark.parametrize("shade", [True, False])
+def test_the_profile_tells_of_light_that_does_not_change_with_the_turn(shade):
+    ball, visible = shaded_ball()
+    views, _, _ = measured(ball, lamp=0.0)
+    # Three materials of like brightness all over the ball.
+    kinds = np.array([[0.2, 0.5], [0.3, 0.3], [0.5, 0.2]])[np.arange(len(visible)) % 3]
+    noise = 1.0 + 0.01 * np.random.default_rng(0).standard_normal((len(views.element), 1))
+    shown = kinds[views.element] * noise * (visible[views.element, None] if shade else 1.0)
+    views = replace(views, reflectance=shown)
+    found = shading_evidence(ball, views, fit_light(ball, views, FACING))
+    assert found.profile == pytest.approx(1.0 if shade else 0.0, abs=0.1)
+    assert found.shaded == shade
+
+
+def test_a_lamp_shows_in_the_turn():
+    ball = turning_ball()
+    views, _, _ = measured(ball, lamp=0.3)
+    found = shading_evidence(ball, views, fit_light(ball, views, FACING))
+    assert found.turning == pytest.approx(1.0, abs=0.1)
+    assert found.shaded

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from packed_frames import packed_frame
+from capture_factory import packed_frame
 from spectral import get_rgb
 from spectral.io import envi as spy
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from packed_frames import packed_frame
+from capture_factory import packed_frame
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from headless_browser import launch, needs_browser
 
-from hsi_sc_nerf.analysis.closed_mesh import Size
 from hsi_sc_nerf.analysis.report import trait_content
+from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.ply import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -28,7 +28,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.page import Section, html_page
-from hsi_sc_nerf.report.result_sections import comparison_section, traits_section
+from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 SECTIONS = ["inspection", "object", "views", "bands", "spectra", "comparison", "traits", "training"]
@@ -170,7 +170,7 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         write_json(dataset.root / f"{name}.json", content)
         with pytest.raises(InputError, match=rf"{name}\.json: holds no"):
             section(dataset)
-    with pytest.raises(InputError, match=r"comparison\.json: is no comparison"):
+    with pytest.raises(InputError, match=r"comparison\.json: holds no comparison"):
         comparison_section({"curves": {"thresholds_m": [1.0]}}, run / "comparison.json")
     with pytest.raises(InputError, match="holds no traits"):
         traits_section({"settings": {}}, run / "traits.json")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.ply import SpectralCloud
+from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, quantise, spacing_of, thinned
 
 

@@ -7,8 +7,7 @@ import pytest
 
 from hsi_sc_nerf.report.build import judge_cloud
 from hsi_sc_nerf.report.dataset_sections import judge_calibration, judge_masks, judge_poses
-from hsi_sc_nerf.report.result_sections import judge_comparison, judge_traits
-from hsi_sc_nerf.report.run_sections import judge_training
+from hsi_sc_nerf.report.run_sections import judge_comparison, judge_training, judge_traits
 from hsi_sc_nerf.report.view_sections import judge_bands, judge_spectra, judge_views
 
 NM = np.linspace(400.0, 1000.0, 7)

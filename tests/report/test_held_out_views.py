@@ -1,11 +1,11 @@
 """Held-out views: scores, points and rendering; training curves and settings of a run."""
 
-from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 import torch
+from small_trainer import untrained_pipeline
 
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
@@ -136,12 +136,7 @@ def test_settings_by_their_dotted_names_and_those_that_were_changed():
 
 @pytest.fixture(scope="module")
 def run(flagged_dataset):
-    from hsi_sc_nerf.config import hsi_sc_nerf
-
-    config = deepcopy(hsi_sc_nerf.config.pipeline)
-    config.datamanager.data = config.datamanager.dataparser.data = flagged_dataset
-    torch.manual_seed(0)
-    pipeline = config.setup(device="cpu", test_mode="test")
+    pipeline = untrained_pipeline(flagged_dataset)
     pipeline.eval()
     return TrainedRun(pipeline.model, pipeline.datamanager)
 

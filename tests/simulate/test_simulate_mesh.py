@@ -53,12 +53,6 @@ def test_quads_face_their_corners_order():
     assert np.cross(b - a, c - a)[2] > 0
 
 
-@pytest.mark.parametrize("profile", [[(0.1, 0), (1, 1), (0, 2)], [(0, 0), (0, 1), (0, 2)], [(0, 0), (0, 1)]])
-def test_revolve_refuses_a_profile_that_cannot_close(profile):
-    with pytest.raises(ValueError, match="axis"):
-        revolve(np.array(profile, float), 8)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "height_m", "volume_ml", "radius_m"),

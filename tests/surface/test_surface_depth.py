@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
-from hsi_sc_nerf.surface.ray_densities import densities_along
-from hsi_sc_nerf.surface.surface_depth import SURFACE_OPACITY, opacity_crossing_depth, surface_depth
+from hsi_sc_nerf.surface.surface_depth import SURFACE_OPACITY, densities_along, opacity_crossing_depth, surface_depth
 
 
 @pytest.mark.parametrize("level", [0.1, 0.25, 0.5, 0.9])

@@ -1,6 +1,5 @@
 import contextlib
 import math
-from copy import deepcopy
 from types import SimpleNamespace
 
 import matplotlib
@@ -10,6 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerControl, ViewerElement
+from small_trainer import untrained_pipeline
 from viser.transforms import SO3
 
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX
@@ -77,13 +77,7 @@ def test_drawings_are_pictures_in_markdown():
 
 @pytest.fixture(scope="module")
 def pipeline(flagged_dataset):
-    from hsi_sc_nerf.config import hsi_sc_nerf
-
-    config = deepcopy(hsi_sc_nerf.config.pipeline)
-    config.datamanager.data = flagged_dataset
-    config.datamanager.dataparser.data = flagged_dataset
-    torch.manual_seed(0)
-    return config.setup(device="cpu", test_mode="test")
+    return untrained_pipeline(flagged_dataset)
 
 
 class FakeServer:

@@ -91,9 +91,7 @@ class Clockwise(MotionEffect):
     name: ClassVar[str] = "clockwise"
 
     def replan(self, plan: FramePlan, rng: np.random.Generator) -> FramePlan:
-        """Reverse a counter-clockwise plan."""
-        if plan.direction == "cw":
-            return plan
+        """Reverse the plan."""
         return replace(plan, angles_deg=-plan.angles_deg, direction="cw")
 
 

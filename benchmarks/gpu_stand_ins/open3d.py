@@ -1,12 +1,29 @@
-"""Casting rays at triangles with embreex."""
+"""The parts of Open3D that this project uses, by embreex; only benchmarks/gpu.py puts this file on the path."""
 
 from __future__ import annotations
+
+import sys
+from types import ModuleType
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from open3d.core import Tensor
+
+class Tensor:
+    """An array."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.array = np.asarray(array)
+
+    @classmethod
+    def from_numpy(cls, array: np.ndarray) -> Tensor:
+        """The array as a tensor; nothing is copied."""
+        return cls(array)
+
+    def numpy(self) -> np.ndarray:
+        """The tensor as an array."""
+        return self.array
 
 
 class RaycastingScene:
@@ -42,3 +59,9 @@ class RaycastingScene:
 def _split(rays: Tensor | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     array = rays.array if isinstance(rays, Tensor) else np.asarray(rays)
     return np.ascontiguousarray(array[:, :3]), np.ascontiguousarray(array[:, 3:])
+
+
+# ``open3d.core``, ``open3d.t`` and ``open3d.t.geometry`` are modules of their own.
+core, t, geometry = (ModuleType(f"open3d.{name}") for name in ("core", "t", "t.geometry"))
+core.Tensor, t.geometry, geometry.RaycastingScene = Tensor, geometry, RaycastingScene  # type: ignore[attr-defined]
+sys.modules |= {module.__name__: module for module in (core, t, geometry)}

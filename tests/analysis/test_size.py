@@ -7,13 +7,15 @@ import pytest
 from ball_run import write_ball_dataset
 from standing_sphere import RADIUS_M, STAND_M, sphere_points
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, Size, closed_mesh, size_of
-from hsi_sc_nerf.analysis.size_uncertainty import (
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.size import (
     SURFACE_PX,
     SharedErrors,
+    Size,
     combined,
     offset,
     shared_errors,
+    size_of,
     size_uncertainty,
     sizes_to_find,
 )

@@ -1,4 +1,7 @@
-"""How uncertain an object's sizes are: by the scatter of single points, and by what all points have in common."""
+"""An object's sizes, and how uncertain they are.
+
+Uncertainty comes from the scatter of single points, and from what all points have in common.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, Size, closed, closed_mesh, size_of, surface_and_base
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed, closed_mesh, surface_and_base
 from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -24,8 +28,63 @@ FOOT = 0.5
 """Standard deviation of how far the surface continues under itself, as a fraction of what its slope says."""
 COARSER = 2.0
 """Factor on the smoothing radius. What this changes, finer detail than the smoothing is expected to change again."""
+LITRES_PER_M3 = 1000.0
 DIMENSIONS = np.array([2.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 """Powers of a length in the sizes, in their order."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Sizes of an object that stands upright.
+
+    Attributes:
+        area_m2: surface area, base included.
+        volume_l: enclosed volume, litres.
+        height_m: from lowest to highest, along the turntable's axis.
+        largest_diameter_m: largest width seen from above over all directions (largest Feret diameter).
+        smallest_diameter_m: smallest such width (smallest Feret diameter).
+        equivalent_diameter_m: diameter of the sphere of the same volume.
+    """
+
+    area_m2: float
+    volume_l: float
+    height_m: float
+    largest_diameter_m: float
+    smallest_diameter_m: float
+    equivalent_diameter_m: float
+
+
+def size_of(mesh: Mesh) -> Size:
+    """Sizes of a closed mesh whose z points up.
+
+    Example:
+        >>> size_of(closed_mesh(cloud.points, cloud.normals, MeshConfig())).volume_l
+        0.21
+    """
+    largest, smallest = feret_diameters(mesh.vertices[:, :2])
+    volume_m3 = mesh.volume_m3()
+    return Size(
+        area_m2=mesh.area_m2(),
+        volume_l=volume_m3 * LITRES_PER_M3,
+        height_m=float(np.ptp(mesh.vertices[:, 2])),
+        largest_diameter_m=largest,
+        smallest_diameter_m=smallest,
+        equivalent_diameter_m=float(np.cbrt(6.0 * volume_m3 / np.pi)),
+    )
+
+
+def feret_diameters(outline: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
+    """Largest and smallest distance between parallel lines that enclose the points.
+
+    Exact: the largest is the greatest distance of two corners of the convex hull, the smallest lies across one of
+    its edges (Toussaint 1983, "Solving geometric problems with the rotating calipers").
+    """
+    corners = outline[ConvexHull(outline).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    across = np.stack([-edges[:, 1], edges[:, 0]], axis=-1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    widths = np.ptp(corners @ across.T, axis=0)
+    distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
+    return float(distances.max()), float(widths.min())
 
 
 @dataclass(frozen=True)

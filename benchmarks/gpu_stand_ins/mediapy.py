@@ -1,1 +1,0 @@
-"""An empty mediapy: imported by nerfstudio's exporter for textures, which this project does not export."""

@@ -1,1 +1,0 @@
-"""An empty xatlas: imported by nerfstudio's exporter for textures, which this project does not export."""

@@ -1,0 +1,150 @@
+"""The benchmarks: tables that say where each row comes from, damaged files, the path-traced session, stand-ins."""
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from damaged_files import Kind, damaged, kinds, run_kind
+from results_table import RESULTS, SOURCE_COLUMNS, read_results, write_results
+
+from hsi_sc_nerf.errors import InputError
+
+COLUMNS = ["object", "method", "error, mm"]
+OLD = {"commit": "aaaaaaa", "machine": "old machine", "seed": "1"}
+
+
+def test_cells_are_read_as_they_were_written(tmp_path):
+    rows = [["pear", "ours, plain", '0.1 "±" 0.2'], ["maize", "", "-"]]
+    path = write_results("table", COLUMNS, rows, folder=tmp_path / "new", **OLD)
+    titles, *found = read_results(path)
+    assert titles == [*COLUMNS, *SOURCE_COLUMNS]
+    assert found == [[*row, "aaaaaaa", "1", "old machine"] for row in rows]
+
+
+def test_rows_that_are_not_measured_again_keep_their_sources(tmp_path):
+    write_results("table", COLUMNS, [["pear", "a", "1"], ["pear", "b", "2"]], keys=2, folder=tmp_path, **OLD)
+    path = write_results("table", COLUMNS, [["maize", "a", "3"], ["pear", "a", "4"]], keys=2, folder=tmp_path)
+    _, *rows = read_results(path)
+    assert [row[:3] for row in rows] == [["pear", "a", "4"], ["pear", "b", "2"], ["maize", "a", "3"]]
+    assert rows[1][3:] == ["aaaaaaa", "1", "old machine"]
+    for row in (rows[0], rows[2]):
+        assert row[3] not in ("", "aaaaaaa")
+        assert row[4] == "scene"
+        assert "cores" in row[5]
+
+
+def test_a_whole_table_replaces_the_file(tmp_path):
+    write_results("table", COLUMNS, [["pear", "a", "1"], ["pear", "b", "2"]], folder=tmp_path, **OLD)
+    path = write_results("table", COLUMNS, [["pear", "a", "4"], ["pear", "a", "5"]], folder=tmp_path)
+    assert [row[2] for row in read_results(path)[1:]] == ["4", "5"]
+
+
+def test_rows_of_another_table_are_not_mixed(tmp_path):
+    path = write_results("table", COLUMNS, [["pear", "a", "1"]], folder=tmp_path, **OLD)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="other columns"):
+        write_results("table", COLUMNS[:2], [["pear", "b"]], keys=1, folder=tmp_path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.csv")), ids=lambda path: path.stem)
+def test_committed_results_name_their_sources(path):
+    titles, *rows = read_results(path)
+    assert tuple(titles[-3:]) == SOURCE_COLUMNS
+    assert rows
+    assert all(len(row) == len(titles) and all(row[-3:]) for row in rows)
+
+
+# Charts take tenths of a second to draw, settings of a run as long to read.
+SLOW_READERS = {"config.yml": 2, "calibration.json": 2, "poses.json": 2, "comparison.json": 2}
+INPUTS = 12
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    return kinds(tmp_path_factory.mktemp("damaged") / "valid")
+
+
+@pytest.mark.slow
+def test_damaged_files_are_refused_or_read(valid):
+    for kind in valid:
+        kind.read()
+        outcome = run_kind(kind, SLOW_READERS.get(kind.name, INPUTS), seed=1)
+        assert not outcome.errors, (kind.name, outcome.errors)
+        kind.read()  # the valid file is back
+
+
+def test_the_same_seed_damages_alike_and_every_input_is_counted(tmp_path):
+    assert damaged(b'{"a": [1, 2]}', random.Random(3)) == damaged(b'{"a": [1, 2]}', random.Random(3))
+    path = tmp_path / "a.json"
+    path.write_bytes(b'{"a": 1}')
+    said = iter(["read", "refused", "other", "other"])
+
+    def read():
+        what = next(said)
+        if what == "refused":
+            raise InputError("a: is damaged; make it again.")
+        if what == "other":
+            raise KeyError(what)
+
+    outcome = run_kind(Kind("some", path, read), 4, seed=0, keep=tmp_path / "kept")
+    assert outcome.row("some") == ["some", "4", "1", "1", "2", "0", "0"]
+    assert len(list((tmp_path / "kept").iterdir())) == 2
+    assert path.read_bytes() == b'{"a": 1}'
+
+
+@pytest.mark.slow
+def test_nine_wavelengths_give_all_spectra_and_the_drift_ends_where_it_is_said():
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    import independent_session
+    import path_traced_scene
+
+    nodes_nm, bands_nm = independent_session.NODES_NM.ravel(), independent_session.BANDS
+    mixing = independent_session.mixing_matrix()
+    for name, spectrum in path_traced_scene.MATERIALS.items():
+        np.testing.assert_allclose(spectrum(nodes_nm) @ mixing, spectrum(bands_nm), atol=0.016, err_msg=name)
+    drift = independent_session.lamp_drift(30)
+    assert (drift[-1, 0], drift[-1, -1]) == pytest.approx((0.90, 0.95), abs=1e-3)
+    assert (np.diff(drift, axis=0) < 0).all()
+    for _, corners in path_traced_scene.marker_poses().values():
+        sides_m = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+        np.testing.assert_allclose(sides_m, path_traced_scene.MARKER_SIDE_M)
+        # Clockwise for who looks from above.
+        assert np.cross(corners[1] - corners[0], corners[2] - corners[1])[2] < 0
+
+
+STAND_INS = Path(__file__).parents[1] / "benchmarks" / "gpu_stand_ins"
+SCRIPT = """
+import sys
+import numpy as np
+import open3d
+from hsi_sc_nerf.simulate.frames import Simulation
+from hsi_sc_nerf.simulate.scene import load_scene, override
+
+scene = override(load_scene("pear"), frames=4, size_px=40, bands=5, effects=("chamber_shading",))
+frame = Simulation(scene).frame(1)
+np.savez(sys.argv[1], where=open3d.__file__, counts=frame.counts, coverage=frame.coverage)
+"""
+
+
+@pytest.mark.slow
+def test_frames_by_the_stand_in_equal_open3d(tmp_path, monkeypatch):
+    pytest.importorskip("embreex")
+    pytest.importorskip("open3d")
+    path = str(tmp_path / "stand_in.npz")
+    search = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
+    subprocess.run([sys.executable, "-c", SCRIPT, path], check=True, env={**os.environ, "PYTHONPATH": search})
+    monkeypatch.setattr(sys, "argv", ["", str(tmp_path / "open3d.npz")])
+    exec(SCRIPT, {})
+    with np.load(path) as found, np.load(tmp_path / "open3d.npz") as expected:
+        assert str(STAND_INS) in str(found["where"])
+        np.testing.assert_allclose(found["coverage"], expected["coverage"], atol=1e-3)
+        difference = np.abs(found["counts"].astype(int) - expected["counts"].astype(int))
+    # A ray along the edge of two triangles may go to either.
+    assert (difference > 1).mean() < 1e-3
