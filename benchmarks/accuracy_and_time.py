@@ -30,7 +30,8 @@ from matplotlib import rc_context
 from paper_tables import PaperTable
 from results_table import read_results, write_results
 
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, size_of
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.benchmark.configurations import own_configuration, split_words
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
 from hsi_sc_nerf.evaluation.comparison import CompareConfig
