@@ -13,6 +13,7 @@ import yaml
 from capture_factory import packed_frame
 from nerfstudio.field_components.field_heads import FieldHeadNames
 
+from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS, SpectralCloud, band_property_names, write_spectral_ply
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
@@ -88,3 +89,24 @@ def fill_with_ball(run) -> None:
 
     model.field.forward, model.field.density_fn = field, density
     model.occupancy.refresh_all(density)
+
+
+def write_material_cloud(path: Path, material, relative_std=0.05) -> Path:
+    """A cloud by `hsi-sc-nerf material`: points all over the ball, of that material in half the light at the top."""
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    count = len(directions)
+    irradiance = np.where(directions[:, 2] > 0.0, 0.5, 1.0)
+    spectra = np.broadcast_to(material, (count, factory.BANDS))
+    names = [*band_property_names(factory.WAVELENGTHS_NM, "material"), *LIGHT_COLUMNS]
+    columns = [*spectra.T, irradiance, relative_std * irradiance]
+    cloud = SpectralCloud(
+        points=factory.SPHERE_CENTRE_M + factory.SPHERE_RADIUS_M * directions,
+        normals=directions,
+        colours=np.zeros((count, 3), np.uint8),
+        spectra=spectra * irradiance[:, None],
+        wavelengths_nm=factory.WAVELENGTHS_NM,
+        extra=dict(zip(names, columns, strict=True)),
+    )
+    write_spectral_ply(path, cloud)
+    return path

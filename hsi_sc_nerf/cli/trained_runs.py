@@ -71,6 +71,9 @@ class SampleCommand:
     """Largest distance of a point from the run's surface, in millimetres; points further away get no spectrum."""
     views: int = between(1, math.inf, default=4)
     """Training views to average at each point, the most frontal first. More take longer."""
+    material: Path | None = None
+    """The run's cloud by `hsi-sc-nerf material`: points also get the material's reflectance (material_397.32nm, ...),
+    irradiance and irradiance_std. Points further than 3 mm from the cloud have NaN there."""
 
     def main(self) -> None:
         """Run the command.
@@ -81,6 +84,7 @@ class SampleCommand:
         """
         check_options(self)
         from hsi_sc_nerf.export.cloud import run_name
+        from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_run
 
@@ -89,6 +93,8 @@ class SampleCommand:
         given = read_points(self.points)
         normals = given.normals()
         run = open_run(self.load_config)
+        wavelengths_nm = run.dataset.wavelengths_nm
+        material = None if self.material is None else read_material(self.material, wavelengths_nm)
         points_m = given.positions * _METRES[self.unit]
         found = sample_points(run, points_m, normals, self.max_distance_mm / 1e3, self.views)
         count, no_spectrum = len(found.views), int((found.views == 0).sum())
@@ -98,14 +104,15 @@ class SampleCommand:
                 "the turntable's disc, z up), in metres or with --unit mm."
             )
         name = run_name(self.load_config)
-        write_sampled_ply(output, given, found, run.dataset.wavelengths_nm, run.model.rgb_bands, name)
+        added = None if material is None else material.at(points_m)
+        write_sampled_ply(output, given, found, wavelengths_nm, run.model.rgb_bands, name, added)
         console = Console()
         if no_spectrum:
             console.print(
                 f"[yellow]{no_spectrum:,} of {count:,} points have no spectrum (NaN): no training camera that "
                 f"faces them sees a surface within {self.max_distance_mm:g} mm of them."
             )
-        bands = len(run.dataset.wavelengths_nm)
+        bands = len(wavelengths_nm)
         console.print(f"{escape(str(output))}: {count - no_spectrum:,} points with spectra of {bands} bands.")
 
 
@@ -137,6 +144,9 @@ class RenderCommand:
     """Name of a composite or an index to make a video (MP4) of, such as CIR or NDVI; may be given several times."""
     frames_per_second: int = between(1, 1000, default=15)
     """Frame rate of the videos."""
+    material: Path | None = None
+    """The run's cloud by `hsi-sc-nerf material`: NAME_material is a cube of the material's reflectance beside each
+    cube. It has no data where a pixel shows nothing within 3 mm of the cloud."""
 
     def main(self) -> None:
         """Run the command.
@@ -148,6 +158,7 @@ class RenderCommand:
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         require_writable(self.output_dir)
+        from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
         from hsi_sc_nerf.rendering.pictures import compare, find_false_colour, open_video, write_report
@@ -156,12 +167,15 @@ class RenderCommand:
             views_of_frames,
             views_of_orbit,
             views_of_path,
+            visible_points,
+            write_cube_of_view,
             write_view,
         )
         from hsi_sc_nerf.spectra import to_8_bit
         from hsi_sc_nerf.terminal import progress_bar
 
         run = open_run(self.load_config)
+        material = None if self.material is None else read_material(self.material, run.dataset.wavelengths_nm)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]
         shown = list({item.name: item for item in found}.values())  # a name may be given twice
         if self.camera_path is not None:
@@ -181,6 +195,10 @@ class RenderCommand:
                     rendered = render_view(run.model, camera)
                     if self.cubes != "none":
                         write_view(self.output_dir, name, rendered, run.dataset, self.cubes)
+                    if self.cubes != "none" and material is not None:
+                        points_m = run.to_metres(visible_points(camera, rendered))
+                        spectra = material.at(points_m.reshape(-1, 3))[0].reshape(*points_m.shape[:2], -1)
+                        write_cube_of_view(self.output_dir, f"{name}_material", spectra, run.dataset, self.cubes)
                     rows.append({"view": name, "valid": float(rendered.valid.float().mean())})
                     if views.measured is not None:
                         rows[-1] |= compare(self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands)

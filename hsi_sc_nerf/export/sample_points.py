@@ -21,7 +21,13 @@ from plyfile import PlyData
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, band_property_names, comment_lines, estimate_normals
+from hsi_sc_nerf.export.cloud import (
+    LIGHT_COLUMNS,
+    MAX_INCIDENCE_DEG,
+    band_property_names,
+    comment_lines,
+    estimate_normals,
+)
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -242,10 +248,12 @@ def write_sampled_ply(
     wavelengths_nm: Float[np.ndarray, "bands"],
     rgb_bands: list[int],
     run: str,
+    material: tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]] | None = None,
 ) -> None:
     """Write a file with the spectra of its points as binary PLY, and normals and pseudo-RGB if it has none.
 
-    Its comments state ``run``, the name of the run, and what the new columns mean.
+    Its comments state ``run``, the name of the run, and what the new columns mean. ``material`` is the reflectance of
+    the material, and the relative standard deviation of the light (`CloudMaterial.at`).
 
     Raises:
         InputError: the file cannot be written.
@@ -253,6 +261,12 @@ def write_sampled_ply(
     content, vertices = points.content, points.content["vertex"].data
     columns = dict(zip(band_property_names(wavelengths_nm), found.spectra.T, strict=True))
     columns |= {"sampled_views": found.views, "sampled_std": found.spectral_std}
+    if material is not None:
+        spectra, relative_std = material
+        with np.errstate(divide="ignore", invalid="ignore"):
+            irradiance = found.spectra.mean(axis=1) / spectra.mean(axis=1)
+        names = [*band_property_names(wavelengths_nm, "material"), *LIGHT_COLUMNS]
+        columns |= zip(names, [*spectra.T, irradiance, relative_std * irradiance], strict=True)
     if not points.has(_NORMAL):
         columns |= zip(_NORMAL, found.normals.T.astype(np.float32), strict=True)
     if not points.has(_COLOUR):

@@ -110,10 +110,12 @@ class RenderedView:
     Attributes:
         spectral: reflectance; transparent pixels include the background's.
         opacity: fraction of each pixel that the model's scene covers, in [0, 1].
+        depth: distance from the camera along each pixel's ray, scene units.
     """
 
     spectral: Float[torch.Tensor, "h w bands"]
     opacity: Float[torch.Tensor, "h w"]
+    depth: Float[torch.Tensor, "h w"]
 
     @property
     def valid(self) -> Bool[torch.Tensor, "h w"]:
@@ -129,14 +131,38 @@ def render_view(model: SpectralModel, camera: Cameras) -> RenderedView:
         >>> view = render_view(run.model, run.manager.eval_dataset.cameras[:1])
     """
     outputs = model.get_outputs_for_camera(camera.to(model.device))
-    return RenderedView(outputs["spectral"].cpu(), outputs["accumulation"][..., 0].cpu())
+    return RenderedView(
+        outputs["spectral"].cpu(), outputs["accumulation"][..., 0].cpu(), outputs["depth"][..., 0].cpu()
+    )
+
+
+def visible_points(camera: Cameras, view: RenderedView) -> Float[np.ndarray, "h w 3"]:
+    """Where each pixel's ray ends, scene units; NaN where a pixel is not `RenderedView.valid`."""
+    rays = camera.to("cpu").generate_rays(0)
+    points = rays.origins + rays.directions * view.depth[..., None]
+    return torch.where(view.valid[..., None], points, torch.nan).numpy()
 
 
 def write_view(folder: Path, name: str, view: RenderedView, dataset: PackedDataset, kind: CubeType) -> None:
-    """Write a BIL cube of reflectance ``NAME.hdr`` and ``.raw``, and ``NAME_valid``, a band that is 1 where valid.
+    """Write a cube of reflectance ``NAME``, and ``NAME_valid``, a band that is 1 where valid.
 
-    A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header says. Each pair of files appears whole or
-    not at all.
+    Each pair of files appears whole or not at all.
+
+    Raises:
+        InputError: the files cannot be written.
+    """
+    write_cube_of_view(folder, name, view.spectral.numpy(), dataset, kind)
+    about = {"description": f"1 where the opacity of {name} is above {MIN_OPACITY}", "band names": ["valid"]}
+    valid = view.valid.numpy().astype(np.uint8)[..., None]
+    write_cube(folder / f"{name}_valid.hdr", valid, wavelengths_nm=None, extra_header=about)
+
+
+def write_cube_of_view(
+    folder: Path, name: str, reflectance: Float[np.ndarray, "h w bands"], dataset: PackedDataset, kind: CubeType
+) -> None:
+    """Write a BIL cube of reflectance ``NAME.hdr`` and ``.raw``.
+
+    A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header says, and `FLAGGED` where it is NaN.
 
     Raises:
         InputError: the files cannot be written.
@@ -150,11 +176,7 @@ def write_view(folder: Path, name: str, view: RenderedView, dataset: PackedDatas
     }
     if dataset.fwhm_nm is not None:
         header["fwhm"] = dataset.fwhm_nm.tolist()
-    cube = view.spectral.numpy()
     if kind == "uint16":
-        cube = pack(cube)
+        reflectance = pack(reflectance)
         header |= {"reflectance scale factor": REFLECTANCE_SCALE, "data ignore value": FLAGGED}
-    write_cube(folder / f"{name}.hdr", cube, wavelengths_nm=wavelengths_nm, extra_header=header)
-    about = {"description": f"1 where the opacity of {name} is above {MIN_OPACITY}", "band names": ["valid"]}
-    valid = view.valid.numpy().astype(np.uint8)[..., None]
-    write_cube(folder / f"{name}_valid.hdr", valid, wavelengths_nm=None, extra_header=about)
+    write_cube(folder / f"{name}.hdr", reflectance, wavelengths_nm=wavelengths_nm, extra_header=header)

@@ -8,12 +8,13 @@ import pytest
 import torch
 import yaml
 from plyfile import PlyData, PlyElement
+from random_cloud import random_cloud
 
 from hsi_sc_nerf.cli.trained_runs import SampleCommand
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
-from hsi_sc_nerf.export.cloud import read_spectral_ply
+from hsi_sc_nerf.export.cloud import material_spectra, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.export.sample_points import frontal_views, outward_normals, read_points
 from hsi_sc_nerf.models import trained_run
 
@@ -110,6 +111,34 @@ def test_a_ball_gives_its_spectrum_where_cameras_see_it(tmp_path, sample, capsys
     assert (cloud.colours[~seen] == 64).all()
     assert np.abs(cloud.colours[seen] - 255.0 * factory.PLANT[[5, 3, 1]]).max() <= 1.0
     assert f"{(~seen).sum()} of {len(seen)} points have no spectrum" in " ".join(capsys.readouterr().out.split())
+
+
+def test_points_get_the_material_of_the_cloud_that_tells_it(tmp_path, sample):
+    path, far = tmp_path / "ball.ply", tmp_path / "far.ply"
+    sphere_mesh(path)
+    material = factory.PLANT / 0.8
+    known = ball_run.write_material_cloud(tmp_path / "material.ply", material)
+    cloud = read_spectral_ply(sample(path, material=known))
+    found = material_spectra(cloud)
+    np.testing.assert_allclose(found, np.broadcast_to(material, found.shape), rtol=1e-5)
+    seen = np.isfinite(cloud.spectra).all(axis=1)
+    # Irradiance is that of the spectra beside it: as measured over the material's.
+    np.testing.assert_allclose(cloud.extra["irradiance"][seen], 0.8, atol=0.01)
+    np.testing.assert_allclose(cloud.extra["irradiance_std"][seen], 0.05 * 0.8, rtol=0.02)
+    sphere_mesh(far, radius_m=factory.SPHERE_RADIUS_M + 0.0045)
+    beyond = read_spectral_ply(sample(far, material=known, max_distance_mm=6.0))
+    assert np.isnan(material_spectra(beyond)).all()
+    assert np.isfinite(beyond.spectra).any()
+
+
+def test_clouds_without_the_material_or_with_other_bands_are_refused(tmp_path, sample):
+    path = tmp_path / "ball.ply"
+    sphere_mesh(path)
+    for unusable in (sample(path), tmp_path / "other.ply"):
+        if not unusable.exists():
+            write_spectral_ply(unusable, random_cloud())
+        with pytest.raises(InputError, match=f"{unusable.name}: "):
+            sample(path, material=unusable)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

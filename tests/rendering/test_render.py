@@ -31,7 +31,7 @@ def dataset(tmp_path_factory):
 def random_view(lines=5, samples=7):
     generator = torch.Generator().manual_seed(0)
     spectral_ = torch.rand(lines, samples, len(NM), generator=generator)
-    return RenderedView(spectral_, torch.rand(lines, samples, generator=generator))
+    return RenderedView(spectral_, torch.rand(lines, samples, generator=generator), torch.ones(lines, samples))
 
 
 @pytest.mark.parametrize("kind", ["float32", "uint16"])
@@ -57,7 +57,7 @@ def test_spy_reads_a_view_as_it_was(tmp_path, dataset, kind):
 def test_spy_knows_colours_and_widths_from_a_simulated_session_to_its_rendered_views(tmp_path, tiny_dataset, kind):
     simulated = open_packed(tiny_dataset[0])
     shape = (4, 5, len(simulated.wavelengths_nm))
-    write_view(tmp_path, "view", RenderedView(torch.rand(shape), torch.ones(shape[:2])), simulated, kind)
+    write_view(tmp_path, "view", RenderedView(torch.rand(shape), *torch.ones(2, *shape[:2])), simulated, kind)
     for header in (simulated.frames[0].cube_path, tmp_path / "view.hdr"):
         read = spectral.open_image(str(header))
         np.testing.assert_allclose(read.bands.bandwidths, 7.0)
@@ -71,7 +71,7 @@ def test_false_colours_are_the_viewers():
     values = torch.rand(3, 4, len(wavelengths_nm), generator=torch.Generator().manual_seed(0))
     opacity = torch.ones(3, 4)
     opacity[0] = 0.2
-    view = RenderedView(values, opacity)
+    view = RenderedView(values, opacity, torch.ones(3, 4))
     bands = [int(np.abs(wavelengths_nm - nm).argmin()) for nm in COMPOSITES["CIR"].wavelengths_nm]
     cir = find_false_colour("cir", wavelengths_nm)
     assert cir.name == "CIR"
@@ -165,6 +165,23 @@ def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
     assert row["rmse"] < 0.1
     assert f"| {HELD_OUT} |" in (tmp_path / "out" / "render.md").read_text()
     assert Image.open(tmp_path / "out" / f"{HELD_OUT}.png").width > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["float32", "uint16"])
+def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, monkeypatch, kind):
+    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    cloud = ball_run.write_material_cloud(tmp_path / "material.ply", material=factory.PLANT / 0.8)
+    RenderCommand(tmp_path, tmp_path / "out", material=cloud, cubes=kind).main()
+    measured, found = (
+        np.array(spectral.open_image(str(tmp_path / "out" / f"{HELD_OUT}{end}.hdr")).load())
+        for end in ("", "_material")
+    )
+    distance = silhouette(factory.true_pose(36.0 * int(HELD_OUT[-1])))
+    inside, outside = distance < -0.006, distance > 0.0  # rays that graze the ball end deep in its soft rim
+    np.testing.assert_allclose(measured[inside] / 0.8, found[inside], atol=4e-3)
+    # SPy divides a value without data as well.
+    assert (np.isnan(found[outside]) if kind == "float32" else found[outside] > 1.3).all()
 
 
 def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):

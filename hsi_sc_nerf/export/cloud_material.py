@@ -1,0 +1,87 @@
+"""The material's reflectance at any point of an object, from a cloud by `hsi-sc-nerf material`.
+
+The irradiance in that cloud is that of the view that gave a point its spectrum: the object turns under lamps that
+stand still. The material's reflectance is the same in all views, so that it is what other points and views get.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS, material_spectra, read_spectral_ply
+
+NEIGHBOURS = 4
+"""Points of the cloud whose mean a point gets."""
+MAX_DISTANCE_M = 0.003
+"""A point further from all of the cloud's has no known material."""
+_CHUNK_POINTS = 1 << 15
+
+
+@dataclass(frozen=True, eq=False)
+class CloudMaterial:
+    """Reflectance of the material at the points of a cloud.
+
+    Attributes:
+        points_m: object frame.
+        spectra: reflectance of the material, finite.
+        relative_std: standard deviation of the irradiance over the irradiance; NaN where it is not known.
+    """
+
+    points_m: Float[np.ndarray, "n 3"]
+    spectra: Float[np.ndarray, "n bands"]
+    relative_std: Float[np.ndarray, "n"]
+
+    def at(self, points_m: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "m bands"], Float[np.ndarray, "m"]]:
+        """Distance-weighted mean of the nearest points' spectra, and the relative standard deviation of their light.
+
+        Args:
+            points_m: object frame. Those further than `MAX_DISTANCE_M` from the cloud, or not finite, get NaN.
+        """
+        spectra = np.full((len(points_m), self.spectra.shape[1]), np.nan, np.float32)
+        std = np.full(len(points_m), np.nan, np.float32)
+        tree, count = cKDTree(self.points_m), np.arange(1, min(NEIGHBOURS, len(self.points_m)) + 1)
+        finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
+        for start in range(0, len(finite), _CHUNK_POINTS):
+            rows = finite[start : start + _CHUNK_POINTS]
+            distance_m, nearest = tree.query(points_m[rows], count, workers=-1)
+            near = distance_m[:, 0] <= MAX_DISTANCE_M
+            rows, distance_m, nearest = rows[near], distance_m[near], nearest[near]
+            weights = 1.0 / (distance_m + 1e-6)
+            weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+            spectra[rows] = np.einsum("mk,mkb->mb", weights, self.spectra[nearest])
+            std[rows] = (weights * self.relative_std[nearest]).sum(axis=1)
+        return spectra, std
+
+
+def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> CloudMaterial:
+    """The material in a PLY file by `hsi-sc-nerf material`.
+
+    Args:
+        path: of the file.
+        wavelengths_nm: bands that it must have.
+
+    Raises:
+        InputError: the file cannot be read, has no material's columns, or other bands.
+
+    Example:
+        >>> material = read_material(Path("point_cloud-material.ply"), run.dataset.wavelengths_nm)
+        >>> spectra, relative_std = material.at(points_m)
+    """
+    cloud = read_spectral_ply(path)
+    same = len(cloud.wavelengths_nm) == len(wavelengths_nm)
+    if not same or not np.allclose(cloud.wavelengths_nm, wavelengths_nm, atol=0.01):
+        raise InputError(f"{path}: its bands are not those of the run; take the cloud of the same run.")
+    spectra = material_spectra(cloud)
+    if spectra is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):
+        raise InputError(f"{path}: has no columns of the material; take the cloud by `hsi-sc-nerf material`.")
+    known = np.isfinite(spectra).all(axis=1)
+    if not known.any():
+        raise InputError(f"{path}: none of its points has a material's spectrum; make it again.")
+    irradiance, std = (cloud.extra[name][known] for name in LIGHT_COLUMNS)
+    return CloudMaterial(cloud.points[known], spectra[known], std / irradiance)
