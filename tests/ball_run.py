@@ -93,7 +93,7 @@ def fill_with_ball(run) -> None:
 
 def write_material_cloud(path: Path, material, relative_std=0.05) -> Path:
     """A cloud by `hsi-sc-nerf material`: points all over the ball, of that material in half the light at the top."""
-    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions = np.random.default_rng(0).normal(size=(30_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     count = len(directions)
     irradiance = np.where(directions[:, 2] > 0.0, 0.5, 1.0)
