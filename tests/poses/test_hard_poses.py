@@ -13,7 +13,7 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
-from hsi_sc_nerf.poses.known_camera import KnownCamera
+from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
