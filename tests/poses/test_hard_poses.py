@@ -98,13 +98,13 @@ def test_two_frames_fix_no_axis_but_have_poses_by_a_known_camera():
     first = look_at([0.4, 0.0, 0.2], [0, 0, 0.06])
     camera = KnownCamera(PinholeIntrinsics(64, 48, 100.0, 100.0, 32.0, 24.0), (0.0,) * 4, first, "ccw")
     info = SessionInfo(frame_angles_deg=(0.0, 180.0))
-    poses = find_poses(images, names, info, "angles", camera=camera, progress=False)
+    poses = find_poses(images, names, info, "angles", camera=camera)
     np.testing.assert_allclose(poses.camera_to_world, [first, rotation_about_z(-180.0) @ first], atol=1e-12)
 
 
 def test_two_frames_without_markers_or_camera_are_one_sentence():
     with pytest.raises(InputError, match=r"^no method finds poses: [^\n]*2 frame\(s\)[^\n]*\.$"):
-        find_poses([np.zeros((48, 64), np.uint8)] * 2, ["a", "b"], INFO, progress=False)
+        find_poses([np.zeros((48, 64), np.uint8)] * 2, ["a", "b"], INFO)
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_markers_of_a_table_that_does_not_turn_are_named():
     scene = MarkerScene(frames=4, noise=0.01)
     scene.camera_to_world[:] = scene.camera_to_world[0]
     with pytest.raises(InputError, match=r"markers \d+[^\n]* stand still"):
-        poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
+        poses_from_markers(scene.render(), scene.names(), INFO)
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_a_camera_that_turns_where_it_stands_is_refused(axis, step_deg):
         pose[:] = scene.first_camera_to_world
         pose[:3, :3] @= Rotation.from_euler(axis, (i - 4) * step_deg, degrees=True).as_matrix()
     with pytest.raises(InputError, match="axis goes through the camera"):
-        poses_from_markers(scene.render(), scene.names(), INFO, progress=False)
+        poses_from_markers(scene.render(), scene.names(), INFO)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
