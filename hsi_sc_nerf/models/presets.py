@@ -38,14 +38,10 @@ def apply_preset(config: Any) -> None:
             that of balanced, the default.
 
     Example:
-        >>> from types import SimpleNamespace as Config
-        >>> manager = Config(train_num_rays_per_batch=512)
-        >>> machine, pipeline = Config(device_type="cpu"), Config(datamanager=manager)
-        >>> balanced = PRESETS[default_device()]["balanced"][ITERATIONS]
-        >>> config = Config(preset="fast", max_num_iterations=balanced, machine=machine, pipeline=pipeline)
+        >>> config.preset, config.max_num_iterations = "fast", PRESETS["cpu"]["balanced"][ITERATIONS]
         >>> apply_preset(config)
-        >>> config.max_num_iterations, manager.train_num_rays_per_batch
-        (800, 512)
+        >>> config.max_num_iterations
+        800
     """
     if config.preset is None:
         return
