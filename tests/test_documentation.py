@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from hsi_sc_nerf.inspection.capture_checks import ACCURACY_BY_VIEWS
+
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 documentation = pytest.importorskip("documentation", reason="the documentation's packages are not installed")
@@ -67,3 +69,14 @@ def test_every_test_that_a_page_names_exists():
             assert path.is_file(), f"{page.name}: {file}"
             assert f"def {name}(" in path.read_text(encoding="utf-8"), f"{page.name}: {file}::{name}"
     assert found > 40
+
+
+def test_inspect_quotes_the_committed_figures_of_views():
+    titles, *rows = documentation.read_results(documentation.RESULTS / "accuracy_and_time.csv")
+    columns = [titles.index(title) for title in (" RMSE", "F at 0.5 mm, %", "volume, %")]
+    for part, name, *_ in rows:
+        if part == "views":
+            (row,) = (row for row in rows if row[:2] == [part, name])
+            measured = [float(row[column].split()[0]) for column in columns]
+            quoted = ACCURACY_BY_VIEWS[int(name.split()[0])]
+            assert quoted == (round(100.0 * measured[0], 1), round(measured[1]), round(abs(measured[2]), 1))

@@ -117,6 +117,7 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
         "findings.refuse_red",
         "geometry.mesh.Mesh",
         "models.losses.hsi_loss",
+        "models.schedule.Schedule",
         "numerics.spectral_angle",
         "spectra.index_values",
         "surface.surface_depth.opacity_crossing_depth",

@@ -27,6 +27,15 @@ COMPARED_PX = 40
 """Side of the pictures in which frames are compared."""
 FEWEST_COMPARED = 8
 """Fewest frames among which one can be told to be different."""
+ACCURACY_BY_VIEWS = {
+    8: (3.3, 76, 2.1),
+    12: (2.6, 93, 2.0),
+    20: (1.9, 94, 1.7),
+    30: (1.5, 93, 1.5),
+    60: (1.2, 94, 1.9),
+}
+"""Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume
+(docs/validation/accuracy_and_time.md)."""
 LEAST_SPREAD, LARGEST_DEVIATION = 0.02, 8.0
 """Deviations count in units of a pixel's spread over the frames, of this reflectance at least, up to this many."""
 DIFFERENT_AMBER, DIFFERENT_RED = 1.5, 2.7
@@ -78,10 +87,22 @@ def _binning(capture: Capture) -> str | None:
     return None if binning is None else " x ".join(binning) if isinstance(binning, list) else str(binning)
 
 
+def _accuracy_of(views: int) -> str:
+    """What a simulated pear of at most so many views was like."""
+    tried = max((count for count in ACCURACY_BY_VIEWS if count <= views), default=min(ACCURACY_BY_VIEWS))
+    rmse_percent, near_percent, volume_percent = ACCURACY_BY_VIEWS[tried]
+    return (
+        f"of {tried} views, a simulated pear had its reflectance right to {rmse_percent:g} %, {near_percent:g} % of "
+        f"its surface to 0.5 mm and its volume to {volume_percent:g} %"
+    )
+
+
 def _frames(session: Session) -> Finding:
     white = "no white reference" if session.white is None else f"the white reference {session.white.name}"
     first, last = session.frames[0].name, session.frames[-1].name
     parts = [f"{len(session.frames)} frames ({first} to {last}) and {white}"]
+    if len(session.frames) < max(ACCURACY_BY_VIEWS):
+        parts.append(_accuracy_of(len(session.frames)))
     if session.excluded:
         parts.append(f"left out by --exclude: {names_in_short(session.excluded)}")
     if session.skipped:
