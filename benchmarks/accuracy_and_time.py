@@ -302,6 +302,10 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
         at = ranges("settings", "training, s")[1:, 0]
         by_time.plot(at, others, "x", color=colour, markersize=4, label=f"{title.split()[-1]}, one setting changed")
     by_time.set(xscale="log", yscale="log", xlabel="training (s of one core)", ylabel="error without the noise")
+    by_time.set_xticks(seconds, [f"{second:.0f}" for second in seconds])
+    errors_drawn = (0.01, 0.02, 0.03, 0.04)
+    by_time.set_yticks(errors_drawn, [f"{error:g}" for error in errors_drawn])
+    by_time.minorticks_off()
     by_time.legend(fontsize=7)
 
     minutes = np.array([int(row[1].split()[0]) for row in rows if row[0] == "views"]) * CAPTURE_SECONDS / 60.0
@@ -310,6 +314,7 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
     by_views.set_xticks(minutes, [f"{minute:.0f}" for minute in minutes])
     by_views.minorticks_off()
     errors = by_views.twinx()
+    errors.grid(visible=False)
     curve(errors, minutes, np.abs(ranges("views", "volume, %")), COLOURS[3], "error of the volume (%)")
     curve(errors, minutes, 100.0 * ranges("views", " RMSE"), COLOURS[1], "RMSE without the noise (% reflectance)")
     errors.set(ylabel="error (%)", ylim=(0.0, None))
