@@ -43,13 +43,7 @@ def command_line(names: Sequence[str] = tuple(COMMANDS)) -> Any:
     Importing all takes seconds. The others are listed, and have no options.
     """
     classes = {name: _imported(name) if name in names else _listed(name) for name in COMMANDS}
-    # The list shows the summary; the command's own help shows its docstring.
-    return Union[  # noqa: UP007
-        tuple(
-            Annotated[made, tyro.conf.subcommand(name, description=None if name in names else COMMANDS[name].summary)]
-            for name, made in classes.items()
-        )
-    ]
+    return Union[tuple(Annotated[made, tyro.conf.subcommand(name)] for name, made in classes.items())]  # noqa: UP007
 
 
 def named_commands(words: Sequence[str]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -24,6 +24,7 @@ from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, make_folder, read_json, write_json
+from hsi_sc_nerf.models.presets import Preset
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -89,7 +90,7 @@ class RunCommand:
     """Folder of the capture session."""
     output_dir: Path
     """Folder for the dataset, the trained run, the cloud, the traits and report.html."""
-    preset: Literal["fast", "balanced", "best"] = "balanced"
+    preset: Preset = "balanced"
     """How long to train: on two cores without a GPU fast takes about one minute, balanced five and best twenty; on a
     GPU 10 seconds, one minute and seven."""
     max_num_iterations: int | None = between(1, math.inf, default=None)

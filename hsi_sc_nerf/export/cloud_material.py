@@ -7,6 +7,7 @@ stand still. The material's reflectance is the same in all views, so that it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,10 @@ class CloudMaterial:
     spectra: Float[np.ndarray, "n bands"]
     relative_std: Float[np.ndarray, "n"]
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points_m)
+
     def at(self, points_m: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "m bands"], Float[np.ndarray, "m"]]:
         """Distance-weighted mean of the nearest points' spectra, and the relative standard deviation of their light.
 
@@ -45,11 +50,11 @@ class CloudMaterial:
         """
         spectra = np.full((len(points_m), self.spectra.shape[1]), np.nan, np.float32)
         std = np.full(len(points_m), np.nan, np.float32)
-        tree, count = cKDTree(self.points_m), np.arange(1, min(NEIGHBOURS, len(self.points_m)) + 1)
+        count = np.arange(1, min(NEIGHBOURS, len(self.points_m)) + 1)
         finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
         for start in range(0, len(finite), _CHUNK_POINTS):
             rows = finite[start : start + _CHUNK_POINTS]
-            distance_m, nearest = tree.query(points_m[rows], count, workers=-1)
+            distance_m, nearest = self._tree.query(points_m[rows], count, workers=-1)
             near = distance_m[:, 0] <= MAX_DISTANCE_M
             rows, distance_m, nearest = rows[near], distance_m[near], nearest[near]
             weights = 1.0 / (distance_m + 1e-6)

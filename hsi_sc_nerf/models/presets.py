@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from operator import attrgetter
 from typing import Any, Literal
 
-import torch
-
 Preset = Literal["fast", "balanced", "best"]
 
 Device = Literal["cpu", "cuda"]
@@ -56,4 +54,6 @@ def apply_preset(config: Any) -> None:
 
 def default_device() -> Device:
     """The device that a run trains on if none is named."""
+    import torch  # takes seconds; the names of the presets do without
+
     return "cuda" if torch.cuda.is_available() else "cpu"
