@@ -2,9 +2,8 @@
 
     uv run python benchmarks/long_run.py --output-dir /tmp/long
 
-`ns-train` is killed (SIGKILL) at random moments of every second part of the run, and resumed from its last checkpoint.
-The last row is a run of its own of a quarter of the length, about ten minutes, whose learning rates fall that much
-earlier. What is finished is not done again.
+`ns-train` is killed (SIGKILL) at random moments of every second part of the run and goes on from its last checkpoint.
+The last row is a run of its own of a quarter of the length, about ten minutes. What is finished is not done again.
 """
 
 from __future__ import annotations
