@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,11 +65,16 @@ class OccupancySampler(Sampler):
             ray_bundle, starts, ends = ray_bundle[self.rays], starts[self.rays], ends[self.rays]
         return ray_bundle.get_ray_samples(bin_starts=starts[..., None], bin_ends=ends[..., None]), [], []
 
-    def spread(
-        self, values: Float[Tensor, "sampled channels"], others: Float[Tensor, "rays channels"]
-    ) -> Float[Tensor, "rays channels"]:
-        """Values of all rays from those of the sampled ones, and what the ``others`` have."""
-        return values if self.rays is None else others.index_copy(0, self.rays, values)
+    def of_all_rays(self, outputs: dict[str, Any], rays: RayBundle) -> dict[str, Any]:
+        """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
+        if self.rays is None:
+            return outputs
+        fills = {"depth": rays.fars, "expected_depth": rays.fars}
+        return outputs | {
+            name: fills.get(name, value.new_zeros(len(rays), *value.shape[1:])).index_copy(0, self.rays, value)
+            for name, value in outputs.items()
+            if isinstance(value, Tensor)
+        }
 
 
 def build_occupancy(

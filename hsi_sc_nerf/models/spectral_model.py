@@ -108,18 +108,18 @@ class SpectralModelConfig(NerfactoModelConfig):
     def __post_init__(self) -> None:
         try:
             require_effects(self.effects)
+            if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
+                raise InputError(
+                    "an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 with "
+                    "--pipeline.model.disable-scene-contraction False."
+                )
+            if self.head == "basis" and self.background == "last-sample":
+                raise InputError(
+                    "--pipeline.model.background last-sample needs a value in every band at each sample; take "
+                    "--pipeline.model.head direct with it."
+                )
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
-            raise SystemExit(
-                "hsi-sc-nerf: an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 "
-                "with --pipeline.model.disable-scene-contraction False."
-            )
-        if self.head == "basis" and self.background == "last-sample":
-            raise SystemExit(
-                "hsi-sc-nerf: --pipeline.model.background last-sample needs a value in every band at each sample; "
-                "take --pipeline.model.head direct with it."
-            )
 
 
 class SpectralModel(NerfactoModel):
@@ -285,25 +285,9 @@ class SpectralModel(NerfactoModel):
         return outputs["depth"], outputs["accumulation"]
 
     def _of_all_rays(self, outputs: dict, rays: RayBundle) -> dict:
-        """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
+        """Outputs of all rays from those of the sampled ones."""
         sampler = self.proposal_sampler
-        if not isinstance(sampler, OccupancySampler):
-            return outputs
-        fills: dict[str, Any] = {"depth": rays.fars, "expected_depth": rays.fars}
-        return outputs | {
-            name: sampler.spread(value, fills.get(name, value.new_zeros(len(rays), *value.shape[1:])))
-            for name, value in outputs.items()
-            if isinstance(value, Tensor)
-        }
-
-    def _distortion(self, outputs: dict) -> Tensor:
-        """Distortion of the batch's rays."""
-        (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
-        if self.occupancy is None:
-            return distortion_loss([weights], [samples])
-        frustums = samples.frustums
-        distortion = separate_distortion(weights[..., 0], frustums.starts[..., 0], frustums.ends[..., 0])
-        return distortion.sum() / len(outputs["accumulation"])
+        return sampler.of_all_rays(outputs, rays) if isinstance(sampler, OccupancySampler) else outputs
 
     def _measured(self, batch: dict) -> tuple[Tensor, Tensor | None]:
         """Measured reflectance, and which of its values are measurements (None for all)."""
@@ -322,7 +306,12 @@ class SpectralModel(NerfactoModel):
             metrics["rmse"] = spectral_rmse(*images, valid=some_valid)
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
-            metrics["distortion"] = self._distortion(outputs)
+            (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
+            if self.occupancy is None:
+                metrics["distortion"] = distortion_loss([weights], [samples])
+            else:  # the mean over all rays, and those that were not sampled have none
+                ends = (samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
+                metrics["distortion"] = separate_distortion(weights[..., 0], *ends).sum() / len(target)
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 

@@ -17,6 +17,7 @@ from typing import NoReturn
 
 import torch
 from nerfstudio.utils import writer
+from nerfstudio.utils.profiler import PROFILER
 from rich.progress import TextColumn
 from torch import Tensor
 
@@ -169,6 +170,7 @@ def end_stopped_run(checkpoints: Path) -> NoReturn:
     """
     saved = any(checkpoints.glob("step-*.ckpt"))
     hint = f"; --load-dir {checkpoints} goes on from the last checkpoint" if saved else ""
+    PROFILER.clear()  # or nerfstudio prints its times after this line
     print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
     raise SystemExit(130) from None
 
@@ -177,4 +179,5 @@ def end_diverged_run(error: TrainingDivergedError, checkpoints: Path) -> NoRetur
     """End with one line that says what diverged and where the last good checkpoint is."""
     good = any(checkpoints.glob("step-*.ckpt"))
     kept = f"The last good checkpoint is in {checkpoints}" if good else "No checkpoint was good"
+    PROFILER.clear()
     raise SystemExit(f"hsi-sc-nerf: {error}. {kept}.") from error

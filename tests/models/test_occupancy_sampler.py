@@ -42,8 +42,12 @@ def test_only_rays_that_meet_matter_are_sampled():
     assert sampler.rays.tolist() == [1, 2]
     assert samples.frustums.shape == (2, 8)
     assert (samples.frustums.get_positions().norm(dim=-1) < 0.65).all()
-    spread = sampler.spread(torch.tensor([[1.0], [2.0]]), torch.full((4, 1), 9.0))
-    assert spread[:, 0].tolist() == [9.0, 1.0, 2.0, 9.0]
+    values = torch.tensor([[1.0], [2.0]])
+    outputs = sampler.of_all_rays({"depth": values, "accumulation": values, "weights_list": [values]}, rays)
+    assert {name: value[:, 0].tolist() for name, value in outputs.items() if name != "weights_list"} == {
+        "depth": [4.0, 1.0, 2.0, 4.0],
+        "accumulation": [0.0, 1.0, 2.0, 0.0],
+    }
 
 
 def test_a_bundle_that_meets_nothing_keeps_one_ray_without_length():
