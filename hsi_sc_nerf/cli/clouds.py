@@ -107,6 +107,9 @@ class TraitsCommand:
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
+    index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
+    --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
 
     def main(self) -> None:
         """Measure and write.
@@ -116,6 +119,7 @@ class TraitsCommand:
         """
         from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
         from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.maps import index_maps
         from hsi_sc_nerf.analysis.size import (
             pixel_on_object_m,
             shared_errors,
@@ -126,6 +130,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.cloud import read_spectral_ply
+        from hsi_sc_nerf.indices.catalogue import find_indices
         from hsi_sc_nerf.packed.dataset import open_packed
         from hsi_sc_nerf.terminal import progress_bar
 
@@ -140,6 +145,7 @@ class TraitsCommand:
         dataset = None if self.data is None else open_packed(self.data)
         config = replace(self.mesh, base_height_m=self._base_height_m(dataset))
         cloud = read_spectral_ply(self.cloud)
+        indices = find_indices(self.index, cloud.wavelengths_nm)
         if library is not None:
             library = library.at(cloud.wavelengths_nm)
 
@@ -158,7 +164,8 @@ class TraitsCommand:
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
-            traits = analyse(surface, picked, found, None if dataset is None else pixel_on_object_m(dataset))
+            pixel_m = None if dataset is None else pixel_on_object_m(dataset)
+            traits = analyse(surface, picked, found, pixel_m, index_maps(surface, indices))
         with console.status("tables and pictures"):
             self._write(surface, size, uncertainty, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
@@ -198,9 +205,11 @@ class TraitsCommand:
         if available_composites(surface.wavelengths_nm):
             drawn["Composites"] = "composites.png"
             pictures.draw_composites(self.output_dir / "composites.png", surface, views)
-        if traits.regions[0].indices:
+        indices = [one for one in traits.maps if one.definition]
+        if indices:
             drawn["Indices"] = "indices.png"
-            pictures.draw_indices(self.output_dir / "indices.png", surface, views)
+            pictures.draw_maps(self.output_dir / "indices.png", indices, surface, views)
+            extra |= {f"index_{one.name}": one.values.astype("float32") for one in indices}
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
