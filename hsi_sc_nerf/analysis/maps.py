@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -40,6 +41,12 @@ class SurfaceMap:
     definition: str = ""
     unit: str = ""
     resampling_error: float = 0.0
+
+    @property
+    def column(self) -> str:
+        """Its column in a cloud: ``index_`` or ``calibration_``, and the name with ``_`` for all but letters."""
+        kind = "index" if self.definition else "calibration"
+        return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}"
 
 
 def index_maps(surface: SpectralMesh, indices: Sequence[SpectralIndex]) -> list[SurfaceMap]:

@@ -180,11 +180,14 @@ def analyse(
         maps: of the surface.
 
     Raises:
-        InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
+        InputError: two regions or maps have one name, a region holds no seen surface, or nothing was seen.
     """
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
+    for number, one in enumerate(maps):
+        if any(one.name == other.name or one.column == other.column for other in maps[:number]):
+            raise InputError(f"two indices or calibrations are named {one.name}; give each a name of its own.")
     if classes is not None:
         chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
     for region in regions:

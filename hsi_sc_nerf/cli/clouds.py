@@ -111,12 +111,17 @@ class TraitsCommand:
     """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
     --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
 
+    calibration: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """A regression that was fitted elsewhere, to map and to average (docs/how-to/calibrations.md): a table (CSV) of
+    coefficients, or one that names an ONNX model. May be repeated."""
+
     def main(self) -> None:
         """Measure and write.
 
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
+        from hsi_sc_nerf.analysis.calibrations import calibration_map, read_calibration
         from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.maps import index_maps
@@ -146,6 +151,7 @@ class TraitsCommand:
         config = replace(self.mesh, base_height_m=self._base_height_m(dataset))
         cloud = read_spectral_ply(self.cloud)
         indices = find_indices(self.index, cloud.wavelengths_nm)
+        calibrations = [read_calibration(path) for path in self.calibration]
         if library is not None:
             library = library.at(cloud.wavelengths_nm)
 
@@ -165,7 +171,8 @@ class TraitsCommand:
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
             pixel_m = None if dataset is None else pixel_on_object_m(dataset)
-            traits = analyse(surface, picked, found, pixel_m, index_maps(surface, indices))
+            maps = [*index_maps(surface, indices), *(calibration_map(surface, one) for one in calibrations)]
+            traits = analyse(surface, picked, found, pixel_m, maps)
         with console.status("tables and pictures"):
             self._write(surface, size, uncertainty, traits, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
@@ -205,11 +212,14 @@ class TraitsCommand:
         if available_composites(surface.wavelengths_nm):
             drawn["Composites"] = "composites.png"
             pictures.draw_composites(self.output_dir / "composites.png", surface, views)
-        indices = [one for one in traits.maps if one.definition]
-        if indices:
-            drawn["Indices"] = "indices.png"
-            pictures.draw_maps(self.output_dir / "indices.png", indices, surface, views)
-            extra |= {f"index_{one.name}": one.values.astype("float32") for one in indices}
+        for caption, picture, maps in (
+            ("Indices", "indices.png", [one for one in traits.maps if one.definition]),
+            ("Calibrations", "calibrations.png", [one for one in traits.maps if not one.definition]),
+        ):
+            if maps:
+                pictures.draw_maps(self.output_dir / picture, maps, surface, views)
+                drawn[caption] = picture
+                extra |= {one.column: one.values.astype("float32") for one in maps}
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}

@@ -42,7 +42,7 @@ SPYNDEX = {
 def test_indices_are_those_of_a_published_implementation(name):
     spectra = np.random.default_rng(0).uniform(0.05, 0.9, (20, len(FINE_NM)))
     theirs, bands = SPYNDEX[name]
-    at = {band: spectra[:, FINE_NM == nm][:, 0] for band, nm in bands.items()}
+    at = {band: spectra[:, nm == FINE_NM][:, 0] for band, nm in bands.items()}
     expected = spyndex.computeIndex(theirs, at)
     np.testing.assert_allclose(index_values(CATALOGUE[name], spectra, FINE_NM), expected, rtol=1e-9)
     assert set(CATALOGUE[name].wavelengths_nm) == set(bands.values())

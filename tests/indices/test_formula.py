@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -61,9 +63,8 @@ def test_a_negative_reflectance_that_the_formula_names_has_no_index():
     ],
 )
 def test_what_is_no_formula_is_refused(expression, why):
-    with pytest.raises(ValueError, match=".") as refused:
+    with pytest.raises(ValueError, match=re.escape(why)):
         SpectralIndex("own", expression)
-    assert why in str(refused.value)
 
 
 def test_an_index_names_its_wavelengths_once():
