@@ -104,6 +104,22 @@ class Calibration:
                 values[start + np.flatnonzero(known)] = self.predict(chunk[known])
         return values
 
+    def interpolation(self, nm: Float[np.ndarray, "others"]) -> Float[np.ndarray, "others bands"]:
+        """The matrix that interpolates spectra at wavelengths ``nm`` to its own.
+
+        Raises:
+            InputError: its own reach beyond.
+        """
+        nearest = nm[nearest_bands(nm, self.wavelengths_nm)]
+        wanted = np.where(np.abs(nearest - self.wavelengths_nm) <= _SAME_BAND_NM, nearest, self.wavelengths_nm)
+        if wanted.min() < nm.min() or wanted.max() > nm.max():
+            raise InputError(
+                f"the calibration {self.name} needs {wanted.min():g} to {wanted.max():g} nm, and the cloud has "
+                f"{nm.min():g} to {nm.max():g} nm; give a cloud with more bands, or a calibration that needs fewer."
+            )
+        order = np.argsort(nm)
+        return np.stack([np.interp(wanted, nm[order], row[order]) for row in np.eye(len(nm))])
+
 
 def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceMap:
     """A calibration's value at each vertex; NaN outside its domain.
@@ -115,7 +131,7 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         InputError: the calibration needs wavelengths that the surface's bands do not reach.
     """
     nm = surface.wavelengths_nm
-    weights = _interpolation(nm, calibration)
+    weights = calibration.interpolation(nm)
 
     def of(spectra: np.ndarray, only_inside: bool = False) -> np.ndarray:
         return calibration.values(spectra.astype(float) @ weights, only_inside)
@@ -124,11 +140,9 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
     if not np.isin(weights, (0.0, 1.0)).all():
         order = np.argsort(nm)
         coarse = np.union1d(order[::2], order[-1:])
-        differences = (
-            calibration.values(surface.spectra[:, coarse] @ _interpolation(nm[coarse], calibration)) - values
-        )
-        known = surface.seen & np.isfinite(differences)
-        resampling_error = float(np.sqrt(np.mean(differences[known] ** 2))) / 3.0 if known.any() else math.nan
+        other = calibration.values(surface.spectra[:, coarse] @ calibration.interpolation(nm[coarse]))
+        change = (other - values)[surface.seen & np.isfinite(other - values)]
+        resampling_error = float(np.sqrt(np.mean(change**2))) / 3.0 if len(change) else math.nan
     return SurfaceMap(
         calibration.name,
         calibration.unit,
@@ -138,20 +152,6 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         unit=calibration.unit,
         resampling_error=resampling_error,
     )
-
-
-def _interpolation(nm: Float[np.ndarray, "bands"], calibration: Calibration) -> Float[np.ndarray, "bands others"]:
-    """The matrix that interpolates spectra at ``nm`` to the calibration's wavelengths."""
-    wanted = calibration.wavelengths_nm
-    nearest = nm[nearest_bands(nm, wanted)]
-    wanted = np.where(np.abs(nearest - wanted) <= _SAME_BAND_NM, nearest, wanted)
-    if wanted.min() < nm.min() or wanted.max() > nm.max():
-        raise InputError(
-            f"the calibration {calibration.name} needs {wanted.min():g} to {wanted.max():g} nm, and the cloud has "
-            f"{nm.min():g} to {nm.max():g} nm; give a cloud with more bands, or a calibration that needs fewer."
-        )
-    order = np.argsort(nm)
-    return np.stack([np.interp(wanted, nm[order], row[order]) for row in np.eye(len(nm))])
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -255,7 +255,7 @@ def _onnx_model(table: Path, name: str, bands: int, column: int) -> Callable[[np
         predict(np.zeros((2, bands)))
     except Exception as error:  # onnxruntime's exceptions have no common class
         raise InputError(
-            f"{path}: is no ONNX model of spectra of {bands} bands with numbers in column {column} of its last output "
-            f"({error}); {_REMEDY}."
+            f"{path}: is no ONNX model of spectra of {bands} bands with numbers in column {column} of its last "
+            f"output ({error}); {_REMEDY}."
         ) from error
     return predict

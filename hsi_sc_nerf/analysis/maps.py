@@ -16,6 +16,7 @@ from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
 
 _STEP = 1e-4
 """Change of a reflectance that slopes are taken over: small beside reflectance, large beside rounding."""
+_CAPTION_LETTERS = 40
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,12 @@ class SurfaceMap:
     definition: str = ""
     unit: str = ""
     resampling_error: float = 0.0
+
+    @property
+    def caption(self) -> str:
+        """Name and label beside a picture, without a formula that is too long for it."""
+        label = self.label.replace(" / (", " /\n(") if len(self.label) <= _CAPTION_LETTERS else ""
+        return f"{self.name}\n{label}"
 
     @property
     def column(self) -> str:

@@ -13,7 +13,6 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
-from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
@@ -24,8 +23,6 @@ SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "b
 _HEIGHT_PX = 420
 _LABEL_IN = 1.4
 """Height of a row's label."""
-_LABEL_LETTERS = 40
-"""Longer formulas are not written beside a row."""
 _GREY = 0.85
 """Grey value of unseen surface."""
 _NEAR_WHITE = 0.97
@@ -81,19 +78,20 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews) -> None
 
 
 @rc_context(STYLE)
-def draw_maps(path: Path, maps: Sequence[SurfaceMap], surface: SpectralMesh, views: SideViews) -> None:
-    """Maps in colours in rows, the sides in columns; surface that is unseen or has no value is grey.
+def draw_maps(
+    path: Path, maps: Mapping[str, Float[np.ndarray, "v"]], surface: SpectralMesh, views: SideViews
+) -> None:
+    """Maps by their labels in colours in rows, the sides in columns; surface that is unseen or has no value is grey.
 
     The scale of each goes from its 1st to its 99th percentile on this surface.
     """
     rows, scales = {}, []
-    for one in maps:
-        known = surface.seen & np.isfinite(one.values)
-        low, high = usual_range(one.values[known])
-        coloured = colormaps[INDEX_COLOURS](np.clip((one.values - low) / (high - low), 0.0, 1.0))[:, :3]
+    for label, values in maps.items():
+        known = surface.seen & np.isfinite(values)
+        low, high = usual_range(values[known])
+        coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / (high - low), 0.0, 1.0))[:, :3]
         coloured[~known] = _GREY
-        label = one.label.replace(" / (", " /\n(") if len(one.label) <= _LABEL_LETTERS else ""
-        rows[f"{one.name}\n{label}"] = views.on_white(coloured)
+        rows[label] = views.on_white(coloured)
         scales.append((low, high))
     _draw_rows(path, rows, scales)
 

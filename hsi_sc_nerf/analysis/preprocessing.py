@@ -8,6 +8,7 @@ from scipy.signal import savgol_filter
 
 Step = tuple[str, tuple[int, ...]]
 """Name and whole numbers of a step."""
+_KNOWN = "absorbance, snv, msc or savgol WINDOW POLYNOMIAL DERIVATIVE"
 _NUMBERS = {"absorbance": 0, "snv": 0, "msc": 0, "savgol": 3}
 
 
@@ -20,15 +21,15 @@ def preprocessed(
     """The spectra after all steps, at the bands that a model uses; NaN where a step is not defined.
 
     - absorbance: ``log10(1 / R)``.
-    - snv: standard normal variate, less the spectrum's mean, by its standard deviation with n - 1 (Barnes et al. 1989).
+    - snv: standard normal variate, less the mean, by the standard deviation with n - 1 (Barnes et al. 1989).
     - msc: multiplicative scatter correction by the line through (reference, spectrum) (Geladi et al. 1985).
     - savgol WINDOW POLYNOMIAL DERIVATIVE: Savitzky-Golay, per band (Savitzky and Golay 1964). Bands that are not used
       leave after it; they fill its windows.
 
     Example:
         >>> every = np.ones(3, bool)
-        >>> preprocessed(np.array([[0.2, 0.4, 0.6]]), read_steps("snv", every), every, np.zeros(3)).round(6)
-        array([[-1.,  0.,  1.]])
+        >>> preprocessed(np.array([[0.2, 0.4, 0.9]]), read_steps("snv", every), every, np.zeros(3)).round(2)
+        array([[-0.83, -0.28,  1.11]])
     """
     with np.errstate(all="ignore"):
         for name, numbers in steps:
@@ -62,9 +63,7 @@ def read_steps(text: str, used: Bool[np.ndarray, "bands"]) -> tuple[Step, ...]:
     for words in (part.split() for part in text.split(",") if part.strip()):
         name, numbers = words[0].lower(), tuple(int(word) for word in words[1:])
         if _NUMBERS.get(name) != len(numbers):
-            raise ValueError(
-                f"'{' '.join(words)}' is not absorbance, snv, msc or savgol WINDOW POLYNOMIAL DERIVATIVE"
-            )
+            raise ValueError(f"'{' '.join(words)}' is not {_KNOWN}")
         if name == "savgol":
             window, polynomial, derivative = numbers
             if not (window % 2 and 0 <= derivative <= polynomial < window <= bands):

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.analysis.components import Components
 from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
@@ -101,6 +102,15 @@ def trait_content(
     }
 
 
+def component_content(components: Components) -> dict[str, Any]:
+    """What ``traits.json`` says of principal components and endmembers."""
+    return {
+        "supported": components.supported,
+        "variance_fractions": components.variance_fractions.tolist(),
+        "mean_fractions": np.nanmean(components.fractions, axis=0).tolist(),
+    }
+
+
 def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     """Sizes, classes and indices in mm, cm² and mL, from the content of ``traits.json``.
 
@@ -131,6 +141,15 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
         tables.append(TraitTable("Indices", _MAP_NOTE, ["region", *names], rows))
     if calibrations := content.get("calibrations"):
         tables.append(_calibration_table(calibrations, content["regions"]))
+    if components := content.get("components"):
+        pairs = zip(components["variance_fractions"], components["mean_fractions"], strict=True)
+        rows = [[str(number), f"{a:.2%}", f"{b:.1%}"] for number, (a, b) in enumerate(pairs, 1)]
+        note = (
+            f"The noise supports {components['supported']} directions. Endmembers are the purest spectra of the "
+            "surface (endmembers.csv, which --library takes); their fractions are means over the mesh's points."
+        )
+        header = ["number", "variance of the principal component", "fraction of the endmember"]
+        tables.append(TraitTable("Components", note, header, rows))
     return tables
 
 
