@@ -115,9 +115,10 @@ def find_index(word: str) -> SpectralIndex:
             index = replace(index, drawn_range=(low, high))
     except ValueError as error:
         raise InputError(f"the index '{word}' cannot be computed: {error}; correct it.") from error
-    known = names.get(name.casefold())
-    if known and index.expression != CATALOGUE[known].expression:
-        raise InputError(f"{known} is another index of the catalogue; give '{word}' another name.")
+    if known := names.get(name.casefold()):
+        if index.expression != CATALOGUE[known].expression:
+            raise InputError(f"{known} is another index of the catalogue; give '{word}' another name.")
+        return replace(CATALOGUE[known], drawn_range=index.drawn_range) if index.has_range else CATALOGUE[known]
     return index
 
 
