@@ -199,7 +199,7 @@ def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         lines = [line for line in file if line.strip()]
     pairs = (line.lstrip("# ").partition(":") for line in lines if line.startswith("#") and ":" in line)
     head = {key.strip().lower(): value.strip() for key, _, value in pairs}
-    titles, *rows = csv.reader(line for line in lines if not line.startswith("#"))
+    titles, *rows = [*csv.reader(line for line in lines if not line.startswith("#"))] or [[]]
     if any(len(row) != len(titles) for row in rows):
         raise ValueError("its lines do not have the same number of columns")
     cells = [[math.nan if cell.strip() in ("", "NA") else float(cell) for cell in row] for row in rows]

@@ -274,8 +274,14 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
 
 def _plain(value: MapMean) -> dict[str, float | None]:
     """Ready for JSON."""
-    numbers = {"mean": value.surface.mean, "sd": value.surface.sd, "std": value.std, "outside": value.outside}
-    return {key: float(one) if np.isfinite(one) else None for key, one in numbers.items()}
+    numbers: dict[str, Any] = {
+        "mean": value.surface.mean,
+        "sd": value.surface.sd,
+        "std": value.std,
+        "outside": value.outside,
+    }
+    plain = {key: float(one) for key, one in numbers.items()}
+    return {key: one if math.isfinite(one) else None for key, one in plain.items()}
 
 
 def _with_sd(value: float, sd: float) -> str:

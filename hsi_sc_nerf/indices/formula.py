@@ -148,7 +148,7 @@ def _value(
             return getattr(library, name)(of(argument))
         case ast.Name(name) if band := _BAND.fullmatch(name):
             return reflectance(float(band[1]))
-        case ast.Constant(number) if type(number) in (int, float):
+        case ast.Constant(int() | float() as number) if not isinstance(number, bool):
             return constant(float(number))
     shown = ast.unparse(node)[:40]
     raise ValueError(f"'{shown}' is no number, reflectance such as R800, + - * / **, sqrt() or log10()")

@@ -148,7 +148,7 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, model, column, rtol):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "not enough values"),
+        ("", "wavelength_nm that ascends"),
         ("wavelength_nm,coefficient\n", "wavelength_nm that ascends"),
         ("wavelength_nm,coefficient\n500,1\n400,2\n", "wavelength_nm that ascends"),
         ("wavelength_nm,coefficient\n400,one\n", "could not convert"),
