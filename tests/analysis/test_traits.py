@@ -277,6 +277,9 @@ def test_regions_off_the_surface_or_of_one_name_are_refused():
     spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
     with pytest.raises(InputError, match="two regions are named spot"):
         analyse(surface, [spot, spot])
+    ndvi = index_maps(surface, find_indices(["NDVI"], NM))
+    with pytest.raises(InputError, match="two indices or calibrations are named NDVI"):
+        analyse(surface, maps=ndvi * 2)
     with pytest.raises(InputError, match="raise the smoothing radius"):
         analyse(two_halves(seen=False))
 
