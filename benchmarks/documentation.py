@@ -26,6 +26,7 @@ from mkdocs.structure.pages import Page
 from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
 from hsi_sc_nerf.cli.commands import COMMANDS, command_line, named_commands
+from hsi_sc_nerf.indices.catalogue import catalogue_table
 from hsi_sc_nerf.terminal import markdown_table
 
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
@@ -38,7 +39,8 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
     """Add the pages that are made from the code."""
-    for name, content in (("commands", commands_page()), ("settings", settings_page())):
+    pages = {"commands": commands_page(), "settings": settings_page(), "indices": indices_page()}
+    for name, content in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=content))
     return files
 
@@ -74,6 +76,15 @@ def readme_table(folder: Path = RESULTS) -> str:
     ]
     shown = [[row[0], methods[name, row[1]], *row[3:7], row[11]] for name, row in rows if (name, row[1]) in methods]
     return markdown_table(titles, sorted(shown, key=lambda row: row[0]))
+
+
+def indices_page() -> str:
+    """The catalogue of indices."""
+    intro = (
+        "R800 is the reflectance at 800 nm. All are numbers without a unit. The range is that of the colours in the "
+        "viewer, in videos and in the report. [Map indices](../how-to/indices.md) says how to use them."
+    )
+    return "\n\n".join(["# Indices", intro, catalogue_table()]) + "\n"
 
 
 def commands_page() -> str:

@@ -172,11 +172,14 @@ _TRAITS = {
         "mixture_unclassified_m2": 0.0,
         "regions": [{"label": "green", "area_m2": 0.01, "centre_m": [0.0, 0.0, 0.1]}],
     },
+    "indices": ["NDVI"],
+    "calibrations": {"sugar": {"unit": "%", "error": 0.4, "resampling_error": 0.01}},
     "regions": {
         "whole surface": {
             "area_m2": 0.02,
             "reflectance": {"mean": 0.4, "std": 0.01, "measured": 0.3, "irradiance": 0.8, "irradiance_std": 0.02},
-            "indices": {"NDVI": {"mean": 0.5, "sd": 0.1}},
+            "indices": {"NDVI": {"mean": 0.5, "sd": 0.1, "std": 0.01, "outside": 0.0}},
+            "calibrations": {"sugar": {"mean": 12.0, "sd": 1.0, "std": 0.5, "outside": 0.1}},
         }
     },
 }

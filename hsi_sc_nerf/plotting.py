@@ -90,6 +90,13 @@ def show_image(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
     return axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **options)
 
 
+def usual_range(values: Float[np.ndarray, "*shape"]) -> tuple[float, float]:
+    """All but the lowest and the highest per cent of the finite values, for the ends of a colour map."""
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, (1, 99)).tolist() if finite.size else (0.0, 1.0)
+    return low, max(high, low + 1e-9)
+
+
 def coloured(
     values: Float[Tensor, "*shape"], drawn_range: tuple[float, float], colours: str
 ) -> Float[Tensor, "*shape 3"]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import atomic_write
 
 # Wavelengths of a table that are all below this are in micrometres.
 _SMALLEST_NM = 100.0
@@ -92,6 +93,19 @@ def read_library(path: Path) -> SpectralLibrary:
     if len(names) != len(spectra) or min(spectra.shape) == 0:
         raise InputError(f"{path}: holds {len(spectra)} spectra and names {len(names)}; export the library again.")
     return SpectralLibrary(tuple(names), wavelengths_nm, np.where(spectra < _DELETED, np.nan, spectra))
+
+
+def write_table(path: Path, library: SpectralLibrary) -> None:
+    """Write the CSV table that `read_library` reads.
+
+    Raises:
+        InputError: the operating system refused to write.
+    """
+    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["wavelength_nm", *library.names])
+        rows = zip(library.wavelengths_nm, *library.spectra, strict=True)
+        writer.writerows([f"{number:.6g}" for number in row] for row in rows)
 
 
 def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:

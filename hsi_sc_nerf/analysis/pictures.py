@@ -1,4 +1,4 @@
-"""Pictures of a spectral mesh: composites, indices and classes from four sides; spectra of regions."""
+"""Pictures of a spectral mesh: composites, maps and classes from four sides; spectra of regions."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.spectra import available_composites, available_indices, composite, index_values
+from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure, show_image, usual_range
+from hsi_sc_nerf.spectra import available_composites, composite
 
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
@@ -78,20 +78,20 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews) -> None
 
 
 @rc_context(STYLE)
-def draw_indices(path: Path, surface: SpectralMesh, views: SideViews) -> None:
-    """The named indices as colour maps in rows, the sides in columns; unseen surface is grey.
+def draw_maps(
+    path: Path, maps: Mapping[str, Float[np.ndarray, "v"]], surface: SpectralMesh, views: SideViews
+) -> None:
+    """Maps by their labels in colours in rows, the sides in columns; surface that is unseen or has no value is grey.
 
     The scale of each goes from its 1st to its 99th percentile on this surface.
     """
     rows, scales = {}, []
-    for index in available_indices(surface.wavelengths_nm):
-        values = index_values(index, surface.spectra, surface.wavelengths_nm).astype(float)
+    for label, values in maps.items():
         known = surface.seen & np.isfinite(values)
-        low, high = np.percentile(values[known], (1, 99)) if known.any() else (0.0, 1.0)
-        coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0))[:, :3]
+        low, high = usual_range(values[known])
+        coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / (high - low), 0.0, 1.0))[:, :3]
         coloured[~known] = _GREY
-        expression = index.expression.replace(" / (", " /\n(")
-        rows[f"{index.name}\n{expression}"] = views.on_white(coloured)
+        rows[label] = views.on_white(coloured)
         scales.append((low, high))
     _draw_rows(path, rows, scales)
 

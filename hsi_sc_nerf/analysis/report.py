@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.analysis.components import Components
 from hsi_sc_nerf.analysis.size import Size, combined
-from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
+from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
@@ -36,6 +37,10 @@ _CAUSES = {
 """Words for the causes of `size_uncertainty`."""
 _CM2_PER_M2 = 1e4
 _LISTED_REGIONS = 20
+_MAP_NOTE = (
+    "Mean ± standard deviation over the surface, weighted by area; in brackets, where it is known, the standard "
+    "deviation of the mean, by how much frames disagree."
+)
 
 
 class TraitTable(NamedTuple):
@@ -67,6 +72,12 @@ def trait_content(
         "size_sd_by_cause": {cause: asdict(part) for cause, part in uncertainty.items()},
         "watertight": watertight,
         "seen_area_m2": traits.seen_m2,
+        "indices": [one.definition for one in traits.maps if one.definition],
+        "calibrations": {
+            one.name: {"unit": one.unit, "error": one.error, "resampling_error": one.resampling_error}
+            for one in traits.maps
+            if not one.definition
+        },
         "classes": None
         if classes is None
         else {
@@ -80,11 +91,23 @@ def trait_content(
         "regions": {
             region.name: {
                 "area_m2": region.area_m2,
-                "indices": {name: _plain(value) for name, value in region.indices.items()},
+                "indices": {one.name: _plain(region.maps[one.name]) for one in traits.maps if one.definition},
+                "calibrations": {
+                    one.name: _plain(region.maps[one.name]) for one in traits.maps if not one.definition
+                },
                 "reflectance": _plain_reflectance(region),
             }
             for region in traits.regions
         },
+    }
+
+
+def component_content(components: Components) -> dict[str, Any]:
+    """What ``traits.json`` says of principal components and endmembers."""
+    return {
+        "supported": components.supported,
+        "variance_fractions": components.variance_fractions.tolist(),
+        "mean_fractions": np.nanmean(components.fractions, axis=0).tolist(),
     }
 
 
@@ -114,13 +137,40 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     regions = {name: region["indices"] for name, region in content["regions"].items()}
     names = list(regions[WHOLE])
     if names:
-        rows = [
-            [region, *(_with_std(values[name]["mean"], values[name]["sd"]) for name in names)]
-            for region, values in regions.items()
-        ]
-        note = "Mean ± standard deviation over the surface, weighted by area."
-        tables.append(TraitTable("Indices", note, ["region", *names], rows))
+        rows = [[region, *(_map_mean(values[name]) for name in names)] for region, values in regions.items()]
+        tables.append(TraitTable("Indices", _MAP_NOTE, ["region", *names], rows))
+    if calibrations := content.get("calibrations"):
+        tables.append(_calibration_table(calibrations, content["regions"]))
+    if components := content.get("components"):
+        pairs = zip(components["variance_fractions"], components["mean_fractions"], strict=True)
+        rows = [[str(number), f"{a:.2%}", f"{b:.1%}"] for number, (a, b) in enumerate(pairs, 1)]
+        note = (
+            f"The noise supports {components['supported']} directions. Endmembers are the purest spectra of the "
+            "surface (endmembers.csv, which --library takes); their fractions are means over the mesh's points."
+        )
+        header = ["number", "variance of the principal component", "fraction of the endmember"]
+        tables.append(TraitTable("Components", note, header, rows))
     return tables
+
+
+def _calibration_table(calibrations: Mapping[str, Any], regions: Mapping[str, Any]) -> TraitTable:
+    rows = [
+        [region, name, calibrations[name]["unit"], _map_mean(value), f"{value['outside']:.1%}"]
+        for region, values in regions.items()
+        for name, value in values["calibrations"].items()
+    ]
+    note = f"{_MAP_NOTE} It counts the calibration's own error. Outside: area whose spectra it does not know."
+    for name, of in calibrations.items():
+        if of["resampling_error"]:
+            note += (
+                f" Its bands are not the cloud's: resampling changes {name} by {of['resampling_error']:.2g} (RMS)."
+            )
+    return TraitTable("Calibrations", note, ["region", "calibration", "unit", "value", "outside"], rows)
+
+
+def _map_mean(value: Mapping[str, float | None]) -> str:
+    std = value.get("std")
+    return _with_std(value["mean"], value["sd"]) + ("" if std is None else f" ({std:.2g})")
 
 
 def _listed(causes: Iterable[str]) -> str:
@@ -222,9 +272,16 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 
-def _plain(value: MeanAndSd) -> dict[str, float | None]:
+def _plain(value: MapMean) -> dict[str, float | None]:
     """Ready for JSON."""
-    return {key: float(one) if np.isfinite(one) else None for key, one in (("mean", value.mean), ("sd", value.sd))}
+    numbers: dict[str, Any] = {
+        "mean": value.surface.mean,
+        "sd": value.surface.sd,
+        "std": value.std,
+        "outside": value.outside,
+    }
+    plain = {key: float(one) for key, one in numbers.items()}
+    return {key: one if math.isfinite(one) else None for key, one in plain.items()}
 
 
 def _with_sd(value: float, sd: float) -> str:

@@ -1,4 +1,4 @@
-"""Traits of a spectral mesh: classes and their areas; indices and spectra of regions."""
+"""Traits of a spectral mesh: classes and their areas; spectra of regions, and means of indices and calibrations."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from hsi_sc_nerf.analysis.classes import (
     unmix,
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.maps import SurfaceMap, propagated_std
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra import available_indices, index_values
 
 WHOLE = "whole surface"
 
@@ -113,6 +113,22 @@ class RegionLight:
 
 
 @dataclass(frozen=True)
+class MapMean:
+    """Mean of a map over a region.
+
+    Attributes:
+        surface: mean and standard deviation over the surface.
+        std: standard deviation of the mean, by how much frames disagree and by what the map itself errs; NaN where it
+            is not known.
+        outside: fraction of the area that was not counted, because no value is known of it.
+    """
+
+    surface: MeanAndSd
+    std: float
+    outside: float
+
+
+@dataclass(frozen=True)
 class RegionTraits:
     """Traits of a part of the surface: all that was seen, a class, or a region of interest.
 
@@ -120,7 +136,7 @@ class RegionTraits:
         name: of the part.
         area_m2: on the surface.
         spectrum: reflectance of each band, of the material where it is told apart from the light.
-        indices: spectral indices by name.
+        maps: mean of each map on the surface by name.
         reflectance_std: standard deviation of the spectrum's mean over the bands; NaN where it is not known.
         light: where the two are told apart.
     """
@@ -128,17 +144,18 @@ class RegionTraits:
     name: str
     area_m2: float
     spectrum: MeanAndSd
-    indices: Mapping[str, MeanAndSd]
+    maps: Mapping[str, MapMean]
     reflectance_std: float = math.nan
     light: RegionLight | None = None
 
 
 @dataclass(frozen=True)
 class Traits:
-    """Traits of a surface from its spectra: of its regions, the whole seen surface first, and of its classes."""
+    """Traits of a surface from its spectra: of its regions, the whole seen surface first, its classes, its maps."""
 
     regions: list[RegionTraits]
     classes: Classes | None = None
+    maps: Sequence[SurfaceMap] = ()
 
     @property
     def seen_m2(self) -> float:
@@ -151,30 +168,32 @@ def analyse(
     regions: Sequence[RegionOfInterest] = (),
     classes: Classes | None = None,
     pixel_m: float | None = None,
+    maps: Sequence[SurfaceMap] = (),
 ) -> Traits:
-    """Spectra and indices of the whole seen surface, its classes and the regions of interest.
+    """Spectra of the whole seen surface, its classes and the regions of interest, and the means of maps.
 
     Args:
         surface: the mesh with its spectra.
         regions: of interest.
         classes: of its vertices.
         pixel_m: side of a pixel on the object; None if it is not known, and with it how far means scatter.
+        maps: of the surface.
 
     Raises:
-        InputError: two regions have one name, a region holds no seen surface, or nothing was seen.
+        InputError: two regions or maps have one name, a region holds no seen surface, or nothing was seen.
     """
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
+    for number, one in enumerate(maps):
+        if any(one.name == other.name or one.column == other.column for other in maps[:number]):
+            raise InputError(f"two indices or calibrations are named {one.name}; give each a name of its own.")
     if classes is not None:
         chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
     for region in regions:
         if region.name in chosen:
             raise InputError(f"two regions are named {region.name}; give each picked region a name of its own.")
         chosen[region.name] = region.of(surface)
-
-    nm = surface.wavelengths_nm
-    indices = {one.name: index_values(one, surface.spectra, nm) for one in available_indices(nm)}
 
     def of_region(name: str, where: Bool[np.ndarray, "v"]) -> RegionTraits:
         areas_m2 = surface.areas_m2[where]
@@ -183,12 +202,12 @@ def analyse(
             name,
             float(areas_m2.sum()),
             spectrum,
-            {index: mean_and_sd(values[where], areas_m2) for index, values in indices.items()},
+            {one.name: _map_mean(one, where, surface, spectrum, _noise_std(surface, where, pixel_m)) for one in maps},
             _reflectance_std(surface, where, pixel_m, spectrum, light),
             light,
         )
 
-    return Traits([of_region(name, where) for name, where in chosen.items()], classes)
+    return Traits([of_region(name, where) for name, where in chosen.items()], classes, maps)
 
 
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
@@ -204,6 +223,19 @@ def _reflectance_std(
     light: RegionLight | None,
 ) -> float:
     """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
+    noise = _noise_std(surface, chosen, pixel_m)
+    if pixel_m is None or math.isnan(noise):
+        return math.nan
+    mixed = _mixed(surface, chosen, pixel_m)
+    if light is None:
+        return math.hypot(noise, mixed)
+    variance = noise**2 + (mixed / light.irradiance.mean) ** 2
+    variance += (spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean) ** 2
+    return float(np.sqrt(variance))
+
+
+def _noise_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None) -> float:
+    """Standard deviation of a region's reflectance in a band, by how much frames disagree over its pixels."""
     if surface.scatter is None or pixel_m is None:
         return math.nan
     areas_m2, scatter = surface.areas_m2[chosen], surface.scatter[chosen]
@@ -211,12 +243,18 @@ def _reflectance_std(
     if not known.any():
         return math.nan
     pixels = max(1.0, areas_m2.sum() / pixel_m**2)
-    variance = (areas_m2[known] @ scatter[known] / areas_m2[known].sum()) ** 2 / pixels
-    variance += _mixed(surface, chosen, pixel_m) ** 2
-    if light is not None:
-        variance = variance / light.irradiance.mean**2
-        variance += (spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean) ** 2
-    return float(np.sqrt(variance))
+    noise = float(areas_m2[known] @ scatter[known] / areas_m2[known].sum()) / math.sqrt(pixels)
+    light = _light(surface, chosen)
+    return noise if light is None else noise / float(light.irradiance.mean)
+
+
+def _map_mean(
+    one: SurfaceMap, chosen: Bool[np.ndarray, "v"], surface: SpectralMesh, spectrum: MeanAndSd, noise: float
+) -> MapMean:
+    """The mean of a map over the chosen vertices; its noise is that of the region's mean spectrum."""
+    values, areas_m2 = one.values[chosen], surface.areas_m2[chosen]
+    std = math.hypot(propagated_std(one.of, spectrum.mean, noise), one.error)
+    return MapMean(mean_and_sd(values, areas_m2), std, float(areas_m2[np.isnan(values)].sum() / areas_m2.sum()))
 
 
 def _mixed(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float) -> float:

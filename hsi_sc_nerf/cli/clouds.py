@@ -23,6 +23,7 @@ from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.terminal import screen_table
 
 if TYPE_CHECKING:
+    from hsi_sc_nerf.analysis.components import Components
     from hsi_sc_nerf.analysis.size import Size
     from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
     from hsi_sc_nerf.analysis.traits import Traits
@@ -107,6 +108,14 @@ class TraitsCommand:
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
+    index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
+    --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
+    calibration: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """A regression that was fitted elsewhere, to map and to average (docs/how-to/calibrations.md): a table (CSV) of
+    coefficients, or one that names an ONNX model. May be repeated."""
+    components: int = between(0, math.inf, default=0)
+    """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
 
     def main(self) -> None:
         """Measure and write.
@@ -114,8 +123,11 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
+        from hsi_sc_nerf.analysis.calibrations import calibration_map, read_calibration
         from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
+        from hsi_sc_nerf.analysis.components import find_components
         from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.maps import index_maps
         from hsi_sc_nerf.analysis.size import (
             pixel_on_object_m,
             shared_errors,
@@ -126,6 +138,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
         from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
         from hsi_sc_nerf.export.cloud import read_spectral_ply
+        from hsi_sc_nerf.indices.catalogue import find_indices
         from hsi_sc_nerf.packed.dataset import open_packed
         from hsi_sc_nerf.terminal import progress_bar
 
@@ -140,6 +153,10 @@ class TraitsCommand:
         dataset = None if self.data is None else open_packed(self.data)
         config = replace(self.mesh, base_height_m=self._base_height_m(dataset))
         cloud = read_spectral_ply(self.cloud)
+        indices = find_indices(self.index, cloud.wavelengths_nm)
+        calibrations = [read_calibration(path) for path in self.calibration]
+        for calibration in calibrations:
+            calibration.interpolation(cloud.wavelengths_nm)  # which refuses before the work
         if library is not None:
             library = library.at(cloud.wavelengths_nm)
 
@@ -158,9 +175,12 @@ class TraitsCommand:
         with console.status("spectra on the surface"):
             surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
             found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
-            traits = analyse(surface, picked, found, None if dataset is None else pixel_on_object_m(dataset))
+            pixel_m = None if dataset is None else pixel_on_object_m(dataset)
+            maps = [*index_maps(surface, indices), *(calibration_map(surface, one) for one in calibrations)]
+            traits = analyse(surface, picked, found, pixel_m, maps)
+            components = find_components(surface, self.components) if self.components else None
         with console.status("tables and pictures"):
-            self._write(surface, size, uncertainty, traits, config)
+            self._write(surface, size, uncertainty, traits, components, config)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
 
     def _base_height_m(self, dataset: PackedDataset | None) -> float | None:
@@ -175,11 +195,13 @@ class TraitsCommand:
         size: Size,
         uncertainty: dict[str, Size],
         traits: Traits,
+        components: Components | None,
         config: MeshConfig,
     ) -> None:
         """Write pictures, mesh and tables, and last the page that links them."""
         from hsi_sc_nerf.analysis import pictures, report
         from hsi_sc_nerf.analysis.closed_mesh import open_edges
+        from hsi_sc_nerf.analysis.library import write_table
         from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
         from hsi_sc_nerf.files import write_json
         from hsi_sc_nerf.spectra import available_composites
@@ -198,13 +220,31 @@ class TraitsCommand:
         if available_composites(surface.wavelengths_nm):
             drawn["Composites"] = "composites.png"
             pictures.draw_composites(self.output_dir / "composites.png", surface, views)
-        if traits.regions[0].indices:
-            drawn["Indices"] = "indices.png"
-            pictures.draw_indices(self.output_dir / "indices.png", surface, views)
+        maps = {
+            ("Indices", "indices.png"): {one.caption: one.values for one in traits.maps if one.definition},
+            ("Calibrations", "calibrations.png"): {
+                one.caption: one.values for one in traits.maps if not one.definition
+            },
+        }
+        extra |= {one.column: one.values.astype("float32") for one in traits.maps}
+        if components is not None:
+            scores, fractions = components.columns()
+            maps |= {
+                ("Principal components", "components.png"): scores,
+                ("Fractions of endmembers", "endmembers.png"): fractions,
+            }
+            extra |= {name: column.astype("float32") for name, column in (scores | fractions).items()}
+            write_table(self.output_dir / "endmembers.csv", components.endmembers)
+        for (caption, picture), of_picture in maps.items():
+            if of_picture:
+                pictures.draw_maps(self.output_dir / picture, of_picture, surface, views)
+                drawn[caption] = picture
         write_mesh(self.output_dir / "mesh.ply", surface, extra)
         report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
         options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
         settings = {"cloud": self.cloud.name, **asdict(config), **options}
         content = report.trait_content(size, uncertainty, open_edges(surface.mesh) == 0, traits, settings)
+        if components is not None:
+            content["components"] = report.component_content(components)
         write_json(self.output_dir / "traits.json", content)
         report.write_page(self.output_dir / "traits.md", self.cloud.name, content, drawn)

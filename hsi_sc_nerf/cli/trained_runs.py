@@ -141,7 +141,8 @@ class RenderCommand:
     """Type of the numbers in the cubes. float32: reflectance. uint16: reflectance times the header's scale factor, in
     half the space. none: no cubes."""
     video: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Name of a composite or an index to make a video (MP4) of, such as CIR or NDVI; may be given several times."""
+    """Composite or index to make a video (MP4) of, such as CIR or NDVI, or a formula with the ends of its colours:
+    --video "CRI = 1/R510 - 1/R550 [0, 15]"; may be given several times."""
     frames_per_second: int = between(1, 1000, default=15)
     """Frame rate of the videos."""
     material: Path | None = None

@@ -104,6 +104,8 @@ class RunCommand:
     material: str = ""
     """More words for `hsi-sc-nerf material`, likewise, such as the direction that the white reference faced:
     --material="--white-azimuth-deg -35"."""
+    traits: str = ""
+    """More words for `hsi-sc-nerf traits`, likewise: --traits="--index PRI --index CRI1"."""
 
     def main(self, run_step: StepRunner = run_step) -> None:
         """Run the steps that are not up to date and print what was found.
@@ -169,7 +171,16 @@ class RunCommand:
             ),
             (
                 "traits",
-                ["hsi-sc-nerf", "traits", with_material, "--data", data, "--output-dir", traits],
+                [
+                    "hsi-sc-nerf",
+                    "traits",
+                    with_material,
+                    "--data",
+                    data,
+                    "--output-dir",
+                    traits,
+                    *split_words(self.traits),
+                ],
                 (packed, with_material),
                 (traits / "traits.json",),
             ),

@@ -19,6 +19,8 @@ from torch import Tensor
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map, spectral_metrics, squared_error_map
 from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.indices.catalogue import find_index
+from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.plotting import (
     ANGLE_COLOURS,
     ANGLE_DRAWN_RAD,
@@ -31,7 +33,7 @@ from hsi_sc_nerf.plotting import (
     show_image,
 )
 from hsi_sc_nerf.rendering.views import RenderedView
-from hsi_sc_nerf.spectra import COMPOSITES, INDICES, composite, index_values, require_bands
+from hsi_sc_nerf.spectra import COMPOSITES, composite, require_bands
 from hsi_sc_nerf.terminal import markdown_table
 
 _PANEL_IN = 2.2
@@ -133,20 +135,18 @@ class FalseColour:
 
 
 def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> FalseColour:
-    """The composite or index of a name, in upper or lower case.
+    """The composite of a name, in upper or lower case, or the index by name or formula (`find_indices`).
 
     Raises:
-        InputError: there is no such composite or index, or no band is near a wavelength that it needs.
+        InputError: there is no such composite or index, no band is near a wavelength that it needs, or a formula
+            does not say what the ends of its colours stand for, which a video's frames have in common.
 
     Example:
         >>> ndvi = find_false_colour("NDVI", run.dataset.wavelengths_nm)
         >>> picture = ndvi.colours(render_view(run.model, run.manager.eval_dataset.cameras[:1]))
     """
-    names = {known.casefold(): known for known in (*COMPOSITES, *INDICES)}
-    found = names.get(name.casefold())
-    if found is None:
-        raise InputError(f"there is no composite or index '{name}'; choose from {', '.join(names.values())}.")
-    if found in COMPOSITES:
+    found = next((known for known in COMPOSITES if known.casefold() == name.casefold()), None)
+    if found is not None:
         rgb_nm = COMPOSITES[found].wavelengths_nm
         require_bands(wavelengths_nm, rgb_nm, found)
         return FalseColour(
@@ -154,16 +154,23 @@ def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> 
             f"{', '.join(f'{nm:g}' for nm in rgb_nm)} nm as red, green, blue",
             lambda view: composite(view.spectral, wavelengths_nm, rgb_nm).clamp(0.0, 1.0),
         )
-    index = INDICES[found]
-    require_bands(wavelengths_nm, index.wavelengths_nm, found)
-    low, high = index.drawn_range
+    try:
+        index = find_index(name)
+    except InputError as error:
+        if "=" in name:
+            raise
+        raise InputError(f"there is no composite (one of {', '.join(COMPOSITES)}) '{name}', and {error}") from error
+    require_bands(wavelengths_nm, index.wavelengths_nm, index.name)
+    if not index.has_range:
+        raise InputError(f"say what the ends of the colours stand for: '{index.definition} [LOW, HIGH]'.")
+    low, high = ends = index.drawn_range
 
     def colours(view: RenderedView) -> Float[Tensor, "h w 3"]:
         values = index_values(index, view.spectral, wavelengths_nm)
-        return coloured(values.masked_fill(~view.valid, torch.nan), index.drawn_range, INDEX_COLOURS)
+        return coloured(values.masked_fill(~view.valid, torch.nan), ends, INDEX_COLOURS)
 
     legend = f"{index.expression}, {low:g} to {high:g} in {INDEX_COLOURS}, grey outside the object"
-    return FalseColour(found, legend, colours)
+    return FalseColour(index.name, legend, colours)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, html_page, read_known
+from hsi_sc_nerf.report.page import CloudViewer, Section, content_of, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
     comparison_section,
@@ -85,6 +86,8 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
     comparison, traits = read_known(comparison_path), read_known(traits_path)
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
+    with content_of(traits_path, "traits"):
+        indices = [str(word) for word in (traits or {}).get("indices", ())]
 
     from hsi_sc_nerf.models.trained_run import open_run
 
@@ -94,7 +97,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     scores, white = [view.scores for view in views], white_of(views)
     sections = [
         *inspection_section(dataset),
-        object_section(cloud, sources.points),
+        object_section(cloud, sources.points, indices),
         views_section(views, held_out, white),
         bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
         spectra_section(views[len(views) // 2], dataset.wavelengths_nm, white),
@@ -115,15 +118,17 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         temporary.write_text(page, encoding="utf-8")
 
 
-def object_section(cloud: SpectralCloud, points: int) -> Section:
-    """The cloud in 3D, thinned to ``points``."""
+def object_section(cloud: SpectralCloud, points: int, indices: Sequence[str] = ()) -> Section:
+    """The cloud in 3D, thinned to ``points``, with the indices that its traits were measured with."""
     shown = thinned(cloud, points)
     spectra = compress_spectra(shown.spectra)
     caption = (
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
         f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
-    return Section("object", "The object", [CloudViewer(cloud_payload(shown, spectra), caption)], judge_cloud(cloud))
+    return Section(
+        "object", "The object", [CloudViewer(cloud_payload(shown, spectra, indices), caption)], judge_cloud(cloud)
+    )
 
 
 def judge_cloud(cloud: SpectralCloud) -> list[Finding]:

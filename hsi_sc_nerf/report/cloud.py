@@ -14,8 +14,10 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.plotting import INDEX_COLOURS
-from hsi_sc_nerf.spectra import available_composites, available_indices, index_values
+from hsi_sc_nerf.indices.catalogue import find_indices
+from hsi_sc_nerf.indices.formula import index_values
+from hsi_sc_nerf.plotting import INDEX_COLOURS, usual_range
+from hsi_sc_nerf.spectra import available_composites
 
 _INT16 = 32767
 _MISSING = 65535
@@ -111,26 +113,26 @@ def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequen
     return {"name": name, "tells": tells, "data": _base64(counts), "range": ends, "drawn": drawn or ends}
 
 
-def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra) -> dict[str, Any]:
+def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra, indices: Sequence[str] = ()) -> dict[str, Any]:
     """Data of the page's viewer (``templates/cloud_data.js``), for JSON.
 
     Args:
         cloud: the points to show (`thinned`).
         spectra: of the same points.
+        indices: to offer, as `find_indices` reads them.
+
+    Raises:
+        InputError: an index cannot be computed.
     """
     order = np.argsort(cloud.wavelengths_nm)
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
-    scalars = [
-        _scalar(
-            index.name,
-            f"{index.expression}: {index.tells}",
-            index_values(index, cloud.spectra, cloud.wavelengths_nm),
-            index.drawn_range,
-        )
-        for index in available_indices(cloud.wavelengths_nm)
-    ]
+    scalars = []
+    for index in find_indices(indices, cloud.wavelengths_nm):
+        values = index_values(index, cloud.spectra, cloud.wavelengths_nm)
+        drawn = index.drawn_range if index.has_range else usual_range(values)
+        scalars.append(_scalar(index.name, f"{index.expression}: {index.tells}", values, drawn))
     scalars += [_scalar(name, "column of the cloud", values, None) for name, values in cloud.extra.items()]
     return {
         "count": len(cloud.points),

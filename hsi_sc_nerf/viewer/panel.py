@@ -26,14 +26,13 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
+from hsi_sc_nerf.indices.catalogue import CATALOGUE, available_indices
+from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
 from hsi_sc_nerf.spectra import (
     COMPOSITES,
-    INDICES,
     available_composites,
-    available_indices,
     composite,
-    index_values,
     nearest_bands,
 )
 from hsi_sc_nerf.viewer.drawings import BrowserControl, ViewerMarkdown, colour_bar, inline_image, spectra_plot
@@ -143,7 +142,7 @@ class SpectralPanel(torch.nn.Module):
             chosen = COMPOSITES[self.composite.value]
             pictures["composite"] = composite(spectral, self.wavelengths_nm, chosen.wavelengths_nm).clamp(0.0, 1.0)
         if self.index is not None:
-            index = INDICES[self.index.value]
+            index = CATALOGUE[self.index.value]
             values = index_values(index, spectral, self.wavelengths_nm)
             pictures["index"] = coloured(values, index.drawn_range, INDEX_COLOURS)
         angles = torch.full(spectral.shape[:2], torch.nan, device=spectral.device)
@@ -212,7 +211,7 @@ class SpectralPanel(torch.nn.Module):
             shown = ", ".join(f"{nm:g}" for nm in chosen.wavelengths_nm)
             parts.append(f"**composite** {chosen.name}: {shown} nm as red, green, blue ({chosen.shows})")
         if self.index is not None:
-            index = INDICES[self.index.value]
+            index = CATALOGUE[self.index.value]
             bar = colour_bar(index.drawn_range, INDEX_COLOURS, index.name)
             parts.append(f"**index** {index.name} = {index.expression}: {index.tells}")
             parts.append(inline_image(bar, "colours {:g} to {:g}".format(*index.drawn_range)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
-from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.library import SpectralLibrary, read_library
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
@@ -117,6 +117,7 @@ def test_command_writes_all_results(tmp_path, capsys):
     true = small_cloud(tmp_path / "cloud.ply")
     rows = [f"{nm},{skin},{bruise}" for nm, skin, bruise in zip(NM, *true.endmembers, strict=True)]
     (tmp_path / "library.csv").write_text("\n".join(["wavelength_nm,skin,bruise", *rows]))
+    (tmp_path / "sum.csv").write_text("# unit: %\nwavelength_nm,coefficient\n600,1\n700,1\n")
     # Brackets would be taken for colours of the terminal.
     output = tmp_path / "out[bold]"
     TraitsCommand(
@@ -126,12 +127,16 @@ def test_command_writes_all_results(tmp_path, capsys):
         splits=1,
         library=tmp_path / "library.csv",
         roi=(("spot", 0.0, 0.02, STAND_M + 0.025, 0.006),),
+        index=("PRI", "own = R800 / R670"),
+        calibration=(tmp_path / "sum.csv",),
+        components=4,
     ).main()
     assert str(output / "traits.md") in capsys.readouterr().err
     written = {path.name for path in output.iterdir()}
+    pictures = ("components", "composites", "endmembers", "indices", "calibrations", "classes", "classes_by_mixture")
     assert written == {
-        *("traits.md", "traits.json", "spectra.csv", "mesh.ply"),
-        *("composites.png", "indices.png", "classes.png", "classes_by_mixture.png", "region_spectra.png"),
+        *("traits.md", "traits.json", "spectra.csv", "endmembers.csv", "mesh.ply", "region_spectra.png"),
+        *(f"{picture}.png" for picture in pictures),
     }
     content = json.loads((output / "traits.json").read_text())
     assert content["watertight"]
@@ -145,7 +150,14 @@ def test_command_writes_all_results(tmp_path, capsys):
     table = np.loadtxt(output / "spectra.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(table[:, 0], NM, rtol=1e-5)
     np.testing.assert_allclose(table[:, -2], true.endmembers[1], atol=0.002)
-    assert len(read_spectral_ply(output / "mesh.ply").points) > 1000
+    mesh = read_spectral_ply(output / "mesh.ply")
+    assert len(mesh.points) > 1000
+    assert {"index_PRI", "index_own", "calibration_sum", "component_1", "endmember_1"} <= set(mesh.extra)
+    assert read_library(output / "endmembers.csv").names[0] == "endmember 1"
+    spot = content["regions"]["spot"]
+    at = [true.endmembers[1][np.abs(NM - nm).argmin()] for nm in (600, 700, 800, 670)]
+    assert spot["calibrations"]["sum"]["mean"] == pytest.approx(at[0] + at[1], rel=0.02)
+    assert spot["indices"]["own"]["mean"] == pytest.approx(at[2] / at[3], rel=0.02)
     page = (output / "traits.md").read_text()
     assert "watertight" in page
     assert all(f"({name})" in page for name in written if name.endswith(".png"))

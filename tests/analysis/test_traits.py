@@ -1,5 +1,6 @@
 """Spectra on a mesh: classes and their areas, regions, pictures, the PLY file, tables."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,10 @@ from hsi_sc_nerf.analysis.classes import (
     spectral_angles,
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.maps import SurfaceMap, index_maps
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_tables
+from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_mesh
 from hsi_sc_nerf.analysis.traits import (
     WHOLE,
@@ -31,6 +34,7 @@ from hsi_sc_nerf.export.cloud import (
     material_spectra,
     read_spectral_ply,
 )
+from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
@@ -101,14 +105,38 @@ def test_what_was_not_seen_is_in_no_class_and_no_mean():
 
 
 def test_indices_of_regions():
-    traits = analyse(two_halves(), [RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)])
+    surface = two_halves()
+    maps = index_maps(surface, find_indices(["NDVI", "own = R700 - R600"], NM))
+    surface = replace(surface, scatter=np.full(len(surface.seen), 0.02))
+    traits = analyse(surface, [RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)], pixel_m=0.001, maps=maps)
     at = {nm: GREEN[np.abs(NM - nm).argmin()] for nm in (670.0, 800.0)}
     whole, spot = traits.regions
-    ndvi = spot.indices["NDVI"]
+    ndvi = spot.maps["NDVI"].surface
     assert ndvi.mean == pytest.approx((at[800.0] - at[670.0]) / (at[800.0] + at[670.0]), rel=1e-5)
     assert ndvi.sd == pytest.approx(0.0, abs=1e-6)
-    assert whole.indices["NDVI"].sd > 0.05
+    assert whole.maps["NDVI"].surface.sd > 0.05
     assert spot.area_m2 == pytest.approx(np.pi * 0.005**2, rel=0.1)
+    noise = 0.02 / np.sqrt(spot.area_m2 / 0.001**2)
+    assert spot.maps["own"].std == pytest.approx(np.sqrt(2) * noise, rel=1e-3)
+    slope = 2 * np.hypot(at[670.0], at[800.0]) / (at[670.0] + at[800.0]) ** 2
+    assert spot.maps["NDVI"].std == pytest.approx(slope * noise, rel=1e-3)
+    assert np.isnan(analyse(surface, maps=maps).regions[0].maps["NDVI"].std)
+
+
+def test_tables_and_json_hold_maps():
+    surface = two_halves()
+    maps = index_maps(surface, find_indices(["NDVI"], NM))
+    half = np.where(surface.mesh.vertices[:, 1] > 0.0, 12.0, np.nan)
+    maps.append(SurfaceMap("sugar", "°Brix", half, lambda spectra: spectra[:, 0], 0.4, "", "°Brix", 0.03))
+    traits = analyse(surface, maps=maps)
+    content = report.trait_content(Size(*[1.0] * 6), {}, True, traits, {})
+    assert content["indices"] == ["NDVI = (R800 - R670) / (R800 + R670) [0, 1]"]
+    tables = {table.heading: table for table in trait_tables(json.loads(json.dumps(content)))}
+    assert tables["Indices"].header == ["region", "NDVI"]
+    (row,) = tables["Calibrations"].rows
+    assert row[:4] == [WHOLE, "sugar", "°Brix", "12.000 ± 0.000"]
+    assert float(row[4].rstrip("%")) == pytest.approx(50.0, abs=2.0)
+    assert "resampling changes sugar by 0.03" in tables["Calibrations"].note
 
 
 def test_means_are_weighted_by_area():
@@ -189,7 +217,6 @@ def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
     assert low.light.irradiance.mean == pytest.approx(0.5, abs=1e-3)
     # What the region's points share does not shrink with their number.
     assert low.light.irradiance_std == pytest.approx(0.03)
-    assert low.indices.keys() == high.indices.keys()
     write_mesh(tmp_path / "mesh.ply", found, {})
     read = read_spectral_ply(tmp_path / "mesh.ply")
     np.testing.assert_allclose(read.spectra, found.lit.measured)
@@ -250,6 +277,9 @@ def test_regions_off_the_surface_or_of_one_name_are_refused():
     spot = RegionOfInterest("spot", (0.0, 0.02, 0.02), 0.005)
     with pytest.raises(InputError, match="two regions are named spot"):
         analyse(surface, [spot, spot])
+    ndvi = index_maps(surface, find_indices(["NDVI"], NM))
+    with pytest.raises(InputError, match="two indices or calibrations are named NDVI"):
+        analyse(surface, maps=ndvi * 2)
     with pytest.raises(InputError, match="raise the smoothing radius"):
         analyse(two_halves(seen=False))
 

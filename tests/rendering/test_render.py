@@ -17,7 +17,7 @@ from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import RenderedView, views_of_orbit, views_of_path, write_view
-from hsi_sc_nerf.spectra import COMPOSITES, INDICES
+from hsi_sc_nerf.spectra import COMPOSITES
 
 NM = factory.WAVELENGTHS_NM
 HELD_OUT = "ball_8"
@@ -79,7 +79,12 @@ def test_false_colours_are_the_viewers():
     painted = find_false_colour("ndvi", wavelengths_nm).colours(view)
     assert (painted[0] == 0.25).all()
     assert (painted[1:] != 0.25).any(dim=-1).all()
-    with pytest.raises(InputError, match=f"choose from .*{next(iter(INDICES))}"):
+    own = find_false_colour("own = (R800 - R670) / (R800 + R670) [0, 1]", wavelengths_nm)
+    assert own.name == "own"
+    torch.testing.assert_close(own.colours(view), painted)
+    with pytest.raises(InputError, match=r"'own = R800 \[LOW, HIGH\]'"):
+        find_false_colour("own = R800", wavelengths_nm)
+    with pytest.raises(InputError, match=r"no composite .*CIR.*, and there is no index 'beauty'; choose from NDVI"):
         find_false_colour("beauty", wavelengths_nm)
     with pytest.raises(InputError, match="needs a band near"):
         find_false_colour("NDVI", wavelengths_nm[wavelengths_nm < 650.0])

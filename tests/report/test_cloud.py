@@ -100,4 +100,8 @@ def test_the_payload_holds_the_cloud_with_its_bands_in_order():
     coefficients = array(payload["coefficients"], "<i2", 500, payload["rank"])
     spectra = payload["mean"] + coefficients @ basis
     np.testing.assert_allclose(spectra, cloud.spectra[:, np.argsort(cloud.wavelengths_nm)], atol=2e-3)
-    assert [scalar["name"] for scalar in payload["scalars"]] == ["NDVI", "red-edge NDVI", "water index"]
+    assert [scalar["name"] for scalar in payload["scalars"]] == ["NDVI", "NDVI705", "WI"]
+    own = cloud_payload(cloud, compress_spectra(cloud.spectra), ["own = R800 / R670"])["scalars"][0]
+    ratio = cloud.spectra[:, np.abs(cloud.wavelengths_nm - 800).argmin()]
+    ratio = ratio / cloud.spectra[:, np.abs(cloud.wavelengths_nm - 670).argmin()]
+    assert own["drawn"] == pytest.approx(np.percentile(ratio, (1, 99)), rel=1e-5)

@@ -1,0 +1,261 @@
+"""Calibrations: regressions that were fitted elsewhere, read from a table or an ONNX model and applied to a surface.
+
+The table is described in docs/how-to/calibrations.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.analysis.maps import SurfaceMap
+from hsi_sc_nerf.analysis.preprocessing import Step, preprocessed, read_steps
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.spectra import nearest_bands
+
+_KEYS = {
+    *("name", "unit", "preprocessing", "intercept", "error"),
+    *("t2_limit", "q_limit", "score_variances", "model", "column"),
+}
+_SAME_BAND_NM = 0.05
+"""Tables round wavelengths."""
+_CHUNK_SPECTRA = 1 << 13
+_REMEDY = "docs/how-to/calibrations.md shows such a table"
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The spectra that a calibration was fitted on: a mean and a few directions of pre-processed spectra.
+
+    Attributes:
+        mean: subtracted first.
+        scale: divided by then.
+        weights: give the scores.
+        loadings: give a spectrum back from its scores.
+        variances: of the scores.
+        t2_limit: largest Hotelling T², the scores' squares by their variances; infinite for none.
+        q_limit: largest Q, the sum of squares that the scores do not give back; infinite for none.
+    """
+
+    mean: Float[np.ndarray, "used"]
+    scale: Float[np.ndarray, "used"]
+    weights: Float[np.ndarray, "used components"]
+    loadings: Float[np.ndarray, "used components"]
+    variances: Float[np.ndarray, "components"]
+    t2_limit: float
+    q_limit: float
+
+    def holds(self, spectra: Float[np.ndarray, "n used"]) -> Bool[np.ndarray, "n"]:
+        """Whether pre-processed spectra are within both limits."""
+        scaled = (spectra - self.mean) / self.scale
+        scores = scaled @ self.weights
+        t2 = (scores**2 / self.variances).sum(axis=1)
+        q = ((scaled - scores @ self.loadings.T) ** 2).sum(axis=1)
+        return (t2 <= self.t2_limit) & (q <= self.q_limit)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A regression on spectra.
+
+    Attributes:
+        name: of what it tells.
+        unit: of its values.
+        error: standard deviation of its predictions (RMSEP); 0 if it is not known.
+        wavelengths_nm: of the spectra that it takes.
+        steps: of the pre-processing.
+        used: bands that the model takes after it.
+        reference: spectrum of the scatter correction.
+        predict: the model, from pre-processed spectra.
+        domain: what it was fitted on; None if that is not known.
+    """
+
+    name: str
+    unit: str
+    error: float
+    wavelengths_nm: Float[np.ndarray, "bands"]
+    steps: tuple[Step, ...]
+    used: Bool[np.ndarray, "bands"]
+    reference: Float[np.ndarray, "bands"]
+    predict: Callable[[Float[np.ndarray, "n used"]], Float[np.ndarray, "n"]]
+    domain: Domain | None = None
+
+    def values(self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False) -> Float[np.ndarray, "n"]:
+        """Predictions of spectra at its wavelengths; NaN where there is none.
+
+        Args:
+            spectra: reflectance.
+            only_inside: none outside the domain either.
+        """
+        values = np.full(len(spectra), np.nan)
+        for start in range(0, len(spectra), _CHUNK_SPECTRA):
+            chunk = preprocessed(spectra[start : start + _CHUNK_SPECTRA], self.steps, self.used, self.reference)
+            known = np.isfinite(chunk).all(axis=1)
+            if only_inside and self.domain is not None:
+                known[known] = self.domain.holds(chunk[known])
+            if known.any():
+                values[start + np.flatnonzero(known)] = self.predict(chunk[known])
+        return values
+
+    def interpolation(self, nm: Float[np.ndarray, "others"]) -> Float[np.ndarray, "others bands"]:
+        """The matrix that interpolates spectra at wavelengths ``nm`` to its own.
+
+        Raises:
+            InputError: its own reach beyond.
+        """
+        nearest = nm[nearest_bands(nm, self.wavelengths_nm)]
+        wanted = np.where(np.abs(nearest - self.wavelengths_nm) <= _SAME_BAND_NM, nearest, self.wavelengths_nm)
+        if wanted.min() < nm.min() or wanted.max() > nm.max():
+            raise InputError(
+                f"the calibration {self.name} needs {wanted.min():g} to {wanted.max():g} nm, and the cloud has "
+                f"{nm.min():g} to {nm.max():g} nm; give a cloud with more bands, or a calibration that needs fewer."
+            )
+        order = np.argsort(nm)
+        return np.stack([np.interp(wanted, nm[order], row[order]) for row in np.eye(len(nm))])
+
+
+def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceMap:
+    """A calibration's value at each vertex; NaN outside its domain.
+
+    Spectra are interpolated linearly to the calibration's wavelengths. The error of that is estimated from every
+    second band: linear interpolation errs four times as much over twice the distance.
+
+    Raises:
+        InputError: the calibration needs wavelengths that the surface's bands do not reach.
+    """
+    nm = surface.wavelengths_nm
+    weights = calibration.interpolation(nm)
+
+    def of(spectra: np.ndarray, only_inside: bool = False) -> np.ndarray:
+        return calibration.values(spectra.astype(float) @ weights, only_inside)
+
+    values, resampling_error = of(surface.spectra, only_inside=True), 0.0
+    if not np.isin(weights, (0.0, 1.0)).all():
+        order = np.argsort(nm)
+        coarse = np.union1d(order[::2], order[-1:])
+        other = calibration.values(surface.spectra[:, coarse] @ calibration.interpolation(nm[coarse]))
+        change = (other - values)[surface.seen & np.isfinite(other - values)]
+        resampling_error = float(np.sqrt(np.mean(change**2))) / 3.0 if len(change) else math.nan
+    return SurfaceMap(
+        calibration.name,
+        calibration.unit,
+        values,
+        of,
+        calibration.error,
+        unit=calibration.unit,
+        resampling_error=resampling_error,
+    )
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration from a CSV table, whose header may name an ONNX model beside it.
+
+    Raises:
+        InputError: the table or the model cannot be read, or does not hold what it needs.
+    """
+    try:
+        head, columns = _read_table(path)
+        if unknown := head.keys() - _KEYS:
+            raise ValueError(f"{', '.join(sorted(unknown))} is no known key; known are {', '.join(sorted(_KEYS))}")
+        nm = columns.pop("wavelength_nm", np.empty(0))
+        if not (len(nm) and np.isfinite(nm).all() and (np.diff(nm) > 0).all()):
+            raise ValueError("it needs a column wavelength_nm that ascends")
+        coefficients = columns.get("coefficient", np.ones(len(nm)))
+        used = np.isfinite(coefficients)
+        steps = read_steps(head.get("preprocessing", ""), used)
+        reference = columns.get("reference", np.full(len(nm), np.nan))
+        if any(name == "msc" for name, _ in steps) and not np.isfinite(reference).all():
+            raise ValueError("msc needs a column reference")
+        numbers = {key: float(head.get(key, default)) for key, default in (("intercept", 0.0), ("error", 0.0))}
+        if not (all(map(math.isfinite, numbers.values())) and numbers["error"] >= 0.0 and used.any()):
+            raise ValueError("its intercept and error are no finite numbers, or it has no coefficient")
+        domain = _domain(head, {name: column[used] for name, column in columns.items()})
+        column = int(head.get("column", 0))
+    except (ValueError, OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no table of a calibration ({error}); {_REMEDY}.") from error
+    if "model" in head:
+        predict = _onnx_model(path, head["model"], int(used.sum()), column)
+    elif "coefficient" in columns:
+        slopes, intercept = coefficients[used], numbers["intercept"]
+
+        def predict(spectra: np.ndarray) -> np.ndarray:
+            return spectra @ slopes + intercept
+    else:
+        raise InputError(f"{path}: has neither a column coefficient nor a '# model:'; {_REMEDY}.")
+    name, unit = head.get("name", path.stem), head.get("unit", "")
+    return Calibration(name, unit, numbers["error"], nm, steps, used, reference, predict, domain)
+
+
+def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """``# key: value`` lines, and the columns by name; empty cells are NaN."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        lines = [line for line in file if line.strip()]
+    pairs = (line.lstrip("# ").partition(":") for line in lines if line.startswith("#") and ":" in line)
+    head = {key.strip().lower(): value.strip() for key, _, value in pairs}
+    titles, *rows = [*csv.reader(line for line in lines if not line.startswith("#"))] or [[]]
+    if any(len(row) != len(titles) for row in rows):
+        raise ValueError("its lines do not have the same number of columns")
+    cells = [[math.nan if cell.strip() in ("", "NA") else float(cell) for cell in row] for row in rows]
+    table = np.array(cells, float).reshape(len(rows), len(titles))
+    return head, {title.strip(): column for title, column in zip(titles, table.T, strict=True)}
+
+
+def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | None:
+    """The domain, where the table has a limit.
+
+    Raises:
+        ValueError: the table lacks what the limit needs.
+    """
+    limits = [float(head.get(key, "inf")) for key in ("t2_limit", "q_limit")]
+    if not (limits[0] < math.inf or limits[1] < math.inf):
+        return None
+    weights, loadings = (
+        np.stack(found, axis=1) if (found := [c for name, c in columns.items() if name.startswith(kind)]) else None
+        for kind in ("weight", "loading")
+    )
+    if "mean" not in columns or weights is None or loadings is None or weights.shape != loadings.shape:
+        raise ValueError("t2_limit and q_limit need the columns mean, weight_1 ... and as many of loading_1 ...")
+    variances = np.array([float(word) for word in head.get("score_variances", "").split(",") if word.strip()])
+    if limits[0] < math.inf and not (len(variances) == weights.shape[1] and (variances > 0.0).all()):
+        raise ValueError("t2_limit needs score_variances, one above 0 for each weight")
+    scale = columns.get("scale", np.ones(len(weights)))
+    if not all(np.isfinite(part).all() for part in (columns["mean"], scale, weights, loadings)):
+        raise ValueError("mean, scale, weight and loading must be numbers where there is a coefficient")
+    variances = variances if len(variances) else np.full(weights.shape[1], math.inf)
+    return Domain(columns["mean"], scale, weights, loadings, variances, *limits)
+
+
+def _onnx_model(table: Path, name: str, bands: int, column: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A column of the last output of an ONNX model in the folder of the table.
+
+    Raises:
+        InputError: onnxruntime is not installed, or the model cannot be used.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise InputError(f"{name} needs onnxruntime; install it: pip install 'hsi-sc-nerf[calibrations]'.") from error
+    path = table.with_name(Path(name).name)
+    try:
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        takes, gives = session.get_inputs()[0], session.get_outputs()[-1].name
+        kind = {"tensor(float)": np.float32, "tensor(double)": np.float64}[takes.type]
+
+        def predict(spectra: np.ndarray) -> np.ndarray:
+            (found,) = session.run([gives], {takes.name: spectra.astype(kind)})
+            return np.asarray(found, float).reshape(len(spectra), -1)[:, column]
+
+        predict(np.zeros((2, bands)))
+    except Exception as error:  # onnxruntime's exceptions have no common class
+        raise InputError(
+            f"{path}: is no ONNX model of spectra of {bands} bands with numbers in column {column} of its last "
+            f"output ({error}); {_REMEDY}."
+        ) from error
+    return predict

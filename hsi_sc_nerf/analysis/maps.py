@@ -1,0 +1,95 @@
+"""Maps of the surface: a number at each vertex, computed from its spectrum."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
+
+_STEP = 1e-4
+"""Change of a reflectance that slopes are taken over: small beside reflectance, large beside rounding."""
+_CAPTION_LETTERS = 40
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """A number at each vertex.
+
+    Attributes:
+        name: of the map.
+        label: what it is, beside its picture: a formula, or a unit.
+        values: NaN where none is known.
+        of: computes the numbers of spectra at the surface's bands.
+        error: standard deviation that all values share; 0 for none.
+        definition: words that find the index again; empty for other maps.
+        unit: of the values; empty for none.
+        resampling_error: root mean square of what resampling the spectra changes.
+    """
+
+    name: str
+    label: str
+    values: Float[np.ndarray, "v"]
+    of: Callable[[Float[np.ndarray, "n bands"]], Float[np.ndarray, "n"]]
+    error: float = 0.0
+    definition: str = ""
+    unit: str = ""
+    resampling_error: float = 0.0
+
+    @property
+    def caption(self) -> str:
+        """Name and label beside a picture, without a formula that is too long for it."""
+        label = self.label.replace(" / (", " /\n(") if len(self.label) <= _CAPTION_LETTERS else ""
+        return f"{self.name}\n{label}"
+
+    @property
+    def column(self) -> str:
+        """Its column in a cloud: ``index_`` or ``calibration_``, and the name with ``_`` for all but letters."""
+        kind = "index" if self.definition else "calibration"
+        return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}"
+
+
+def index_maps(surface: SpectralMesh, indices: Sequence[SpectralIndex]) -> list[SurfaceMap]:
+    """The indices of each vertex.
+
+    Raises:
+        InputError: a wavelength of an index has no band near it.
+    """
+    maps = []
+    for index in indices:
+        of = partial(index_values, index, wavelengths_nm=surface.wavelengths_nm)
+        values = of(surface.spectra.astype(float))
+        maps.append(SurfaceMap(index.name, index.expression, values, of, definition=index.definition))
+    return maps
+
+
+def propagated_std(
+    of: Callable[[Float[np.ndarray, "n bands"]], Float[np.ndarray, "n"]],
+    spectrum: Float[np.ndarray, "bands"],
+    std: float | Float[np.ndarray, "bands"],
+) -> float:
+    """Standard deviation of a function of a spectrum whose bands err independently (linear propagation).
+
+    Errors that bands share, such as of brightness, change ratios less than this.
+
+    Args:
+        of: the function, of many spectra at once.
+        spectrum: where its slopes are taken.
+        std: standard deviation of each band or of all.
+
+    Example:
+        >>> round(propagated_std(lambda spectra: spectra.sum(axis=1), np.full(4, 0.5), 0.01), 6)
+        0.02
+    """
+    if not np.isfinite(std).all():
+        return math.nan
+    steps = _STEP * np.eye(len(spectrum))
+    slopes = (of(spectrum + steps) - of(spectrum - steps)) / (2.0 * _STEP)
+    return float(np.sqrt(np.sum((slopes * std) ** 2)))

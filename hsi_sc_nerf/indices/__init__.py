@@ -1,0 +1,1 @@
+"""Spectral indices: formulas of reflectances, and the catalogue of usual ones."""

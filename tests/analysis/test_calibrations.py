@@ -1,0 +1,171 @@
+"""Calibrations against scikit-learn's regressions, on simulated spectra."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+from sklearn.cross_decomposition import PLSRegression
+
+from hsi_sc_nerf.analysis.calibrations import calibration_map, read_calibration
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.mesh import cylinder
+
+NM = np.linspace(400.0, 1000.0, 61)
+MODELS = Path(__file__).parent / "calibrations_onnx"
+
+
+def simulated(count, seed=0):
+    """Spectra of a line whose absorption at 680 and 970 nm grows with what a calibration tells, at any brightness."""
+    rng = np.random.default_rng(seed)
+    content, water, brightness = rng.uniform(0.0, 1.0, (3, count, 1))
+    depth = 0.5 * content * np.exp(-(((NM - 680) / 40) ** 2)) + 0.3 * water * np.exp(-(((NM - 970) / 30) ** 2))
+    noise = 0.0005 * rng.standard_normal((count, len(NM)))
+    return (0.4 + 0.5 * brightness) * 10.0**-depth + noise, 8.0 + 6.0 * content[:, 0]
+
+
+def table(path, head, columns):
+    lines = [f"# {key}: {value}" for key, value in head.items()]
+    rows = [",".join(f"{value:.17g}" for value in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([*lines, ",".join(columns), *rows]) + "\n")
+    return path
+
+
+def pretreated(spectra):
+    filtered = savgol_filter(-np.log10(spectra), 7, 2, deriv=1)
+    return (filtered - filtered.mean(axis=1, keepdims=True)) / filtered.std(axis=1, ddof=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def pls():
+    spectra, content = simulated(200)
+    return PLSRegression(3).fit(pretreated(spectra), content)
+
+
+@pytest.fixture
+def fitted(pls, tmp_path):
+    """The table of a regression, as docs/how-to/calibrations.md writes it."""
+    inside = pretreated(simulated(200)[0])
+    scores = pls.transform(inside)
+    scaled = (inside - inside.mean(axis=0)) / inside.std(axis=0, ddof=1)
+    t2 = (scores**2 / scores.var(axis=0, ddof=1)).sum(axis=1)
+    q = ((scaled - scores @ pls.x_loadings_.T) ** 2).sum(axis=1)
+    head = {
+        "name": "sugar content",
+        "unit": "°Brix",
+        "preprocessing": "absorbance, savgol 7 2 1, snv",
+        "intercept": pls.predict(np.zeros((1, len(NM)))).item(),
+        "error": 0.3,
+        "t2_limit": t2.max(),
+        "q_limit": q.max(),
+        "score_variances": ", ".join(map(str, scores.var(axis=0, ddof=1))),
+    }
+    columns = {"wavelength_nm": NM, "coefficient": pls.coef_.ravel(), "mean": inside.mean(axis=0)}
+    columns["scale"] = inside.std(axis=0, ddof=1)
+    columns |= {f"weight_{k + 1}": column for k, column in enumerate(pls.x_rotations_.T)}
+    columns |= {f"loading_{k + 1}": column for k, column in enumerate(pls.x_loadings_.T)}
+    return table(tmp_path / "sugar.csv", head, columns)
+
+
+def surface_of(spectra, nm=NM):
+    mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
+    count = len(mesh.vertices)
+    return SpectralMesh(mesh, np.resize(spectra, (count, len(nm))), nm, np.ones(count, bool))
+
+
+def test_predictions_are_those_of_scikit_learn(pls, fitted):
+    calibration = read_calibration(fitted)
+    spectra, _ = simulated(100, seed=1)
+    found = calibration.values(spectra)
+    np.testing.assert_allclose(found, pls.predict(pretreated(spectra)).ravel(), rtol=1e-9)
+    assert (calibration.name, calibration.unit, calibration.error) == ("sugar content", "°Brix", 0.3)
+
+
+def test_spectra_that_the_calibration_does_not_know_have_no_value(fitted):
+    calibration = read_calibration(fitted)
+    inside, outside = simulated(100, seed=0)[0], simulated(20, seed=1)[0]
+    outside += 0.1 * np.exp(-(((NM - 500) / 10) ** 2))
+    assert np.isfinite(calibration.values(inside, only_inside=True)).mean() > 0.9
+    assert np.isnan(calibration.values(outside, only_inside=True)).all()
+    assert np.isfinite(calibration.values(outside)).all()
+
+
+def test_each_limit_counts_alone(fitted):
+    text = fitted.read_text()
+    extreme = simulated(200)[0]
+    for key in ("t2_limit", "q_limit"):
+        lines = [f"# {key}: 1e-9" if line.startswith(f"# {key}") else line for line in text.splitlines()]
+        other = {"t2_limit": "q_limit", "q_limit": "t2_limit"}[key]
+        fitted.write_text("\n".join(line for line in lines if not line.startswith(f"# {other}")))
+        assert np.isnan(read_calibration(fitted).values(extreme, only_inside=True)).all()
+
+
+def test_a_map_of_the_same_bands_is_not_resampled(fitted):
+    spectra, _ = simulated(50)
+    calibration = read_calibration(fitted)
+    found = calibration_map(surface_of(spectra, NM + 0.004), calibration)
+    assert found.resampling_error == 0.0
+    np.testing.assert_allclose(found.values[:50], calibration.values(spectra, only_inside=True))
+    assert found.column == "calibration_sugar_content"
+
+
+def test_other_bands_are_resampled_with_the_error_of_linear_interpolation(tmp_path):
+    """Between bands h apart, a line errs by a h² / 4 in the middle of a parabola a nm²; here two such bands."""
+    head = {"name": "sum", "preprocessing": ""}
+    path = table(tmp_path / "sum.csv", head, {"wavelength_nm": [505.0, 905.0], "coefficient": [1.0, 1.0]})
+    curve = 2e-6
+    parabola = 0.2 + curve * (NM - 700.0) ** 2
+    found = calibration_map(surface_of(parabola[None]), read_calibration(path))
+    true = 2 * 0.2 + curve * (195.0**2 + 205.0**2)
+    assert found.values[0] - true == pytest.approx(2 * curve * 10.0**2 / 4)
+    assert found.resampling_error == pytest.approx(2 * curve * 10.0**2 / 4, rel=0.35)
+    np.testing.assert_allclose(found.of(parabola[None]), found.values[:1])
+
+
+def test_a_calibration_beyond_the_bands_is_refused(fitted):
+    spectra, _ = simulated(5)
+    with pytest.raises(InputError, match="sugar content needs 400 to 1000 nm, and the cloud has 400 to 900 nm"):
+        calibration_map(surface_of(spectra[:, :51], NM[:51]), read_calibration(fitted))
+
+
+@pytest.mark.parametrize(("model", "column", "rtol"), [("pls.onnx", 6, 1e-5), ("classes.onnx", 7, 1e-5)])
+def test_models_of_scikit_learn_as_onnx(tmp_path, model, column, rtol):
+    pytest.importorskip("onnxruntime")
+    expected = np.loadtxt(MODELS / "expected.csv", delimiter=",")
+    (tmp_path / model).write_bytes((MODELS / model).read_bytes())
+    head = {"model": model, "column": column - 6}
+    calibration = read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
+    np.testing.assert_allclose(calibration.values(expected[:, :6]), expected[:, column], rtol=rtol)
+    assert calibration.name == "own"
+    with pytest.raises(InputError, match="is no ONNX model of spectra of 7 bands"):
+        read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:7]}))
+    (tmp_path / model).write_bytes(b"no model")
+    with pytest.raises(InputError, match=f"{model}: is no ONNX model"):
+        read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "wavelength_nm that ascends"),
+        ("wavelength_nm,coefficient\n", "wavelength_nm that ascends"),
+        ("wavelength_nm,coefficient\n500,1\n400,2\n", "wavelength_nm that ascends"),
+        ("wavelength_nm,coefficient\n400,one\n", "could not convert"),
+        ("wavelength_nm,coefficient\n400,1,2\n", "same number of columns"),
+        ("wavelength_nm\n400\n", "neither a column coefficient"),
+        ("wavelength_nm,coefficient\n400,\n", "has no coefficient"),
+        ("# slope: 2\nwavelength_nm,coefficient\n400,1\n", "slope is no known key"),
+        ("# error: -1\nwavelength_nm,coefficient\n400,1\n", "no finite numbers"),
+        ("# preprocessing: blur\nwavelength_nm,coefficient\n400,1\n", "'blur' is not absorbance"),
+        ("# preprocessing: msc\nwavelength_nm,coefficient\n400,1\n", "msc needs a column reference"),
+        ("# t2_limit: 3\nwavelength_nm,coefficient\n400,1\n", "need the columns mean, weight_1"),
+        ("# t2_limit: 3\nwavelength_nm,coefficient,mean,weight_1,loading_1\n400,1,1,1,1\n", "needs score_variances"),
+        ("# model: none.onnx\nwavelength_nm\n400\n", "none.onnx: is no ONNX model"),
+    ],
+)
+def test_what_is_no_calibration_is_refused_in_a_sentence(tmp_path, text, why):
+    path = tmp_path / "own.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=why):
+        read_calibration(path)
