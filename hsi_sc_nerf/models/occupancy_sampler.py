@@ -69,7 +69,7 @@ class OccupancySampler(Sampler):
         """Outputs of all rays from those of the sampled ones; what meets nothing is as far away as rays reach."""
         if self.rays is None:
             return outputs
-        fills = {"depth": rays.fars, "expected_depth": rays.fars}
+        fills: dict[str, Any] = {"depth": rays.fars, "expected_depth": rays.fars}
         return outputs | {
             name: fills.get(name, value.new_zeros(len(rays), *value.shape[1:])).index_copy(0, self.rays, value)
             for name, value in outputs.items()
