@@ -12,10 +12,11 @@ from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import atomic_write, read_json, write_json
-from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME
 from hsi_sc_nerf.models.presets import Preset
 
 LIST_NAME, SETTINGS_NAME = "sessions.csv", "settings.json"
+INSPECTION_NAME = "inspection.json"
+"""As in `inspection.inspect`, whose import takes seconds: each step of each object would wait for it."""
 STEPS = ("inspect", "process", "train", "evaluate", "export", "material", "traits", "report")
 """The steps of an object, in order."""
 _AGAIN = "start `hsi-sc-nerf batch` again"

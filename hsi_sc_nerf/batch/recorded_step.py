@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -38,36 +39,34 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
     before = STEPS[: STEPS.index(name)]
     lost = [step for step in before if one.step(step).needed and _status(one, step) == "failed"]
     if lost:
-        _write(one, name, "skipped", sentence=f"The step '{lost[0]}' failed.")
+        _write(one, name, "skipped", f"The step '{lost[0]}' failed.", StepCost(name, 0.0, 0.0))
         return
     step, log = one.step(name), one.folder / "logs" / f"{name}.txt"
     make_folder(one.folder)
     console = Console(highlight=False, soft_wrap=True)
-    costs: list[StepCost] = []
+    sentence, status, started = "", "done", time.perf_counter()
 
     def run(step_name: str, argv: Sequence[str], _: Path) -> StepCost:
         if name == "inspect":
             step.remove_outputs()
-        costs.append(run_step(step_name, argv, log))
-        return costs[-1]
+        return run_step(step_name, argv, log)
 
-    sentence, status = "", "done"
     try:
-        bring_up_to_date(step, one.folder, console, f"{one.folder.name} {name}", run)
+        cost = bring_up_to_date(step, one.folder, console, f"{one.folder.name} {name}", run)
     except InputError as error:
+        cost = StepCost(name, time.perf_counter() - started, 0.0)
         sentence = _told(log) or str(error)
         # `inspect` ends so where it found something red as well, of which its result tells.
         if name != "inspect" or not step.outputs[0].is_file():
             status = "failed"
             if not step.needed:
                 step.remove_outputs()
-    _write(one, name, status, sentence=sentence, cost=costs[0] if costs else None)
+    _write(one, name, status, sentence, cost)
 
 
-def _write(one: PlannedObject, name: str, status: str, sentence: str, cost: StepCost | None = None) -> None:
-    seconds, memory = (round(cost.seconds, 1), round(cost.peak_memory_mib, 1)) if cost else (0.0, 0.0)
-    content = {"step": name, "status": status, "seconds": seconds, "peak_memory_mib": memory, "sentence": sentence}
-    write_json(one.record(name), content)
+def _write(one: PlannedObject, name: str, status: str, sentence: str, cost: StepCost) -> None:
+    content = {"step": name, "status": status, "seconds": round(cost.seconds, 1)}
+    write_json(one.record(name), content | {"peak_memory_mib": round(cost.peak_memory_mib, 1), "sentence": sentence})
 
 
 def _status(one: PlannedObject, name: str) -> str:

@@ -159,7 +159,7 @@ def is_up_to_date(step: Step, out: Path) -> bool:
     return finished and all(path.is_file() for path in step.outputs)
 
 
-def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_step: StepRunner) -> StepCost | None:
+def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_step: StepRunner) -> StepCost:
     """Run a step unless its results are those of the same command and inputs; a training goes on where it stopped.
 
     Args:
@@ -170,14 +170,14 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         run_step: runs the command.
 
     Returns:
-        What it cost; None where nothing was to be done.
+        What it cost, now or when it was done.
 
     Raises:
         InputError: it failed, or left no results.
     """
     if is_up_to_date(step, out):
         console.print(f"{title}: up to date")
-        return None
+        return _cost(step.name, _entries(out)[step.name])
     done, fingerprint = _entries(out), step.fingerprint(out)
     words = [*step.words]
     same = step.was_tried(out)
@@ -188,19 +188,23 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         elif any(run.glob("nerfstudio_models/*.ckpt")):
             words += ["--load-dir", str(run / "nerfstudio_models")]
     console.print(f"{title}\n{escape(shlex.join(words))}")
-    entry = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
+    entry: dict[str, Any] = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
     write_json(out / STEPS_NAME, done | {step.name: entry})
-    logs, cost = out / "logs", None
+    logs = out / "logs"
     make_folder(logs)
     # A training whose last stage is kept was killed between its end and the next line of steps.json.
     if step.name != "train" or not (same and any(run.glob("stage-masked/*.ckpt"))):
         cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
-        entry["seconds"] = round(cost.seconds, 1)
+        entry |= {"seconds": round(cost.seconds, 1), "peak_memory_mib": round(cost.peak_memory_mib, 1)}
     missing = [path for path in step.outputs if not path.is_file()]
     if missing:
         raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
     write_json(out / STEPS_NAME, done | {step.name: entry | {"finished": True}})
-    return cost
+    return _cost(step.name, entry)
+
+
+def _cost(name: str, entry: dict[str, Any]) -> StepCost:
+    return StepCost(name, entry.get("seconds", 0.0), entry.get("peak_memory_mib", 0.0))
 
 
 def _entries(out: Path) -> dict[str, Any]:
