@@ -6,7 +6,8 @@
 Starts Debian's munged, slurmctld and slurmd with files of their own in a temporary folder, as root, and
 `hsi-sc-nerf batch --executor slurm` on simulated sessions, one of them broken. As soon as a training has left a
 checkpoint, slurmd and all processes of its jobs are killed (SIGKILL) and slurmd is started anew. If the batch ends
-early for that, it is started again. At the end every step must have its record, and all but the broken session their report.
+early for that, it is started again. At the end every step should
+have its record, and all but the broken session their report.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ MinJobAge=600
 MpiDefault=none
 SwitchType=switch/none
 NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory_mb} State=UNKNOWN
-PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PartitionName=lab Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
 
@@ -136,7 +137,7 @@ def start(cluster: Cluster, sessions: Path, out: Path, steps: int, words: Sequen
         5,
         "--default-resources",
         "runtime=30",
-        "slurm_partition=all",
+        "slurm_partition=lab",
     ]
     with out.with_suffix(".log").open("ab") as log:
         return subprocess.Popen(typed_command(command), env=cluster.environment, stdout=log, stderr=subprocess.STDOUT)
