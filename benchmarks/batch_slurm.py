@@ -22,6 +22,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NoReturn
 
 import tyro
 from results_table import RESULTS, write_results
@@ -167,14 +168,14 @@ def main(
             batch = start(cluster, folder / "sessions", out, steps, [target])
             while not any(out.glob("objects/*/training/hsi-sc-nerf/run/nerfstudio_models/*.ckpt")):
                 if batch.poll() is not None:
-                    sys.exit(out.with_suffix(".log").read_text()[-3000:])
+                    give_up(out)
                 time.sleep(0.5)
             lost = len(cluster.output("squeue", "--noheader", "--states=RUNNING").splitlines())
             print(f"{time.monotonic() - started:.0f} s: the node loses its power with {lost} jobs", flush=True)
             cluster.lose_power()
             while batch.wait() != 0:
                 if starts == 3:
-                    sys.exit(out.with_suffix(".log").read_text()[-3000:])
+                    give_up(out)
                 starts += 1
                 print(f"{time.monotonic() - started:.0f} s: the batch ended early and is started again", flush=True)
                 batch = start(cluster, folder / "sessions", out, steps, [target])
