@@ -144,6 +144,12 @@ def start(cluster: Cluster, sessions: Path, out: Path, steps: int, words: Sequen
         return subprocess.Popen(typed_command(command), env=cluster.environment, stdout=log, stderr=subprocess.STDOUT)
 
 
+def give_up(out: Path) -> NoReturn:
+    """End with what the batch and its jobs said last."""
+    logs = [out.with_suffix(".log"), *out.glob(".snakemake/slurm_logs/**/*.log")]
+    sys.exit("\n".join(f"{log}:\n{log.read_text(errors='replace')[-3000:]}" for log in logs))
+
+
 def main(
     sessions: int = 3, steps: int = 60, frames: int = 8, target: str = "collect", results: Path = RESULTS
 ) -> None:
