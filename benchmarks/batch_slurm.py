@@ -3,7 +3,8 @@
     apt-get install slurm-wlm munge
     uv run python benchmarks/batch_slurm.py
 
-Starts Debian's munged, slurmctld and slurmd with files of their own in a temporary folder, as root, and
+Starts Debian's munged, slurmctld and slurmd as root, with files of their own in a temporary folder, whose slurm.conf
+/etc/slurm/slurm.conf points at meanwhile (where there is one, nothing is done), and
 `hsi-sc-nerf batch --executor slurm` on simulated sessions, one of them broken. As soon as a training has left a
 checkpoint, slurmd and all processes of its jobs are killed (SIGKILL) and slurmd is started anew. If the batch ends
 early for that, it is started again. At the end every step should
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -65,12 +66,18 @@ PartitionName=lab Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
 
+# Not SLURM_CONF: the jobs of Snakemake's plugin have no variables of SLURM's own.
+CONFIGURATION_PATH = Path("/etc/slurm/slurm.conf")
+MARK = "HSI_SC_NERF_CLUSTER"
+"""Stands in the surroundings of every process of the cluster."""
+
+
 class Cluster:
     """munged, slurmctld and slurmd in a folder; ended at the end of the ``with`` block."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.host = folder, socket.gethostname()
-        self.environment = os.environ | {"SLURM_CONF": str(folder / "slurm.conf")}
+        self.environment = os.environ | {MARK: str(folder)}
         self._ends = ExitStack()
 
     def __enter__(self) -> Cluster:
@@ -81,6 +88,8 @@ class Cluster:
             host=self.host, folder=self.folder, cores=available_cores(), memory_mb=memory_mb - 500
         )
         (self.folder / "slurm.conf").write_text(text)
+        CONFIGURATION_PATH.symlink_to(self.folder / "slurm.conf")
+        self._ends.callback(CONFIGURATION_PATH.unlink)
         key = self.folder / "munge.key"
         key.write_bytes(os.urandom(64))
         key.chmod(0o600)
@@ -116,16 +125,12 @@ class Cluster:
         return process
 
     def _kill_jobs(self) -> None:
-        """Kill the processes in whose surroundings stands a job of this cluster, and what holds them."""
+        """Kill what SLURM started: marked processes of other terminal sessions than this script's."""
         for entry in Path("/proc").glob("[0-9]*"):
-            try:
-                surroundings = (entry / "environ").read_bytes()
-                name = (entry / "comm").read_text().strip()
-            except OSError:
-                continue
-            ours = f"SLURM_CONF={self.folder}/slurm.conf".encode() in surroundings
-            if ours and (b"SLURM_JOB_ID=" in surroundings or name == "slurmstepd"):
-                os.kill(int(entry.name), signal.SIGKILL)
+            with suppress(OSError):
+                marked = f"{MARK}={self.folder}\0".encode() in (entry / "environ").read_bytes()
+                if marked and os.getsid(int(entry.name)) != os.getsid(0):
+                    os.kill(int(entry.name), signal.SIGKILL)
 
 
 def start(cluster: Cluster, sessions: Path, out: Path, steps: int, words: Sequence[str]) -> subprocess.Popen[bytes]:
