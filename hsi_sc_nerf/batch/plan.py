@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions, sessions_table
 from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date, session_steps
@@ -102,7 +102,7 @@ def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
         for name in STEPS:
             if not one.record(name).is_file():
                 continue
-            status = read_json(one.record(name), f"delete it and {_AGAIN}")["status"]
+            status = read_json(one.record(name), f"delete it and {_AGAIN}").get("status")
             step = one.step(name)
             if status == "done" and not is_up_to_date(step, one.folder):
                 found.append(one.record(name))
@@ -117,7 +117,7 @@ def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
     if preset not in get_args(Preset):
         choices = ", ".join(get_args(Preset))
         raise InputError(f"the object {row[OBJECT]}: its preset {shown(preset)} is none; there are {choices}.")
-    words = {key: f"{getattr(settings, key)} {row.get(key, '')}".strip() for key in ("process", "train")}
-    for text in words.values():
+    process, train = (f"{getattr(settings, key)} {row.get(key, '')}".strip() for key in ("process", "train"))
+    for text in (process, train):
         split_words(text)
-    return replace(settings, preset=preset, **words)
+    return replace(settings, preset=cast(Preset, preset), process=process, train=train)

@@ -104,14 +104,14 @@ def _snakemake(words: list[str]) -> int:
 
 
 def _show_failures(out: Path) -> None:
-    """Print how many objects are done, and the sentence of each that is not."""
+    """Print the sentence of each object that failed, and how many are done."""
     console = Console(highlight=False, soft_wrap=True)
-    plan, failed = read_plan(out), 0
+    plan, done = read_plan(out), 0
     for name, one in plan.items():
         for step in STEPS:
             path = one.record(step)
             record = read_json(path, "delete it and start again") if path.is_file() else {}
+            done += step == STEPS[-1] and record.get("status") == "done"
             if record.get("status") == "failed" and one.step(step).needed:
-                failed += 1
                 console.print(f"[yellow]{escape(name)}, {step}: {escape(record['sentence'])}")
-    console.print(f"{len(plan) - failed} of {len(plan)} objects are done.", style="bold")
+    console.print(f"{done} of {len(plan)} objects are done.", style="bold")
