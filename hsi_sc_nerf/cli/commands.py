@@ -22,6 +22,7 @@ COMMANDS = {
     "demo": Command("workflows", "DemoCommand", "Simulate, reconstruct and judge a fruit: try this first."),
     "simulate": Command("sessions", "SimulateCommand", "Simulate a turntable session, with its truth."),
     "run": Command("workflows", "RunCommand", "Do all steps from a capture session to traits and a report."),
+    "batch": Command("batch", "BatchCommand", "Do all steps on many sessions, here or on a cluster."),
     "markers": Command("sessions", "MarkersCommand", "Write ArUco markers to print."),
     "inspect": Command("sessions", "InspectCommand", "Check a session in seconds, before you process it."),
     "process": Command("sessions", "ProcessCommand", "Calibrate captures, estimate poses and masks, pack a dataset."),
