@@ -30,13 +30,14 @@ _SCRIPTS = ("statistics.js", "table.js", "charts.js", "overview.js")
 _SHOWN = {columns.FLAGS, columns.TOTAL, columns.SCORES["sam"]}
 _SHOWN |= {columns.SIZE[key][0] for key in ("volume_l", "area_m2", "height_m")}
 _HIDDEN_OF_LIST = {"object", "session", "process", "train", "preset"}
-# What the page shows in a way of its own.
+# What the page shows in a way of its own, and the trait that its charts begin with.
 _SPECIAL = {
     "status": columns.STATUS,
     "step": columns.STEP,
     "sentence": columns.SENTENCE,
     "quality": columns.QUALITY,
     "flags": columns.FLAGS,
+    "volume": columns.SIZE["volume_l"][0],
 }
 
 

@@ -105,9 +105,8 @@ function drawAll() {
 offerFacets(find(".facets"));
 offerColumns(find(".chooser div"));
 offer(named("group"), groupings, ALL);
-const sizes = traits.filter((at) => data.columns[at].group === "size" && data.columns[at].shown);
-const [first, second] = [...sizes, ...traits];
-const index = traits.find((at) => data.columns[at].group === "index") ?? second;
+const first = traits.includes(data.places.volume) ? data.places.volume : traits[0];
+const index = traits.find((at) => data.columns[at].group === "index") ?? traits[1] ?? first;
 for (const [name, at] of [["y", first], ["x", first], ["up", index]]) offer(named(name), traits, "", at);
 find("form.filters").addEventListener("input", drawAll);
 find("form.filters").addEventListener("reset", () => setTimeout(drawAll));
