@@ -39,8 +39,11 @@ def write_object(folder, traits=None, failed=None, sentence="", picture=True):
     for number, step in enumerate(reached, start=1):
         cost = {"seconds": float(number), "peak_memory_mib": 100.0 * number}
         write_json(folder / "steps" / f"{step}.json", {"step": step, "status": "done", "sentence": ""} | cost)
-    if failed:
-        write_json(folder / "steps" / f"{failed}.json", {"step": failed, "status": "failed", "sentence": sentence})
+    for step in STEPS[len(reached) :]:
+        state = (
+            {"status": "failed", "sentence": sentence} if step == failed else {"status": "skipped", "sentence": "No."}
+        )
+        write_json(folder / "steps" / f"{step}.json", {"step": step, "seconds": 0.0, "peak_memory_mib": 0.0} | state)
     write_json(folder / "inspection.json", {"findings": FINDINGS})
     if "process" in reached:
         write_json(folder / "data" / "report" / "inspection.json", {"findings": FINDINGS})

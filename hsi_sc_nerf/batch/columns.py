@@ -98,11 +98,14 @@ _REFLECTED = measured(
     "spectrum",
     _SD,
 )
-_LIT = measured("irradiance", "", "light on the seen surface relative to that on the white reference", "spectrum", _SD)
-_LIT_REFLECTED = measured("reflectance_measured", "", "the same as measured, light on the object included", "spectrum")
-REFLECTANCE = dict(
-    zip(("mean", "std", "measured", "irradiance", "irradiance_std"), (*_REFLECTED, *_LIT_REFLECTED, *_LIT), strict=True)
+_LIT = measured(
+    "irradiance", "", "light on the seen surface relative to that on the white reference", "spectrum", _SD
 )
+_LIT_REFLECTED = measured(
+    "reflectance_measured", "", "the same as measured, with the light on the object", "spectrum"
+)
+_REFLECTANCE_KEYS = ("mean", "std", "measured", "irradiance", "irradiance_std")
+REFLECTANCE = dict(zip(_REFLECTANCE_KEYS, (*_REFLECTED, *_LIT_REFLECTED, *_LIT), strict=True))
 """By the key of the region's reflectance in ``traits.json``."""
 SCORES = {
     "sam": Column("sam_rad", "rad", "spectral angle of held-out views, inside the mask", "score"),
@@ -111,7 +114,7 @@ SCORES = {
     "ssim": Column("ssim", "", "structural similarity of them, inside the mask", "score"),
 }
 """By the key in ``eval.json``."""
-QUALITY = Column("quality", "", "worst level of the checks of inspect and process: green, amber, red", "quality", "text")
+QUALITY = Column("quality", "", "worst level of inspect's and process's checks: green, amber, red", "quality", "text")
 FLAGS = Column("flags", "", "names of the checks that are not green, with semicolons between", "quality", "text")
 SECONDS = {step: Column(f"{step}_s", "s", f"wall time of the step {step}", "cost") for step in STEPS}
 MEMORY = {step: Column(f"{step}_memory_mib", "MiB", f"peak memory of the step {step}", "cost") for step in STEPS}

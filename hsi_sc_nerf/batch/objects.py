@@ -19,14 +19,8 @@ from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.report.page import content_of
 
-OPTIONAL_STEP = "material"
-"""Where it fails, the other steps do without."""
-_NEEDED = {
-    "traits": {"inspect", "process", "train", "export", "traits"},
-    "evaluate": {"inspect", "process", "train", "evaluate"},
-    "report": {"inspect", "process", "train", "evaluate", "export", "traits", "report"},
-}
-"""Where one of these failed, the result of the step that lies there is of an earlier attempt."""
+OPTIONAL_STEPS = ("inspect", "material")
+"""Where one of these fails, the others do without."""
 _AGAIN = "delete it and start the batch again"
 _LEVELS = ("green", "amber", "red")
 _CM2_PER_M2 = 1e4
@@ -78,25 +72,24 @@ def read_object(folder: Path) -> ObjectRow:
         if found.pop(columns.STATUS, None) == "failed":
             wrong.append(_Trouble("failed", step, str(found[columns.SENTENCE])))
         cells |= {column: value for column, value in found.items() if column is not columns.SENTENCE}
-    failed = {one.step for one in wrong if one.status == "failed"}
+    failed = [one.step for one in wrong if one.status == "failed" and one.step not in OPTIONAL_STEPS]
+    # What lies there of later steps is of an earlier attempt.
+    lost = STEPS[STEPS.index(failed[0]) :] if failed else ()
     for total, parts, combined in ((columns.TOTAL, columns.SECONDS, math.fsum), (columns.PEAK, columns.MEMORY, max)):
         known = [value for column in parts.values() if isinstance(value := cells.get(column), float)]
         if known:
             cells[total] = combined(known)  # type: ignore[operator]
 
     checks = folder / "data" / CHECKS_PATH
-    if "inspect" in failed or not checks.is_file():
-        checks = folder / INSPECTION_NAME
-    cells |= tried("inspect", checks, _findings)
-    traits = {} if failed & _NEEDED["traits"] else tried("traits", folder / "traits" / "traits.json", _traits)
-    scores = {} if failed & _NEEDED["evaluate"] else tried("evaluate", folder / "eval.json", _scores)
-    serious = [one for one in wrong if one.status == "damaged" or one.step != OPTIONAL_STEP]
+    cells |= tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)
+    traits = {} if "traits" in lost else tried("traits", folder / "traits" / "traits.json", _traits)
+    scores = {} if "evaluate" in lost else tried("evaluate", folder / "eval.json", _scores)
+    serious = [one for one in wrong if one.status == "damaged" or one.step not in OPTIONAL_STEPS]
     status = serious[0].status if serious else "done" if traits and scores else "unfinished"
     told = (serious or wrong or [_Trouble("", "", "")])[0]
     state: Cells = {columns.STATUS: status, columns.STEP: told.step, columns.SENTENCE: told.sentence}
     report = folder / "report.html"
-    there = report.is_file() and not failed & _NEEDED["report"]
-    return ObjectRow(cells | traits | scores | state, report if there else None)
+    return ObjectRow(cells | traits | scores | state, report if report.is_file() and "report" not in lost else None)
 
 
 def _read(path: Path, step: str, tells: Tells) -> Cells:
@@ -112,12 +105,13 @@ def _read(path: Path, step: str, tells: Tells) -> Cells:
 
 
 def _cost(step: str, content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
-    """Of a step: whether it was done, the sentence of its failure, time and memory."""
+    """Of a step: whether it was done, failed or was skipped after a failure; the sentence; time and memory."""
     yield columns.STATUS, str(content["status"])
     # As an error's text it is one line, of a length that can be read.
     yield columns.SENTENCE, str(InputError(content.get("sentence") or ""))
-    yield columns.SECONDS[step], _number(content.get("seconds"))
-    yield columns.MEMORY[step], _number(content.get("peak_memory_mib"))
+    if content["status"] != "skipped":
+        yield columns.SECONDS[step], _number(content.get("seconds"))
+        yield columns.MEMORY[step], _number(content.get("peak_memory_mib"))
 
 
 def _traits(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:

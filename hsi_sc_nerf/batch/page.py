@@ -16,6 +16,7 @@ from PIL import Image
 
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column
+from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
 from hsi_sc_nerf.batch.tables import OBJECTS_NAME, Table
 from hsi_sc_nerf.files import atomic_write, read_picture
 from hsi_sc_nerf.inspection.inspect import THUMBNAIL_GAMMA
@@ -29,7 +30,7 @@ _SCRIPTS = ("statistics.js", "table.js", "charts.js", "overview.js")
 # Columns of the table at first; the others can be switched on.
 _SHOWN = {columns.FLAGS, columns.TOTAL, columns.SCORES["sam"]}
 _SHOWN |= {columns.SIZE[key][0] for key in ("volume_l", "area_m2", "height_m")}
-_HIDDEN_OF_LIST = {"object", "session", "process", "train", "preset"}
+_HIDDEN_OF_LIST = {OBJECT, SESSION, "process", "train", "preset"}
 # What the page shows in a way of its own, and the trait that its charts begin with.
 _SPECIAL = {
     "status": columns.STATUS,
@@ -133,7 +134,7 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
         }
         for column in table.columns
     ]
-    object_at = next(at for at, column in enumerate(table.columns) if column.name == "object")
+    object_at = next(at for at, column in enumerate(table.columns) if column.name == OBJECT)
     pictures = []
     for number, row in enumerate(table.rows, start=1):
         pictures.append(thumbnail(out / OBJECTS_NAME / str(row[object_at]) / "data"))
@@ -141,7 +142,7 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
             done(number)
     return {
         "columns": described,
-        "rows": list(map(list, zip(*map(table.values, table.columns), strict=True))) if table.rows else [],
+        "rows": list(zip(*map(table.values, table.columns), strict=True)),
         "pictures": pictures,
         "reports": [path and quote(path.relative_to(out).as_posix()) for path in table.reports],
         "places": {"object": object_at} | {name: _place(table, column) for name, column in _SPECIAL.items()},

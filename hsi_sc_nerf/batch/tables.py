@@ -10,12 +10,13 @@ from pathlib import Path
 
 from hsi_sc_nerf.batch.columns import GROUPS, STANDING, Column, Value
 from hsi_sc_nerf.batch.objects import read_object
+from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 
 SESSIONS_NAME, OBJECTS_NAME = "sessions.csv", "objects"
 CSV_NAME, PARQUET_NAME, DICTIONARY_NAME = "traits.csv", "traits.parquet", "traits_dictionary.csv"
-_MEANINGS = {"object": "name of the object, and of its folder", "session": "folder of its captures"}
+_MEANINGS = {OBJECT: "name of the object, and of its folder", SESSION: "folder of its captures"}
 _NUMBER = re.compile(r"[+-]?(0|[1-9]\d{0,14})(\.\d*)?([eE][+-]?\d{1,2})?")
 """Numbers, but not names such as 007 or 12345678901234567890."""
 
@@ -48,7 +49,7 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
 
     Args:
         out: with ``sessions.csv`` and ``objects/``.
-        done: called with the number of objects read, of those that `read_sessions` gives.
+        done: called with the number of objects read, of `listed_sessions`.
 
     Raises:
         InputError: the list of sessions cannot be read. What is wrong with an object stands in its row.
@@ -58,48 +59,35 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
         >>> [column.name for column in table.columns[:2]]
         ['object', 'session']
     """
-    header, lines = read_sessions(out / SESSIONS_NAME)
-    found = []
-    for number, line in enumerate(lines, start=1):
-        found.append(read_object(out / OBJECTS_NAME / line[header.index("object")]))
+    sessions = listed_sessions(out)
+    header, found = [*sessions[0]], []
+    for number, session in enumerate(sessions, start=1):
+        found.append(read_object(out / OBJECTS_NAME / session[OBJECT]))
         if done is not None:
             done(number)
     names = named_apart(header, {column for row in found for column in row.cells})
     given = []
-    for name, values in zip(header, zip(*lines, strict=True) if lines else [()] * len(header), strict=True):
-        meaning = _MEANINGS.get(name, "column of the list of sessions")
+    for name in header:
+        meaning, values = _MEANINGS.get(name, "column of the list of sessions"), [one[name] for one in sessions]
         numbers = name not in _MEANINGS and any(values) and all(not v or _NUMBER.fullmatch(v) for v in values)
         given.append(Column(name, "", meaning, "list", "number" if numbers else "text"))
     rows = [
-        [*line, *(row.cells.get(column) for column in names)] for line, row in zip(lines, found, strict=True)
+        [*session.values(), *(row.cells.get(column) for column in names)]
+        for session, row in zip(sessions, found, strict=True)
     ]
     return Table((*given, *names.values()), rows, [row.report for row in found])
 
 
-def read_sessions(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of a list of sessions.
+def listed_sessions(out: Path) -> list[Row]:
+    """The objects of the batch in ``out``, whose sessions may have been moved since.
 
     Raises:
-        InputError: there is none, a line has too few or too many values, or an object's name is used twice or is no
-            name of a folder.
+        InputError: there is no batch, or its list of sessions cannot be read.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header, *lines = [line for line in csv.reader(file) if line] or [[]]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); make it by `hsi-sc-nerf batch`.") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is no CSV table in UTF-8 ({error}); save it as one.") from error
-    if "object" not in header or len(set(header)) < len(header):
-        raise InputError(f"{path}: needs a first line with different names, one of them `object`; correct it.")
-    seen: set[str] = set()
-    for line in lines:
-        name = line[header.index("object")] if len(line) == len(header) else ""
-        if name in ("", ".", "..", *seen) or re.search(r"[/\\\0]", name):
-            why = "needs a value for each column" if not name else f"names the object {name!r}, which is taken or no name"
-            raise InputError(f"{path}: the line {','.join(line)[:80]!r} {why}; correct it.")
-        seen.add(name)
-    return header, lines
+    path = out / SESSIONS_NAME
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give the --output-dir of `hsi-sc-nerf batch`.")
+    return read_sessions(path, may_be_gone=True)
 
 
 def named_apart(taken: Iterable[str], found: Iterable[Column]) -> dict[Column, Column]:

@@ -30,11 +30,11 @@ class CollectCommand:
             InputError: there is no batch, or the results cannot be written.
         """
         from hsi_sc_nerf.batch.page import write_overview
-        from hsi_sc_nerf.batch.tables import CSV_NAME, SESSIONS_NAME, read_sessions, read_table, write_tables
+        from hsi_sc_nerf.batch.tables import CSV_NAME, listed_sessions, read_table, write_tables
         from hsi_sc_nerf.terminal import progress_bar
 
         out = self.output_dir
-        count = len(read_sessions(out / SESSIONS_NAME)[1])
+        count = len(listed_sessions(out))
         require_writable(out)
         with progress_bar("reading", "objects", count) as done:
             table = read_table(out, done)

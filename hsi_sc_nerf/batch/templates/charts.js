@@ -13,13 +13,13 @@ function drawn(tag, attributes, ...content) {
 }
 
 /** A scale from numbers to pixels that leaves room at both ends, and round numbers on it. */
-function scaled(values, from, to, wanted = 5) {
+function scaled(values, from, to, wanted = 6) {
   let low = Infinity, high = -Infinity;
   for (const value of values) [low, high] = [Math.min(low, value), Math.max(high, value)];
   const half = low === high ? Math.abs(low) * 0.05 || 0.5 : (high - low) * 0.04;
   [low, high] = [low - half, high + half];
   const rough = (high - low) / wanted, power = 10 ** Math.floor(Math.log10(rough));
-  const step = power * [1, 2, 5, 10].find((factor) => factor * power >= rough * 0.999);
+  const step = power * [1, 2, 2.5, 5, 10].find((factor) => factor * power >= rough * 0.999);
   const ticks = [];
   for (let tick = Math.ceil(low / step); tick * step <= high; tick++) ticks.push(Number((tick * step).toPrecision(12)));
   return { at: (value) => from + ((value - low) / (high - low)) * (to - from), ticks };
