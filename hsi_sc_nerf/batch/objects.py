@@ -78,7 +78,7 @@ def read_object(folder: Path) -> ObjectRow:
     for total, parts, combined in ((columns.TOTAL, columns.SECONDS, math.fsum), (columns.PEAK, columns.MEMORY, max)):
         known = [value for column in parts.values() if isinstance(value := cells.get(column), float)]
         if known:
-            cells[total] = combined(known)  # type: ignore[operator]
+            cells[total] = combined(known)
 
     checks = folder / "data" / CHECKS_PATH
     cells |= tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)

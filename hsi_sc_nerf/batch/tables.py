@@ -41,7 +41,7 @@ class Table:
         values = [row[at] for row in self.rows]
         if column.kind != "number":
             return values
-        return [float(value) if value not in ("", None) else None for value in values]
+        return [None if value is None or value == "" else float(value) for value in values]
 
 
 def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
