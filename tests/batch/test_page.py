@@ -5,7 +5,6 @@ import csv
 import io
 import json
 import re
-from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlparse
 from urllib.request import url2pathname
@@ -13,7 +12,7 @@ from urllib.request import url2pathname
 import numpy as np
 import pytest
 from batch_folder import traits_of, write_object, write_season, write_sessions
-from headless_browser import launch, needs_browser
+from headless_browser import launch, needs_browser, quiet_page
 from PIL import Image
 
 from hsi_sc_nerf.batch.page import thumbnail, write_overview
@@ -82,22 +81,6 @@ def browser():
         browser.close()
 
 
-@contextmanager
-def opened(browser, out, **window):
-    """The page in a window of its own; it must say nothing on the console and fetch nothing."""
-    page = browser.new_page(reduced_motion="reduce", **window)
-    page.set_default_timeout(120_000)
-    messages, requests = [], []
-    page.on("console", lambda message: messages.append(message.text))
-    page.on("pageerror", lambda error: messages.append(str(error)))
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto((out / "index.html").as_uri())
-    yield page
-    assert messages == []
-    assert [url for url in requests if not url.startswith("data:")] == [(out / "index.html").as_uri()]
-    page.close()
-
-
 def names(page):
     return page.locator("tbody th").all_inner_texts()
 
@@ -129,7 +112,7 @@ def odd_ones(rows, trait, group=None):
 @pytest.mark.slow
 @needs_browser
 def test_sorting_by_mouse_and_keyboard_with_missing_values_last(browser, season):
-    with opened(browser, season, viewport={"width": 1300, "height": 900}) as page:
+    with quiet_page(browser, season / "index.html", viewport={"width": 1300, "height": 900}) as page:
         listed = [row["object"] for row in rows_of(season)]
         assert names(page) == listed
         volumes = {row["object"]: float(row["volume_ml"] or "nan") for row in rows_of(season)}
@@ -147,7 +130,7 @@ def test_sorting_by_mouse_and_keyboard_with_missing_values_last(browser, season)
 @pytest.mark.slow
 @needs_browser
 def test_search_and_choices_leave_rows_and_points_out(browser, season):
-    with opened(browser, season, viewport={"width": 1300, "height": 900}) as page:
+    with quiet_page(browser, season / "index.html", viewport={"width": 1300, "height": 900}) as page:
         page.fill("input[name=words]", "PEAR_05 focus")
         assert names(page) == [f"pear_05{i}" for i in range(10)]
         assert page.locator("[name=count]").inner_text() == f"10 of {COUNT} shown"
@@ -167,7 +150,7 @@ def test_search_and_choices_leave_rows_and_points_out(browser, season):
 @pytest.mark.slow
 @needs_browser
 def test_groups_have_strips_medians_and_outliers_of_their_own(browser, season):
-    with opened(browser, season, viewport={"width": 1300, "height": 900}) as page:
+    with quiet_page(browser, season / "index.html", viewport={"width": 1300, "height": 900}) as page:
         rows = rows_of(season)
         for group in (None, "genotype", "day"):
             page.select_option("select[name=group]", label=group or "all objects")
@@ -188,7 +171,7 @@ def test_groups_have_strips_medians_and_outliers_of_their_own(browser, season):
 @pytest.mark.slow
 @needs_browser
 def test_points_of_the_scatter_lie_where_their_traits_are(browser, season):
-    with opened(browser, season, viewport={"width": 1300, "height": 900}) as page:
+    with quiet_page(browser, season / "index.html", viewport={"width": 1300, "height": 900}) as page:
         page.select_option("select[name=x]", label="volume, mL")
         page.select_option("select[name=up]", label="ndvi")
         page.select_option("select[name=group]", label="genotype")
@@ -231,7 +214,7 @@ def test_hostile_names_are_shown_and_do_nothing(browser, tmp_path):
     write_object(tmp_path / "objects" / "ä", traits_of(regions=(HOSTILE,)))
     write_object(tmp_path / "objects" / "b", failed="train", sentence=HOSTILE)
     CollectCommand(tmp_path).main()
-    with opened(browser, tmp_path) as page:
+    with quiet_page(browser, tmp_path / "index.html") as page:
         page.select_option("select[name=group]", label=HOSTILE)
         assert names(page) == ["ä", "b"]
         assert HOSTILE in column(page, "status")[1]
@@ -248,7 +231,7 @@ def test_hostile_names_are_shown_and_do_nothing(browser, tmp_path):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_scrolls_the_table_and_not_the_page(browser, season, scheme):
     window = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "color_scheme": scheme}
-    with opened(browser, season, **window) as page:
+    with quiet_page(browser, season / "index.html", **window) as page:
         assert page.evaluate("document.documentElement.scrollWidth") == 390
         page.locator(".scrolled").evaluate("one => one.scrollTo(600, 400)")
         box = page.locator("tbody th").nth(8).bounding_box()
@@ -265,7 +248,7 @@ def test_one_and_a_thousand_objects_can_be_looked_at(browser, tmp_path, count):
         write_object(tmp_path / "objects" / f"a{number}")
     CollectCommand(tmp_path).main()
     assert (tmp_path / "index.html").stat().st_size < 1_000_000
-    with opened(browser, tmp_path) as page:
+    with quiet_page(browser, tmp_path / "index.html") as page:
         assert page.locator("tbody tr").count() == count
         page.select_option("select[name=group]", label="genotype")
         page.click("thead button:text('status')")
