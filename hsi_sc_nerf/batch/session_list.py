@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError, shown
 
 OBJECT, SESSION = "object", "session"
@@ -36,6 +35,9 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
         'pear_01'
     """
     if path.is_dir():
+        # Deferred because it takes a second to import: each step of each object would wait for it.
+        from hsi_sc_nerf.capture.session import is_session
+
         folders = sorted(one for one in path.iterdir() if one.is_dir() and is_session(one))
         if not folders:
             raise InputError(f"{path}: holds no sessions; give the folder that the folders of the sessions lie in.")
