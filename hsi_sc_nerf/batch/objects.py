@@ -109,9 +109,9 @@ def _cost(step: str, content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
     yield columns.STATUS, str(content["status"])
     # As an error's text it is one line, of a length that can be read.
     yield columns.SENTENCE, str(InputError(content.get("sentence") or ""))
-    if content["status"] != "skipped":
-        yield columns.SECONDS[step], _number(content.get("seconds"))
-        yield columns.MEMORY[step], _number(content.get("peak_memory_mib"))
+    # Nothing was run, and 0 recorded, where a step was skipped or up to date.
+    yield columns.SECONDS[step], _number(content.get("seconds")) or None
+    yield columns.MEMORY[step], _number(content.get("peak_memory_mib")) or None
 
 
 def _traits(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:

@@ -134,7 +134,8 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
         }
         for column in table.columns
     ]
-    object_at = next(at for at, column in enumerate(table.columns) if column.name == OBJECT)
+    names = [column.name for column in table.columns]
+    object_at = names.index(OBJECT)
     pictures = []
     for number, row in enumerate(table.rows, start=1):
         pictures.append(thumbnail(out / OBJECTS_NAME / str(row[object_at]) / "data"))
@@ -145,7 +146,8 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
         "rows": list(zip(*map(table.values, table.columns), strict=True)),
         "pictures": pictures,
         "reports": [path and quote(path.relative_to(out).as_posix()) for path in table.reports],
-        "places": {"object": object_at} | {name: _place(table, column) for name, column in _SPECIAL.items()},
+        "places": {"object": object_at, "session": names.index(SESSION)}
+        | {name: _place(table, column) for name, column in _SPECIAL.items()},
     }
 
 

@@ -14,7 +14,7 @@ const traits = [...data.columns.keys()].filter((at) => {
   const isSpread = data.columns.some((one) => one.spread === at);
   return column.kind === "number" && !isSpread && data.rows.some((row) => row[at] !== null);
 });
-const groupings = [...data.columns.keys()].filter((at) => at !== data.places.object
+const groupings = [...data.columns.keys()].filter((at) => ![data.places.object, data.places.session].includes(at)
   && (data.columns[at].group === "list" || at === data.places.status || at === data.places.quality));
 
 /** Fill a choice with columns. */
