@@ -33,6 +33,7 @@ COMMANDS = {
     "compare": Command("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
     "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
     "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
+    "collect": Command("collect", "CollectCommand", "Write one table and one page of all objects of a batch."),
     "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
 }
 """The commands, in the order in which the help lists them."""
