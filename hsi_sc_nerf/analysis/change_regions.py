@@ -80,8 +80,9 @@ def changed_regions(
         The region of each vertex or `OUTSIDE`, and the regions, the largest first.
     """
     known = np.isfinite(change).all(axis=1) & (patches.of_vertex >= 0)
-    found: list[tuple[ChangedRegion, Int[np.ndarray, "inside"]]] = []
-    for group in _touching(patches, patches.means(change, areas_m2), significant):
+
+    def outlined(group: Int[np.ndarray, "group"]) -> tuple[Int[np.ndarray, "inside"], float]:
+        """Vertices of the region around a group of patches, and the standard deviation of its area."""
         core = known & np.isin(patches.of_vertex, group)
         mean = areas_m2[core] @ change[core]
         direction = mean / max(float(np.linalg.norm(mean)), 1e-30)
@@ -93,15 +94,28 @@ def changed_regions(
         half = np.percentile(along[core], _PLATEAU_PERCENT) / 2.0
         blur = float(np.linalg.norm(noise * direction))
         inside, less, more = (_connected(mesh, along > level, core) for level in (half, half + blur, half - blur))
+        return inside, float(areas_m2[more].sum() - areas_m2[less].sum()) / 2.0
+
+    labels, found = np.full(len(known), OUTSIDE), []
+    groups = _touching(patches, patches.means(change, areas_m2), significant)
+    while groups:
+        # Groups whose regions overlap are one.
+        group = groups.pop(0)
+        inside, sd_m2 = outlined(group)
+        others = set(labels[inside].tolist()) - {OUTSIDE}
+        if others:
+            groups.insert(0, np.concatenate([group, *(found[other][0] for other in others)]))
+            for other in others:
+                labels[labels == other] = OUTSIDE
+            continue
+        labels[inside] = len(found)
         area_m2 = float(areas_m2[inside].sum())
-        if area_m2 >= smallest_m2:
-            sd_m2 = float(areas_m2[more].sum() - areas_m2[less].sum()) / 2.0
-            found.append((ChangedRegion(area_m2, sd_m2, _centre(mesh, areas_m2, inside)), inside))
-    found.sort(key=lambda one: -one[0].area_m2)
-    labels = np.full(len(known), OUTSIDE)
-    for number in reversed(range(len(found))):
-        labels[found[number][1]] = number
-    return labels, [region for region, _ in found]
+        found.append((group, ChangedRegion(area_m2, sd_m2, _centre(mesh, areas_m2, inside))))
+    kept = np.unique(labels[labels != OUTSIDE])
+    kept = sorted((n for n in kept if found[n][1].area_m2 >= smallest_m2), key=lambda n: -found[n][1].area_m2)
+    order = np.full(len(found) + 1, OUTSIDE)
+    order[kept] = np.arange(len(kept))
+    return order[labels], [found[number][1] for number in kept]
 
 
 def grown_regions(
