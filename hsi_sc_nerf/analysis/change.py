@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -61,7 +62,7 @@ def compare_days(
     first, earlier = days[0], None
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
     at_first = None if library is None else classified(first.surface, library, angle_rad, smallest_m2)
-    for before, after in zip(days, days[1:], strict=False):
+    for before, after in pairwise(days):
         quantities = changes(first, after, bands_nm, session_sd, smallest_m2)
         grown = {}
         for name, quantity in quantities.items():

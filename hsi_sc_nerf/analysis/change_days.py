@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_features import surface_samples
@@ -21,6 +21,8 @@ SAME_BAND_NM = 1.0
 """Bands of two days that are further apart are others."""
 SEEN_WITHIN = 2.0
 """Smoothing radii from a vertex within which a day's cloud must have points: surfaces move."""
+_ONE_SIDED = 0.6
+"""Distance of the nearest points' mean over that of the furthest of them: 0.42 at a straight edge."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,9 @@ def days_on_one_mesh(
         spectra = [cloud.spectra for cloud in clouds]
     known = [np.isfinite(one).all(axis=1) for one in spectra if one is not None]
     clouds = [cloud.select(rows) for cloud, rows in zip(clouds, known, strict=True)]
-    samples = surface_samples(clouds, [one[rows] for one, rows in zip(spectra, known, strict=True) if one is not None])
+    samples = surface_samples(
+        clouds, [one[rows] for one, rows in zip(spectra, known, strict=True) if one is not None]
+    )
 
     mesh = closed_mesh(clouds[0].points, clouds[0].normals, config)
     normals, days = mesh.vertex_normals(), []
@@ -85,7 +89,24 @@ def days_on_one_mesh(
                 raise InputError(f"{name} beside {names[0]}: {error}") from error
             moved = replace(cloud, points=attitude.transform(cloud.points))
         surface = with_spectra(mesh, moved, SEEN_WITHIN * config.smoothing_radius_m, max_incidence_deg)
-        near = cKDTree(moved.points).query(mesh.vertices, k=min(NEIGHBOURS, len(moved)))[1]
-        raised_m = np.einsum("vkj,vj->v", moved.points[near] - mesh.vertices[:, None], normals) / near.shape[1]
-        days.append(Day(name, surface, np.where(surface.seen, raised_m, np.nan), attitude))
+        raised_m, beyond_edge = _raised_m(moved.points, mesh.vertices, normals, config.smoothing_radius_m)
+        seen = surface.seen & ~beyond_edge
+        days.append(Day(name, replace(surface, seen=seen), np.where(seen, raised_m, np.nan), attitude))
     return days
+
+
+def _raised_m(
+    points: Float[np.ndarray, "n 3"],
+    vertices_m: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    detail_m: float,
+) -> tuple[Float[np.ndarray, "v"], Bool[np.ndarray, "v"]]:
+    """Height of the points near each vertex above it, and whether it lies beyond their edge.
+
+    Beyond the edge, the nearest points all lie on one side, and their spectra say nothing of the vertex.
+    """
+    distance_m, near = cKDTree(points).query(vertices_m, k=min(NEIGHBOURS, len(points)))
+    offset = points[near].mean(axis=1) - vertices_m
+    raised_m = np.einsum("vj,vj->v", offset, normals)
+    aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
+    return raised_m, (aside_m > _ONE_SIDED * distance_m[:, -1]) & (aside_m > detail_m / 2.0)

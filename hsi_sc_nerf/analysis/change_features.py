@@ -68,7 +68,9 @@ def surface_samples(
     return samples
 
 
-def surface_gradients(points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n f"]) -> Float[np.ndarray, "n f 3"]:
+def surface_gradients(
+    points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n f"]
+) -> Float[np.ndarray, "n f 3"]:
     """Gradient of each value along the surface, by least squares over the nearest points."""
     near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1]
     # Across the surface, neighbours hardly differ: small singular values are left out.

@@ -101,19 +101,20 @@ def changes(
         shared: Float[np.ndarray, "k"],
         shown: Float[np.ndarray, "v"] | None = None,
     ) -> Quantity:
-        first, last = (np.where(seen[:, None], one, np.nan) for one in values)
+        first, last = (np.where(seen[:, None], each, np.nan) for each in values)
         of_patches = patches.means(last - first, one.areas_m2)
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
         test = significance(of_patches, patches.centres_m, noise, off, shared)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
+        beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
-            one_mesh, one.areas_m2, patches, last - first - test.whole, test.p < FALSE_DISCOVERIES, test.noise, smallest_m2
+            one.mesh, one.areas_m2, patches, beyond, significant, test.noise, smallest_m2
         )
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
         return Quantity(name, unit, change, p, test, region, regions)
 
-    one_mesh, found = one.mesh, {}
+    found = {}
     if len(one.wavelengths_nm) > 1:
         units = [unit_spectra(surface.spectra) for surface in (one, other)]
         axes = _axes((units[1] - units[0])[seen])
@@ -145,7 +146,7 @@ def _scalars(
 
 def _axes(change: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "k bands"]:
     """Principal components of the changes of spectra."""
-    values, vectors = np.linalg.eigh(np.cov(change, rowvar=False))
+    vectors = np.linalg.eigh(np.cov(change, rowvar=False))[1]
     return vectors[:, ::-1][:, : min(COMPONENTS, change.shape[1] - 1)].T
 
 

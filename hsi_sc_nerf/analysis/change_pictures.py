@@ -32,17 +32,14 @@ def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, vie
     """A quantity on the four sides: before, after, its change, and the p-values; grey is not seen on both days."""
     colours, low, high, name = _scale(quantity)
     p = -np.log10(np.clip(quantity.p, _SMALLEST_P, 1.0))
-    known = np.isfinite(quantity.change)
+    lit = colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3]
+    lit[~quantity.changed] *= 0.6
     rows = {
         "before": views.on_white(_natural(first, first)),
         "after": views.on_white(_natural(one.after, first)),
         f"{quantity.name}\nchange ({quantity.unit})": views.on_white(colours(quantity.change)),
         "p-value, -log10\noutlined areas lit": views.on_white(
-            np.where(
-                known[:, None],
-                colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3] * np.where(quantity.changed, 1.0, 0.6)[:, None],
-                GREY,
-            )
+            np.where(np.isfinite(quantity.change)[:, None], lit, GREY)
         ),
     }
     draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
@@ -50,7 +47,7 @@ def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, vie
 
 @rc_context(STYLE)
 def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views: SideViews, shown: str) -> None:
-    """The days one after the other on one mesh, faded into each other: pseudo-RGB above, change since the first below.
+    """The days one after the other on one mesh, faded into each other: pseudo-RGB, and change since the first.
 
     Args:
         path: of the film, MP4.
@@ -65,7 +62,9 @@ def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views:
     stills = [_frame(first.name, first, first, colours(still), views, shown)]
     for one in comparisons:
         changed = one.quantities[shown]
-        lit = np.where(changed.p < FALSE_DISCOVERIES, changed.change, np.where(np.isfinite(changed.change), 0.0, np.nan))
+        lit = np.where(
+            changed.p < FALSE_DISCOVERIES, changed.change, np.where(np.isfinite(changed.change), 0.0, np.nan)
+        )
         stills.append(_frame(one.after.name, one.after, first, colours(lit), views, shown))
     with atomic_write(path) as (temporary,), open_video(temporary, _FRAMES_PER_SECOND) as add_frame:
         for before, after in pairwise([*stills, stills[-1]]):
@@ -82,7 +81,10 @@ def _frame(
     figure.suptitle(name)
     grid = figure.subplots(2, len(SIDES_DEG))
     for line, label, pictures in zip(
-        grid, ("pseudo-RGB", f"{shown}\nsince {first.name}"), map(views.on_white, (_natural(day, first), change)), strict=True
+        grid,
+        ("pseudo-RGB", f"{shown}\nsince {first.name}"),
+        map(views.on_white, (_natural(day, first), change)),
+        strict=True,
     ):
         for axes, picture in zip(line, pictures, strict=True):
             show_image(axes, picture)

@@ -62,10 +62,11 @@ def changed_regions(
 ) -> tuple[Int[np.ndarray, "v"], list[ChangedRegion]]:
     """Outline the areas around significant patches, finer than patches are.
 
-    Significant patches of one sign with gaps of at most one patch are one region. Its change is projected onto the
-    direction of its mean, and its edge is where half of its plateau (the 90th percentile) is reached: there, a blurred
-    edge stays in place. What reaches that level beside the significant patches and is connected to them belongs to it.
-    The edge's levels of one standard deviation of the noise more and less give the standard deviation of the area.
+    Significant patches of one sign with gaps of at most one patch are one region, and so are those whose regions
+    overlap. A region's change is projected onto the direction of its mean, and its edge is where half of its plateau
+    (the 90th percentile) is reached: there, a blurred edge stays in place. What reaches that level beside the
+    significant patches and is connected to them belongs to it. The edges at one standard deviation of the noise more
+    and less give the standard deviation of the area.
 
     Args:
         mesh: the surface.

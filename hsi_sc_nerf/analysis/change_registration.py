@@ -33,7 +33,7 @@ LEAST_OVERLAP = 0.5
 FINE_ATTITUDES = 4
 """The best of the coarse ones, which are fitted again to the fine sample."""
 COARSE_ROUNDS, FINE_ROUNDS = 25, 30
-CONVERGED = 1e-6
+CONVERGED = 1e-5
 TUKEY = 4.685
 _OFF_EDGE = 1.5
 """Pairs further apart along the surface than this, in spacings, lie beyond the reference's edge."""
@@ -103,15 +103,15 @@ def find_attitude(
         )
     if not SCALE_RANGE[0] < best.growth < SCALE_RANGE[1]:
         raise InputError(
-            f"the second object fits the first only {best.growth:.2f} times as large (allowed are {SCALE_RANGE[0]} to "
-            f"{SCALE_RANGE[1]}); give clouds of one object, in metres."
+            f"the second object fits the first only {best.growth:.2f} times as large (allowed are "
+            f"{SCALE_RANGE[0]} to {SCALE_RANGE[1]}); give clouds of one object, in metres."
         )
     # Written so that NaN, of one attitude only, passes.
     if best.rival_p > AMBIGUOUS_P:
         raise InputError(
             f"two attitudes {best.rival_turn_deg:.0f} degrees apart fit equally well (the worse one would do so by "
-            f"chance with p = {best.rival_p:.2g}, and p below {AMBIGUOUS_P:g} would tell them apart); mark the object "
-            "with a spot before the first day."
+            f"chance with p = {best.rival_p:.2g}, and p below {AMBIGUOUS_P:g} would tell them apart); mark the "
+            "object with a spot before the first day."
         )
     return best
 
@@ -127,7 +127,7 @@ class _Target:
     def residuals(
         self, points: Float[np.ndarray, "n 3"], features: Float[np.ndarray, "n f"]
     ) -> tuple[Float[np.ndarray, "n 1+f"], Float[np.ndarray, "n 1+f 3"], Bool[np.ndarray, "n"]]:
-        """Distance to the tangent plane and differences of features, their gradients, and which points have a pair."""
+        """Distance off the tangent plane and differences of features, their gradients, and which points have a pair."""
         _, at = self.tree.query(points)
         offset, normals = points - self.sample.points[at], self.sample.normals[at]
         off = np.einsum("ij,ij->i", offset, normals)
@@ -209,7 +209,9 @@ def _attitude(moving: SurfaceSample, target: _Target, ranked: Sequence[Similarit
     block = _blocks(moving.points)
     of_blocks = np.stack([np.bincount(block, column) for column in gradients.T], axis=1)
     inverse = np.linalg.inv(matrix)
-    variance = np.diag(inverse @ (of_blocks.T @ of_blocks) @ inverse) * len(of_blocks) / max(len(of_blocks) - _PARAMETERS, 1)
+    variance = (
+        np.diag(inverse @ (of_blocks.T @ of_blocks) @ inverse) * len(of_blocks) / max(len(of_blocks) - _PARAMETERS, 1)
+    )
     scales = _scales(moving, target, best)
     _, _, paired = target.residuals(best(moving.points), moving.features)
     rival_turn_deg, rival_p = np.nan, np.nan

@@ -1,4 +1,4 @@
-"""What changed over days, as change.json, as a table with a row for each region and pair of days, as a page, as PLY."""
+"""What changed over days as change.json, as a table with a row a region and pair of days, as a page, as PLY."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PAGE_REGIONS = 12
 
 def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """The rows of change.csv: of each quantity the whole surface and its regions, areas grown since the day before,
-    and regions of classes. Absent numbers are None."""
+    and regions of classes that changed. Absent numbers are None."""
     rows: list[dict[str, Any]] = []
     for one in comparisons:
         areas_m2 = one.after.surface.areas_m2
@@ -51,12 +51,15 @@ def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
                     "area_change_sd_cm2": _CM2_PER_M2 * region.area_sd_m2
                 }
                 rows.append(head | {"kind": "change"} | told)
-        for kind, before, groups in (("grown", one.earlier, one.grown), ("class", one.before, one.classes)):
+        # Beside the first day, the regions themselves are what grew.
+        grown = one.grown if one.earlier != one.before else {}
+        for kind, before, groups in (("grown", one.earlier, grown), ("class", one.before, one.classes)):
             rows += [
                 {"before": before, "after": one.after.name, "kind": kind, "name": name, "region": str(number + 1)}
                 | _areas(region.before_m2, region.after_m2, region.centre_m)
                 for name, regions in groups.items()
                 for number, region in enumerate(regions)
+                if region.before_m2 != region.after_m2
             ]
     return [dict.fromkeys(COLUMNS) | row for row in rows]
 
@@ -76,7 +79,10 @@ def write_tables(
         InputError: a file cannot be written.
     """
     rows = change_rows(comparisons)
-    with atomic_write(folder / "change.csv") as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
+    with (
+        atomic_write(folder / "change.csv") as (temporary,),
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         writer.writerows([_cell(row[column]) for column in COLUMNS] for row in rows)
@@ -121,7 +127,8 @@ def _content(
 def _set_down(comparisons: Sequence[Comparison]) -> list[str]:
     rows = []
     for one in comparisons:
-        assert (found := one.after.attitude) is not None
+        found = one.after.attitude
+        assert found is not None
         rows.append(
             [
                 *(one.after.name, f"{found.turn_deg:.2f} ± {found.turn_sd_deg:.2f}", f"{found.tip_deg:.1f}"),

@@ -150,21 +150,19 @@ def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
     kept = within > 0.0
     off, within = off[kept], within[kept]
     weight = np.sum(within * (5.0 * within - 4.0))
-    variance = len(values) * np.sum(np.square(off) * within**4) / max(weight, 1e-12) ** 2
+    variance = len(off) * np.sum(np.square(off) * within**4) / max(weight, 1e-12) ** 2
     return float(max(np.sqrt(variance), 1e-9))
 
 
 def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
-    """Length over which changes of patches, in standard deviations, are alike, and how many independent ones they hold.
+    """Length over which changes of patches, in standard deviations, are alike, and how many are independent.
 
     The mean product of pairs over their distance falls to 1 / e at that length. For errors that decay exponentially
     the variance of a mean over n patches is that of ``n² / sum exp(-distance / length)`` independent ones.
     """
     if len(ratio) > _MOST_PATCHES:
         chosen = np.random.default_rng(0).choice(len(ratio), _MOST_PATCHES, replace=False)
-        length_m, independent = correlation(ratio[chosen], centres_m[chosen])
-        # Drawing hardly changes the number of independent parts where they are fewer than the patches drawn.
-        return length_m, independent
+        ratio, centres_m = ratio[chosen], centres_m[chosen]
     clipped = np.clip(ratio, -_CLIPPED, _CLIPPED)
     clipped = clipped - clipped.mean(axis=0)
     distance_m = cdist(centres_m, centres_m)
@@ -182,9 +180,7 @@ def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n
     return length_m, float(len(ratio) ** 2 / np.exp(-distance_m / max(length_m, 1e-9)).sum())
 
 
-def _hotelling_p(
-    squares: Float[np.ndarray, "*n"], dimensions: int, observations: float
-) -> Float[np.ndarray, "*n"]:
+def _hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:
     """Chance of a larger T² of so many numbers whose variances come from so many observations (Hotelling 1931)."""
     free = observations - 1.0
     last = free - dimensions + 1.0

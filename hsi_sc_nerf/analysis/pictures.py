@@ -100,7 +100,7 @@ def draw_indices(path: Path, surface: SpectralMesh, views: SideViews) -> None:
 def draw_rows(
     path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float, str] | None] = ()
 ) -> None:
-    """Pictures of the four sides in labelled rows; ``scales`` are ends and colour map of the first rows' colour bars."""
+    """Pictures of the four sides in labelled rows; ``scales`` are ends and colours of the first rows' bars."""
     first = next(iter(rows.values()))[0]
     width_in = 1.75
     row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)

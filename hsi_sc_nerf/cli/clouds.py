@@ -279,7 +279,9 @@ class ChangeCommand:
         comparisons = list(steps)
 
         views, pictures = SideViews(days[0].surface.mesh), {}
-        each = [(day, one, quantity) for day, one in enumerate(comparisons, 1) for quantity in one.quantities.values()]
+        each = [
+            (day, one, quantity) for day, one in enumerate(comparisons, 1) for quantity in one.quantities.values()
+        ]
         for day, one, quantity in track(each, "Drawing", console=console, transient=True):
             file = f"{quantity.name.lower().replace(' ', '_')}_{day}.png"
             change_pictures.draw_change(self.output_dir / file, days[0], one, quantity, views)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -65,7 +66,9 @@ class CloudErrors:
     session: float = 0.005
 
 
-def fruit_of(day: SetDown, wavelengths_nm: Float[np.ndarray, "bands"], kind: str = "apple", seed: int = 3) -> TrueSurface:
+def fruit_of(
+    day: SetDown, wavelengths_nm: Float[np.ndarray, "bands"], kind: Literal["apple", "pear"] = "apple", seed: int = 3
+) -> TrueSurface:
     """The true surface of an apple or a pear on that day, as it grew, not turned."""
     rng = np.random.default_rng(seed)
     fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
