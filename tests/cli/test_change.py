@@ -69,9 +69,9 @@ def test_a_second_capture_of_the_same_day_shows_no_change(written):
 @pytest.mark.slow
 def test_the_bruise_grew_by_its_area_and_the_fruit_dried(written):
     (bruise, *_) = rows_of(written, after="3 friday", kind="class", name="bruise")
-    assert float(bruise["area_change_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.1)
+    assert float(bruise["area_change_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.2)
     (darker, *_) = (row for row in rows_of(written, after="3 friday", name="brightness") if row["region"] == "1")
-    assert float(darker["area_after_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.2)
+    assert float(darker["area_after_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.1)
     assert float(darker["change"]) < -0.3
     (water,) = rows_of(written, after="3 friday", name="water index", region="whole surface")
     assert float(water["p"]) < 1e-4
