@@ -1,9 +1,9 @@
-"""How well `hsi-sc-nerf change` finds turns, growing bruises and drying, and nothing where nothing changed, as a table.
+"""How well `hsi-sc-nerf change` finds turns, bruises that grow and drying, and no change where none is, as a table.
 
     uv run python benchmarks/change_over_time.py
 
-The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface with
-the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
+The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface
+with the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
 """
 
 from __future__ import annotations

@@ -107,6 +107,8 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
+        "analysis.change_regions.grown_regions",
+        "analysis.change_significance.significance",
         "evaluation.spatial.precision_recall_f_score",
         "export.cloud.comment_lines",
         "export.formats.write_cloud",

@@ -127,7 +127,7 @@ class _Target:
     def residuals(
         self, points: Float[np.ndarray, "n 3"], features: Float[np.ndarray, "n f"]
     ) -> tuple[Float[np.ndarray, "n 1+f"], Float[np.ndarray, "n 1+f 3"], Bool[np.ndarray, "n"]]:
-        """Distance off the tangent plane and differences of features, their gradients, and which points are paired."""
+        """Distance off the tangent plane and differences of features, their gradients, and which points have one."""
         _, at = self.tree.query(points)
         offset, normals = points - self.sample.points[at], self.sample.normals[at]
         off = np.einsum("ij,ij->i", offset, normals)
