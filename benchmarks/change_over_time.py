@@ -1,20 +1,25 @@
 """How well `hsi-sc-nerf change` finds turns, bruises that grow and drying, and no change where none is, as a table.
 
     uv run python benchmarks/change_over_time.py
+    uv run python benchmarks/change_over_time.py --trained FOLDER
 
 The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface
-with the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
+with the errors of a run, of which those that are smooth over centimetres count; other ones on each day. With
+``--trained``, small sessions are simulated instead, processed, trained for 800 steps each and exported.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 import tyro
 from results_table import RESULTS, write_results
 from rich.progress import track
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change import Comparison, compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
@@ -23,13 +28,19 @@ from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
 from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.benchmark.steps import run_step
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.paper import CLASSIFICATION_ANGLE_RAD
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of
+from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, dried_materials, fruit_of, set_down
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
+from hsi_sc_nerf.simulate.render import Part
+from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.true_surface import TrueSurface
+from hsi_sc_nerf.simulate.truth import write_mesh
 from hsi_sc_nerf.spectra import INDICES, index_values
 
 NM = np.linspace(400.0, 1000.0, 25)
@@ -45,17 +56,19 @@ COLUMNS = (
     *("fruit", "day", "turn, °", "turn found, °", "size", "size found", "bruise grew, cm²", "by brightness, cm²"),
     *("by class, cm²", "water index changed", "found", "false change, cm²"),
 )
+FIRST = SetDown(AGAIN)
+NEAR_M = 0.004
+"""As far from what changed a pixel or a patch may call a change."""
+Row: TypeAlias = tuple[str, SetDown, CloudErrors]
+"""Name, day and errors."""
 ROUGH = {
     "errors smooth over 1 cm": CloudErrors(smooth_over_m=0.01),
     "errors smooth over 4 cm": CloudErrors(smooth_over_m=0.04),
     "errors of 3 %": CloudErrors(smooth=0.03),
 }
-SERIES = {
+SERIES: dict[str, list[Row]] = {
     "apple": [
-        *(
-            (f"second capture, {turn:g}", SetDown(AGAIN, turn_deg=turn), CloudErrors())
-            for turn in (0.0, 30.0, 90.0, 180.0)
-        ),
+        *(("second capture", SetDown(AGAIN, turn_deg=turn), CloudErrors()) for turn in (0.0, 30.0, 90.0, 180.0)),
         *((f"second capture, {name}", SetDown(AGAIN, turn_deg=30.0), errors) for name, errors in ROUGH.items()),
         ("grown", SetDown(GROWN), CloudErrors()),
         ("grown, 5 % dried", SetDown(GROWN, 0.05, turn_deg=30.0), CloudErrors()),
@@ -72,11 +85,18 @@ SERIES = {
     ],
 }
 
+TRAINED: list[Row] = [
+    ("second capture, trained runs", SetDown(AGAIN, turn_deg=90.0), CloudErrors()),
+    ("grown, 10 % dried, trained runs", SetDown(GROWN, 0.1, turn_deg=30.0), CloudErrors()),
+]
+
 
 @dataclass(frozen=True)
 class ChangeOverTime:
     """Simulate days, compare them, and write the table."""
 
+    trained: Path | None = None
+    """Folder for sessions and runs, whose clouds are compared instead; what is there is not made again."""
     points: int = 40_000
     """Of each cloud, before what no camera sees is left out."""
     results: Path = RESULTS
@@ -84,22 +104,24 @@ class ChangeOverTime:
 
     def main(self) -> None:
         """Measure, print, write."""
-        rows = [row for fruit in ("apple", "pear") for row in self._series(fruit)]
-        write_results("change_over_time", COLUMNS, [*rows, self._ball()], seed="0 to 11", folder=self.results)
+        if self.trained is None:
+            rows = [row for fruit in ("apple", "pear") for row in self._series(fruit)] + [self._ball()]
+        else:
+            days = [FIRST, *(day for _, day, _ in TRAINED)]
+            clouds = [_run_cloud(self.trained / str(seed), day, seed) for seed, day in enumerate(days)]
+            rows = _rows("apple", TRAINED, clouds)
+        write_results("change_over_time", COLUMNS, rows, keys=3, seed="0 to 11", folder=self.results)
 
-    def _series(self, kind: str) -> list[list[str]]:
-        first = SetDown(AGAIN)
-        fruits = [fruit_of(day, NM, kind) for day in (first, *(day for _, day, _ in SERIES[kind]))]
-        days, errors = [first, *(day for _, day, _ in SERIES[kind])], [CloudErrors(), *(e for *_, e in SERIES[kind])]
-        each = enumerate(zip(fruits, days, errors, strict=True))
-        clouds = [cloud_of(fruit, day, error, self.points, seed) for seed, (fruit, day, error) in each]
-        on_mesh = days_on_one_mesh(clouds, [str(i) for i in range(len(days))], MESH, MAX_INCIDENCE_DEG)
-        library = SpectralLibrary(fruits[0].materials[:SKINS], NM, fruits[0].endmembers[:SKINS])
-        # Each day beside the first one; what grew since the day before plays no part here.
-        compared = compare_days(on_mesh, (), SESSION_SD, SMALLEST_M2, library, CLASSIFICATION_ANGLE_RAD)
-        found = list(track(compared, f"Comparing {kind}s", total=len(days) - 1))
-        table = zip(SERIES[kind], fruits[1:], found, strict=True)
-        return [_row(kind, name, day, fruits[0], fruit, one) for (name, day, _), fruit, one in table]
+    def _series(self, kind: Literal["apple", "pear"]) -> list[list[str]]:
+        days = [("", FIRST, CloudErrors()), *SERIES[kind]]
+        return _rows(
+            kind,
+            SERIES[kind],
+            [
+                cloud_of(fruit_of(day, NM, kind), day, error, self.points, seed)
+                for seed, (_, day, error) in enumerate(days)
+            ],
+        )
 
     def _ball(self) -> list[str]:
         mesh = sphere(0.07)
@@ -115,18 +137,67 @@ class ChangeOverTime:
         return ["ball of one colour", "second capture", "0", told, *[""] * (len(COLUMNS) - 4)]
 
 
+def _run_cloud(folder: Path, day: SetDown, seed: int) -> SpectralCloud:
+    """The cloud of a short training on a simulated session of that day."""
+    cloud, session, log = folder / "export" / "point_cloud.ply", folder / "session", folder / "log.txt"
+    if not cloud.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        fruit, mesh_file = fruit_of(day, NM), folder / "fruit.ply"
+        placed = set_down(day, fruit.mesh.vertices)(fruit.mesh.vertices)
+        write_mesh(mesh_file, Part(Mesh(placed, fruit.mesh.triangles), fruit.materials, fruit.weights))
+        own = OwnMesh("mesh", mesh_file, fruit.materials)
+        scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, "apple"))
+        noise = ("photon_noise", "read_noise")
+        scene = override(scene, frames=24, size_px=96, bands=len(NM), seed=seed, effects=noise)
+        simulate_session(scene, session)
+        run, data = folder / "training" / "hsi-sc-nerf" / "run", folder / "data"
+        train = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "training"]
+        for words in (
+            ["hsi-sc-nerf", "process", session, "--output-dir", data],
+            [*train, "--timestamp", "run", "--vis", "tensorboard", "--preset", "fast"],
+            ["ns-export", "pointcloud", "--load-config", run / "config.yml", "--output-dir", cloud.parent],
+        ):
+            run_step(words[0], [str(word) for word in words], log)
+    whole = read_spectral_ply(cloud)
+    return whole.select(slice(None, None, max(1, len(whole) // 60_000)))
+
+
+def _rows(kind: Literal["apple", "pear"], series: Sequence[Row], clouds: Sequence[SpectralCloud]) -> list[list[str]]:
+    nm = clouds[0].wavelengths_nm
+    fruits = [fruit_of(day, nm, kind) for day in (FIRST, *(day for _, day, _ in series))]
+    on_mesh = days_on_one_mesh(clouds, [str(day) for day in range(len(clouds))], MESH, MAX_INCIDENCE_DEG)
+    library = SpectralLibrary(fruits[0].materials[:SKINS], nm, fruits[0].endmembers[:SKINS])
+    # Each day beside the first one; what grew since the day before plays no part here.
+    compared = compare_days(on_mesh, (), SESSION_SD, SMALLEST_M2, library, CLASSIFICATION_ANGLE_RAD)
+    found = list(track(compared, f"Comparing {kind}s", total=len(series)))
+    table = zip(series, fruits[1:], found, strict=True)
+    return [_row(kind, name, day, fruits[0], fruit, one) for (name, day, _), fruit, one in table]
+
+
+def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparison) -> float:
+    """Area that any quantity calls changed, away from what did: bruise, and the place of a lost stem."""
+    bruise, stem = first.materials.index("bruise"), first.materials.index("stem")
+    differs = np.abs(now.weights[:, bruise] - first.weights[:, bruise]) > 0.02
+    if not day.keeps_stem:
+        differs |= first.weights[:, stem] > 0.5
+    surface = one.after.surface
+    changed = np.any([quantity.changed for quantity in one.quantities.values()], axis=0)
+    if differs.any():
+        # A simulated session centres its object on the axis.
+        true, mesh = set_down(FIRST, first.mesh.vertices)(first.mesh.vertices), surface.mesh.vertices
+        true += [*((mesh.min(axis=0) + mesh.max(axis=0) - true.min(axis=0) - true.max(axis=0)) / 2.0)[:2], 0.0]
+        changed &= cKDTree(true[differs]).query(mesh)[0] > NEAR_M
+    return float(1e4 * surface.areas_m2[changed].sum())
+
+
 def _row(kind: str, name: str, day: SetDown, first: TrueSurface, now: TrueSurface, one: Comparison) -> list[str]:
     attitude, brightness = one.after.attitude, one.quantities[BRIGHTNESS]
     assert attitude is not None
-    grew, by_brightness, by_class, water, water_found, false = [""] * 6
+    grew, by_brightness, by_class = [""] * 3
     whole, whole_sd = one.quantities[WATER.name].whole
     water_found = f"{whole:+.4f} ± {whole_sd:.4f}"
     water = f"{_water_change(first, now):+.4f}"
-    if day.bruise_diameter_m == AGAIN:
-        regions = [region.area_m2 for quantity in one.quantities.values() for region in quantity.regions]
-        regions += [abs(r.after_m2 - r.before_m2) for group in one.classes.values() for r in group]
-        false = f"{1e4 * sum(regions):.2f}"
-    else:
+    if day.bruise_diameter_m != AGAIN:
         true_cm2 = _bruise_cm2(now) - _bruise_cm2(first)
         largest = brightness.regions[0] if brightness.regions else None
         of_class = one.classes["bruise"][0]
@@ -135,7 +206,7 @@ def _row(kind: str, name: str, day: SetDown, first: TrueSurface, now: TrueSurfac
         by_class = _beside(1e4 * (of_class.after_m2 - of_class.before_m2), true_cm2)
     cells = [f"{day.turn_deg:g}", f"{attitude.turn_deg % 360:.2f} ± {attitude.turn_sd_deg:.2f}", f"{day.growth:g}"]
     cells += [f"{attitude.growth:.4f} ± {attitude.growth_sd:.4f}", grew, by_brightness, by_class]
-    return [kind, name.split(", 0")[0], *cells, water, water_found, false]
+    return [kind, name, *cells, water, water_found, f"{_false_cm2(first, now, day, one):.2f}"]
 
 
 def _beside(found: float, true: float) -> str:
@@ -150,7 +221,9 @@ def _water_change(first: TrueSurface, now: TrueSurface) -> float:
     """Median over the surface."""
     areas_m2 = _areas_m2(first)
     drawn = np.random.default_rng(0).choice(len(areas_m2), 20_000, p=areas_m2 / areas_m2.sum())
-    before, after = (index_values(WATER, one.weights[drawn] @ one.endmembers, NM) for one in (first, now))
+    before, after = (
+        index_values(WATER, one.weights[drawn] @ one.endmembers, one.wavelengths_nm) for one in (first, now)
+    )
     return float(np.median(after - before))
 
 

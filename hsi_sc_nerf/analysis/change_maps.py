@@ -84,8 +84,8 @@ def changes(
     """
     one, other = before.surface, after.surface
     seen = one.seen & other.seen
-    patches = surface_patches(one.mesh.vertices, one.areas_m2, seen) if seen.any() else None
-    if patches is None or len(patches.areas_m2) < _LEAST_PATCHES:
+    patches = surface_patches(one.mesh.vertices, one.areas_m2, seen)
+    if len(patches.areas_m2) < _LEAST_PATCHES:
         raise InputError(
             f"{after.name} beside {before.name}: hardly any surface is seen on both days; give clouds of one object."
         )
@@ -114,7 +114,7 @@ def changes(
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
         return Quantity(name, unit, change, p, test, region, regions)
 
-    found = {}
+    found: dict[str, Quantity] = {}
     if len(one.wavelengths_nm) > 1:
         units = [unit_spectra(surface.spectra) for surface in (one, other)]
         axes = _axes((units[1] - units[0])[seen])
@@ -126,10 +126,12 @@ def changes(
     measured, then, usual = (_scalars(x, one.wavelengths_nm, bands_nm) for x in (one.spectra, other.spectra, typical))
     moved = [_scalars(typical * (1.0 + mode), one.wavelengths_nm, bands_nm) for mode in modes]
     for name, values in measured.items():
-        shared = np.sqrt(sum(np.square(each[name] - usual[name]) for each in moved))
-        found[name] = tested(name, "1", (values[:, None], then[name][:, None]), shared)
-    raised = tuple(1e3 * day.raised_m[:, None] for day in (before, after))
-    found[SURFACE] = tested(SURFACE, "mm", raised, np.zeros(1))
+        # An index of hardly any light is not defined.
+        if np.isfinite(patches.means((then[name] - values)[:, None], one.areas_m2)).sum() >= _LEAST_PATCHES:
+            shared = np.linalg.norm([each[name] - usual[name] for each in moved], axis=0)
+            found[name] = tested(name, "1", (values[:, None], then[name][:, None]), shared)
+    raised_mm = 1e3 * before.raised_m[:, None], 1e3 * after.raised_m[:, None]
+    found[SURFACE] = tested(SURFACE, "mm", raised_mm, np.zeros(1))
     return found
 
 
@@ -161,10 +163,11 @@ def _misplaced_m(before: Day, after: Day, vertices_m: Float[np.ndarray, "v 3"]) 
 
 def _relative_noise(before: Day, after: Day, patches: Patches) -> Float[np.ndarray, "p"]:
     """Scatter of the frames on each patch on both days, relative to the usual one; 1 where it is not stated."""
-    scatters = [day.surface.scatter for day in (before, after)]
-    if any(one is None for one in scatters):
+    first, last = before.surface.scatter, after.surface.scatter
+    if first is None or last is None:
         return np.ones(len(patches.areas_m2))
-    both = np.sqrt(np.square(scatters[0]) + np.square(scatters[1]))
-    of_patches = patches.means(both[:, None], before.surface.areas_m2)[:, 0]
-    ratio = of_patches / max(float(np.nanmedian(of_patches)), 1e-12) if np.isfinite(of_patches).any() else of_patches
+    of_patches = patches.means(np.hypot(first, last)[:, None], before.surface.areas_m2)[:, 0]
+    if not np.isfinite(of_patches).any():
+        return np.ones(len(patches.areas_m2))
+    ratio = of_patches / max(float(np.nanmedian(of_patches)), 1e-12)
     return np.clip(np.nan_to_num(ratio, nan=1.0), 1.0 / _NOISE_RATIO, _NOISE_RATIO)

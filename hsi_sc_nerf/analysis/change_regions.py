@@ -97,7 +97,8 @@ def changed_regions(
         inside, less, more = (_connected(mesh, along > level, core) for level in (half, half + blur, half - blur))
         return inside, float(areas_m2[more].sum() - areas_m2[less].sum()) / 2.0
 
-    labels, found = np.full(len(known), OUTSIDE), []
+    labels = np.full(len(known), OUTSIDE)
+    found: list[tuple[Int[np.ndarray, "group"], ChangedRegion]] = []
     groups = _touching(patches, patches.means(change, areas_m2), significant)
     while groups:
         # Groups whose regions overlap are one.
@@ -112,8 +113,8 @@ def changed_regions(
         labels[inside] = len(found)
         area_m2 = float(areas_m2[inside].sum())
         found.append((group, ChangedRegion(area_m2, sd_m2, _centre(mesh, areas_m2, inside))))
-    kept = np.unique(labels[labels != OUTSIDE])
-    kept = sorted((n for n in kept if found[n][1].area_m2 >= smallest_m2), key=lambda n: -found[n][1].area_m2)
+    left = np.unique(labels[labels != OUTSIDE]).tolist()
+    kept = sorted((n for n in left if found[n][1].area_m2 >= smallest_m2), key=lambda n: -found[n][1].area_m2)
     order = np.full(len(found) + 1, OUTSIDE)
     order[kept] = np.arange(len(kept))
     return order[labels], [found[number][1] for number in kept]

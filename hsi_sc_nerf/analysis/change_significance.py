@@ -79,6 +79,8 @@ def surface_patches(
 ) -> Patches:
     """Divide the seen vertices into patches: each belongs to the nearest centre of an occupied cube."""
     points = vertices_m[seen]
+    if len(points) == 0:
+        return Patches(np.full(len(vertices_m), -1), np.zeros((0, 3)), np.zeros(0))
     _, cube = np.unique(np.floor(points / PATCH_M).astype(int), axis=0, return_inverse=True)
     count = np.bincount(cube.ravel())
     seeds = np.stack([np.bincount(cube.ravel(), axis) for axis in points.T], axis=1) / count[:, None]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.simulate.materials import MATERIALS, PlantTissue, endmembers, smooth_noise
+from hsi_sc_nerf.simulate.materials import MATERIALS, Material, PlantTissue, endmembers, smooth_noise
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights, pear
 from hsi_sc_nerf.simulate.scene import Fruit
 from hsi_sc_nerf.simulate.true_surface import TrueSurface
@@ -73,14 +73,19 @@ def fruit_of(
     rng = np.random.default_rng(seed)
     fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
     shape = (apple if kind == "apple" else pear)(fruit.height_m, rng)
-    dried = {
-        name: replace(tissue, water=tissue.water * (1.0 - day.dried))
-        for name in FRUIT_MATERIALS[kind]
-        if isinstance(tissue := MATERIALS[name], PlantTissue)
-    }
     weights = fruit_weights(shape, fruit, rng)
-    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried)
+    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
     return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
+
+
+def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:
+    """The fruit's materials with the water that is left, by name."""
+    wet = {name: MATERIALS[name] for name in FRUIT_MATERIALS[kind]}
+    return {
+        name: replace(tissue, water=tissue.water * (1.0 - day.dried))
+        for name, tissue in wet.items()
+        if isinstance(tissue, PlantTissue)
+    }
 
 
 def cloud_of(true: TrueSurface, day: SetDown, errors: CloudErrors, points: int, seed: int) -> SpectralCloud:
