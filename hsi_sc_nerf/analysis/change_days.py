@@ -79,7 +79,8 @@ def days_on_one_mesh(
     )
 
     mesh = closed_mesh(clouds[0].points, clouds[0].normals, config)
-    normals, days = mesh.vertex_normals(), []
+    normals = mesh.vertex_normals()
+    days: list[Day] = []
     for cloud, name, sample in zip(clouds, names, samples, strict=True):
         attitude, moved = None, cloud
         if days:

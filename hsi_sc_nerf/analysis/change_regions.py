@@ -104,6 +104,8 @@ def changed_regions(
         # Groups whose regions overlap are one.
         group = groups.pop(0)
         inside, sd_m2 = outlined(group)
+        if len(inside) == 0:
+            continue
         others = set(labels[inside].tolist()) - {OUTSIDE}
         if others:
             groups.insert(0, np.concatenate([group, *(found[other][0] for other in others)]))
