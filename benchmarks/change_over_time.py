@@ -1,17 +1,15 @@
 """How well `hsi-sc-nerf change` finds turns, bruises that grow and drying, and no change where none is, as a table.
 
     uv run python benchmarks/change_over_time.py
-    uv run python benchmarks/change_over_time.py --trained FOLDER
 
 The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface
-with the errors of a run, of which those that are smooth over centimetres count; other ones on each day. With
-``--trained``, small sessions are simulated instead, processed, trained for 800 steps each and exported.
+with the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -28,19 +26,13 @@ from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
 from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.benchmark.steps import run_step
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
-from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.paper import CLASSIFICATION_ANGLE_RAD
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, dried_materials, fruit_of, set_down
+from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
-from hsi_sc_nerf.simulate.render import Part
-from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
-from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.true_surface import TrueSurface
-from hsi_sc_nerf.simulate.truth import write_mesh
 from hsi_sc_nerf.spectra import INDICES, index_values
 
 NM = np.linspace(400.0, 1000.0, 25)
@@ -59,6 +51,7 @@ COLUMNS = (
 FIRST = SetDown(AGAIN)
 NEAR_M = 0.004
 """As far from what changed a pixel or a patch may call a change."""
+Kind: TypeAlias = Literal["apple", "pear"]
 Row: TypeAlias = tuple[str, SetDown, CloudErrors]
 """Name, day and errors."""
 ROUGH = {
@@ -66,7 +59,7 @@ ROUGH = {
     "errors smooth over 4 cm": CloudErrors(smooth_over_m=0.04),
     "errors of 3 %": CloudErrors(smooth=0.03),
 }
-SERIES: dict[str, list[Row]] = {
+SERIES: dict[Kind, list[Row]] = {
     "apple": [
         *(("second capture", SetDown(AGAIN, turn_deg=turn), CloudErrors()) for turn in (0.0, 30.0, 90.0, 180.0)),
         *((f"second capture, {name}", SetDown(AGAIN, turn_deg=30.0), errors) for name, errors in ROUGH.items()),
@@ -85,18 +78,11 @@ SERIES: dict[str, list[Row]] = {
     ],
 }
 
-TRAINED: list[Row] = [
-    ("second capture, trained runs", SetDown(AGAIN, turn_deg=90.0), CloudErrors()),
-    ("grown, 10 % dried, trained runs", SetDown(GROWN, 0.1, turn_deg=30.0), CloudErrors()),
-]
-
 
 @dataclass(frozen=True)
 class ChangeOverTime:
     """Simulate days, compare them, and write the table."""
 
-    trained: Path | None = None
-    """Folder for sessions and runs, whose clouds are compared instead; what is there is not made again."""
     points: int = 40_000
     """Of each cloud, before what no camera sees is left out."""
     results: Path = RESULTS
@@ -104,15 +90,10 @@ class ChangeOverTime:
 
     def main(self) -> None:
         """Measure, print, write."""
-        if self.trained is None:
-            rows = [row for fruit in ("apple", "pear") for row in self._series(fruit)] + [self._ball()]
-        else:
-            days = [FIRST, *(day for _, day, _ in TRAINED)]
-            clouds = [_run_cloud(self.trained / str(seed), day, seed) for seed, day in enumerate(days)]
-            rows = _rows("apple", TRAINED, clouds)
-        write_results("change_over_time", COLUMNS, rows, keys=3, seed="0 to 11", folder=self.results)
+        rows = [row for kind in SERIES for row in self._series(kind)]
+        write_results("change_over_time", COLUMNS, [*rows, self._ball()], seed="0 to 11", folder=self.results)
 
-    def _series(self, kind: Literal["apple", "pear"]) -> list[list[str]]:
+    def _series(self, kind: Kind) -> list[list[str]]:
         days = [("", FIRST, CloudErrors()), *SERIES[kind]]
         return _rows(
             kind,
@@ -137,32 +118,7 @@ class ChangeOverTime:
         return ["ball of one colour", "second capture", "0", told, *[""] * (len(COLUMNS) - 4)]
 
 
-def _run_cloud(folder: Path, day: SetDown, seed: int) -> SpectralCloud:
-    """The cloud of a short training on a simulated session of that day."""
-    cloud, session, log = folder / "export" / "point_cloud.ply", folder / "session", folder / "log.txt"
-    if not cloud.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        fruit, mesh_file = fruit_of(day, NM), folder / "fruit.ply"
-        placed = set_down(day, fruit.mesh.vertices)(fruit.mesh.vertices)
-        write_mesh(mesh_file, Part(Mesh(placed, fruit.mesh.triangles), fruit.materials, fruit.weights))
-        own = OwnMesh("mesh", mesh_file, fruit.materials)
-        scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, "apple"))
-        noise = ("photon_noise", "read_noise")
-        scene = override(scene, frames=24, size_px=96, bands=len(NM), seed=seed, effects=noise)
-        simulate_session(scene, session)
-        run, data = folder / "training" / "hsi-sc-nerf" / "run", folder / "data"
-        train = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "training"]
-        for words in (
-            ["hsi-sc-nerf", "process", session, "--output-dir", data],
-            [*train, "--timestamp", "run", "--vis", "tensorboard", "--preset", "fast"],
-            ["ns-export", "pointcloud", "--load-config", run / "config.yml", "--output-dir", cloud.parent],
-        ):
-            run_step(words[0], [str(word) for word in words], log)
-    whole = read_spectral_ply(cloud)
-    return whole.select(slice(None, None, max(1, len(whole) // 60_000)))
-
-
-def _rows(kind: Literal["apple", "pear"], series: Sequence[Row], clouds: Sequence[SpectralCloud]) -> list[list[str]]:
+def _rows(kind: Kind, series: Sequence[Row], clouds: Sequence[SpectralCloud]) -> list[list[str]]:
     nm = clouds[0].wavelengths_nm
     fruits = [fruit_of(day, nm, kind) for day in (FIRST, *(day for _, day, _ in series))]
     on_mesh = days_on_one_mesh(clouds, [str(day) for day in range(len(clouds))], MESH, MAX_INCIDENCE_DEG)
@@ -183,10 +139,8 @@ def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparis
     surface = one.after.surface
     changed = np.any([quantity.changed for quantity in one.quantities.values()], axis=0)
     if differs.any():
-        # A simulated session centres its object on the axis.
-        true, mesh = set_down(FIRST, first.mesh.vertices)(first.mesh.vertices), surface.mesh.vertices
-        true += [*((mesh.min(axis=0) + mesh.max(axis=0) - true.min(axis=0) - true.max(axis=0)) / 2.0)[:2], 0.0]
-        changed &= cKDTree(true[differs]).query(mesh)[0] > NEAR_M
+        true = set_down(FIRST, first.mesh.vertices)(first.mesh.vertices)[differs]
+        changed &= cKDTree(true).query(surface.mesh.vertices)[0] > NEAR_M
     return float(1e4 * surface.areas_m2[changed].sum())
 
 

@@ -134,11 +134,11 @@ def significance(
     observations = max(independent * _BIWEIGHT_EFFICIENCY, dimensions + 2.0)
     p = np.ones(len(change))
     p[known] = stats.false_discovery_control(
-        _hotelling_p(np.square(ratio).sum(axis=1), dimensions, observations), method="by"
+        hotelling_p(np.square(ratio).sum(axis=1), dimensions, observations), method="by"
     )
     # The median of normal errors has pi / 2 times the variance of the mean.
     whole_sd = np.sqrt(np.pi / 2.0 * np.square(noise) / independent + np.square(session_sd))
-    whole_p = _hotelling_p(np.square(whole / whole_sd).sum(), dimensions, observations)
+    whole_p = hotelling_p(np.square(whole / whole_sd).sum(), dimensions, observations)
     return Significance(p, noise, length_m, independent, whole, whole_sd, float(whole_p))
 
 
@@ -182,7 +182,7 @@ def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n
     return length_m, float(len(ratio) ** 2 / np.exp(-distance_m / max(length_m, 1e-9)).sum())
 
 
-def _hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:
+def hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:
     """Chance of a larger T² of so many numbers whose variances come from so many observations (Hotelling 1931)."""
     free = observations - 1.0
     last = free - dimensions + 1.0

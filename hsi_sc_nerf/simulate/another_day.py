@@ -73,19 +73,14 @@ def fruit_of(
     rng = np.random.default_rng(seed)
     fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
     shape = (apple if kind == "apple" else pear)(fruit.height_m, rng)
-    weights = fruit_weights(shape, fruit, rng)
-    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
-    return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
-
-
-def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:
-    """The fruit's materials with the water that is left, by name."""
-    wet = {name: MATERIALS[name] for name in FRUIT_MATERIALS[kind]}
-    return {
+    dried: dict[str, Material] = {
         name: replace(tissue, water=tissue.water * (1.0 - day.dried))
-        for name, tissue in wet.items()
-        if isinstance(tissue, PlantTissue)
+        for name in FRUIT_MATERIALS[kind]
+        if isinstance(tissue := MATERIALS[name], PlantTissue)
     }
+    weights = fruit_weights(shape, fruit, rng)
+    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried)
+    return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
 
 
 def cloud_of(true: TrueSurface, day: SetDown, errors: CloudErrors, points: int, seed: int) -> SpectralCloud:

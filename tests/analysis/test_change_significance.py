@@ -8,6 +8,7 @@ from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
     biweight_scale,
     correlation,
+    hotelling_p,
     significance,
     surface_patches,
 )
@@ -113,3 +114,21 @@ def test_patches_hold_the_seen_area_and_the_means_of_their_vertices():
     assert np.median(patches.areas_m2) == pytest.approx(2.5e-5, rel=0.4)
     assert (patches.of_vertex[~seen] == -1).all()
     np.testing.assert_allclose(patches.means(points, areas_m2), patches.centres_m, atol=1e-12)
+
+
+def test_with_few_independent_parts_the_p_value_is_students_and_that_of_components_hotellings():
+    assert hotelling_p(np.array(9.0), 1, 15.0) == pytest.approx(2.0 * stats.t.sf(3.0, 14.0))
+    assert hotelling_p(np.array(9.0), 3, 1e7) == pytest.approx(stats.chi2.sf(9.0, 3), rel=1e-4)
+    random = np.random.default_rng(0)
+    squares = []
+    for _ in range(4000):
+        sample = random.normal(size=(12, 2))
+        apart = random.normal(size=2)
+        squares.append(apart @ np.linalg.solve(np.cov(sample, rowvar=False), apart))
+    assert (hotelling_p(np.array(squares), 2, 12.0) < 0.05).mean() == pytest.approx(0.05, abs=0.012)
+
+
+def test_the_mean_of_smooth_errors_is_no_change_of_the_whole_surface():
+    centres_m = ball_patches()
+    fields = (smooth_noise(centres_m, 0.02, np.random.default_rng(seed))[:, None] for seed in range(40))
+    assert np.mean([outcome(field, centres_m).whole_p < 0.05 for field in fields]) <= 0.15
