@@ -8,7 +8,6 @@ with the errors of a run, of which those that are smooth over centimetres count;
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -27,7 +26,7 @@ from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.paper import CLASSIFICATION_ANGLE_RAD
 from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from hsi_sc_nerf.simulate.materials import endmembers
@@ -94,15 +93,17 @@ class ChangeOverTime:
         write_results("change_over_time", COLUMNS, [*rows, self._ball()], seed="0 to 11", folder=self.results)
 
     def _series(self, kind: Kind) -> list[list[str]]:
-        days = [("", FIRST, CloudErrors()), *SERIES[kind]]
-        return _rows(
-            kind,
-            SERIES[kind],
-            [
-                cloud_of(fruit_of(day, NM, kind), day, error, self.points, seed)
-                for seed, (_, day, error) in enumerate(days)
-            ],
-        )
+        days = [("first", FIRST, CloudErrors()), *SERIES[kind]]
+        first, *later = fruits = [fruit_of(day, NM, kind) for _, day, _ in days]
+        each = enumerate(zip(fruits, days, strict=True))
+        clouds = [cloud_of(fruit, day, error, self.points, seed) for seed, (fruit, (_, day, error)) in each]
+        on_mesh = days_on_one_mesh(clouds, [str(number) for number in range(len(days))], MESH, MAX_INCIDENCE_DEG)
+        library = SpectralLibrary(first.materials[:SKINS], NM, first.endmembers[:SKINS])
+        # Each day beside the first one; what grew since the day before plays no part here.
+        compared = compare_days(on_mesh, (), SESSION_SD, SMALLEST_M2, library, CLASSIFICATION_ANGLE_RAD)
+        found = list(track(compared, f"Comparing {kind}s", total=len(later)))
+        table = zip(SERIES[kind], later, found, strict=True)
+        return [_row(kind, name, day, first, fruit, one) for (name, day, _), fruit, one in table]
 
     def _ball(self) -> list[str]:
         mesh = sphere(0.07)
@@ -116,18 +117,6 @@ class ChangeOverTime:
         except InputError as error:
             told = f"refused: {str(error).split(';')[0]}"
         return ["ball of one colour", "second capture", "0", told, *[""] * (len(COLUMNS) - 4)]
-
-
-def _rows(kind: Kind, series: Sequence[Row], clouds: Sequence[SpectralCloud]) -> list[list[str]]:
-    nm = clouds[0].wavelengths_nm
-    fruits = [fruit_of(day, nm, kind) for day in (FIRST, *(day for _, day, _ in series))]
-    on_mesh = days_on_one_mesh(clouds, [str(day) for day in range(len(clouds))], MESH, MAX_INCIDENCE_DEG)
-    library = SpectralLibrary(fruits[0].materials[:SKINS], nm, fruits[0].endmembers[:SKINS])
-    # Each day beside the first one; what grew since the day before plays no part here.
-    compared = compare_days(on_mesh, (), SESSION_SD, SMALLEST_M2, library, CLASSIFICATION_ANGLE_RAD)
-    found = list(track(compared, f"Comparing {kind}s", total=len(series)))
-    table = zip(series, fruits[1:], found, strict=True)
-    return [_row(kind, name, day, fruits[0], fruit, one) for (name, day, _), fruit, one in table]
 
 
 def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparison) -> float:
