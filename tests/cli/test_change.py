@@ -13,7 +13,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of
 
-NM = np.array([450.0, 551.0, 598.0, 670.0, 800.0, 850.0, 900.0, 970.0])
+NM = np.linspace(400.0, 1000.0, 13)
 DAYS = {
     "monday": SetDown(bruise_diameter_m=0.012),
     "monday_again": SetDown(bruise_diameter_m=0.012, turn_deg=120.0),
