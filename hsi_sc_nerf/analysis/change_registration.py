@@ -29,9 +29,6 @@ AMBIGUOUS_P = 0.01
 """An attitude is ruled out if it would fit this well by chance with at most this probability."""
 BLOCK = 0.8
 """Side, in radii of the object, of blocks whose errors are taken for independent; within one they may be the same."""
-UNDERSTATED = 1.7
-"""By so much the blocks alone state too small a standard deviation: errors reach beyond a block. Found on simulated
-fruit (docs/validation/change.md)."""
 LEAST_OVERLAP = 0.5
 FINE_ATTITUDES = 4
 """The best of the coarse ones, which are fitted again to the fine sample."""
@@ -82,8 +79,7 @@ def find_attitude(
     From turns all around the axis, Gauss-Newton steps minimise the distances to tangent planes and the differences of
     spectral features, each in units of its robust standard deviation, with Tukey's loss: what was lost, such as a
     stem, does not count. Errors of points nearby are alike, so standard deviations are those of a sandwich estimate
-    over blocks (Liang and Zeger 1986), enlarged by `UNDERSTATED`. Two attitudes are compared by a paired t-test of
-    their losses over the blocks.
+    over blocks (Liang and Zeger 1986). Two attitudes are compared by a paired t-test of their losses over the blocks.
 
     Args:
         moving: coarse and fine sample of the cloud, `hsi_sc_nerf.analysis.change_features.surface_samples`.
