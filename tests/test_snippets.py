@@ -109,6 +109,8 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
+        "analysis.change_regions.grown_regions",
+        "analysis.change_significance.significance",
         "analysis.maps.propagated_std",
         "analysis.preprocessing.preprocessed",
         "evaluation.spatial.precision_recall_f_score",
