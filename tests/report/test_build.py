@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from headless_browser import launch, needs_browser, quiet_page
 
+from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.report import trait_content
 from hsi_sc_nerf.analysis.size import Size
-from hsi_sc_nerf.analysis.traits import WHOLE, MeanAndSd, RegionTraits, Traits
+from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
 from hsi_sc_nerf.files import write_json
@@ -50,9 +51,12 @@ TRAITS = trait_content(
     True,
     Traits(
         [
-            RegionTraits(name, 0.02, MeanAndSd(np.full(3, 0.4), np.zeros(3)), {HOSTILE: MeanAndSd(0.5, np.nan)})
+            RegionTraits(
+                name, 0.02, MeanAndSd(np.full(3, 0.4), np.zeros(3)), {HOSTILE: MapMean(MeanAndSd(0.5, 0.1), 0.1, 0.0)}
+            )
             for name in (WHOLE, HOSTILE)
-        ]
+        ],
+        maps=[SurfaceMap(HOSTILE, "", np.zeros(3), lambda spectra: spectra[:, 0], unit=HOSTILE)],
     ),
     {},
 )
