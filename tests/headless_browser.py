@@ -1,6 +1,7 @@
 """Chromium without a screen, where one is installed, for the tests that look at pages as users do."""
 
 import shutil
+from contextlib import contextmanager
 
 import pytest
 
@@ -15,3 +16,19 @@ def launch(playwright):
         args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
         timeout=120_000,
     )
+
+
+@contextmanager
+def quiet_page(browser, path, **window):
+    """A file in a window of its own; it must say nothing on the console and fetch nothing."""
+    page = browser.new_page(reduced_motion="reduce", **window)
+    page.set_default_timeout(120_000)
+    messages, requests = [], []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(path.as_uri())
+    yield page
+    assert messages == []
+    assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+    page.close()

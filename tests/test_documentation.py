@@ -45,7 +45,8 @@ def test_every_option_in_a_page_exists():
         for command, words in re.findall(r"hsi-sc-nerf ([a-z]+) ([^\n`#]*)", text):
             if command not in helps:
                 continue
-            for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9.-]*)", words.split("--common")[0].split("--sets")[0]):
+            ours = re.split("--common|--sets|--executor", words)[0]
+            for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9.-]*)", ours):
                 found += 1
                 assert option in helps[command], f"{page.name}: {command} has no {option}"
     assert found > 20

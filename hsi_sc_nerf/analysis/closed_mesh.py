@@ -159,14 +159,14 @@ def open_edges(mesh: Mesh) -> int:
 
 
 def thinned(
-    points_m: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], cell_m: float
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-    """Voxel downsampling: mean position and mean normal (not longer than 1) of the points in each cell."""
+    points_m: Float[np.ndarray, "n 3"], columns: Float[np.ndarray, "n k"], cell_m: float
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m k"]]:
+    """Voxel downsampling: mean position and mean columns, such as a normal, of the points in each cell."""
     cells = np.floor((points_m - points_m.min(axis=0)) / cell_m).astype(np.int64)
     shape = cells.max(axis=0) + 1
     _, cell = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(shape)), return_inverse=True)
     count = np.bincount(cell)
-    mean = [np.bincount(cell, column) / count for column in np.concatenate([points_m, normals], axis=1).T]
+    mean = [np.bincount(cell, column) / count for column in np.concatenate([points_m, columns], axis=1).T]
     return np.stack(mean[:3], axis=1), np.stack(mean[3:], axis=1)
 
 

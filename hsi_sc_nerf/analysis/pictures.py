@@ -23,7 +23,7 @@ SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "b
 _HEIGHT_PX = 420
 _LABEL_IN = 1.4
 """Height of a row's label."""
-_GREY = 0.85
+GREY = 0.85
 """Grey value of unseen surface."""
 _NEAR_WHITE = 0.97
 """Grey value of surface in no class."""
@@ -72,9 +72,9 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews) -> None
         values = composite(surface.spectra, surface.wavelengths_nm, one.wavelengths_nm, one.name).astype(float)
         # Brightened, so that dark tissue can be seen; the brightest percent is clipped.
         values = np.clip(values / np.percentile(values[surface.seen], 99.0), 0.0, 1.0)
-        values[~surface.seen] = _GREY
+        values[~surface.seen] = GREY
         rows[f"{one.name}\n{', '.join(f'{nm:g}' for nm in one.wavelengths_nm)} nm"] = views.on_white(values)
-    _draw_rows(path, rows)
+    draw_rows(path, rows)
 
 
 @rc_context(STYLE)
@@ -90,15 +90,16 @@ def draw_maps(
         known = surface.seen & np.isfinite(values)
         low, high = usual_range(values[known])
         coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / (high - low), 0.0, 1.0))[:, :3]
-        coloured[~known] = _GREY
+        coloured[~known] = GREY
         rows[label] = views.on_white(coloured)
-        scales.append((low, high))
-    _draw_rows(path, rows, scales)
+        scales.append((low, high, INDEX_COLOURS))
+    draw_rows(path, rows, scales)
 
 
-def _draw_rows(
-    path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float]] = ()
+def draw_rows(
+    path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float, str] | None] = ()
 ) -> None:
+    """Pictures of the four sides in labelled rows; ``scales`` are ends and colours of the first rows' bars."""
     first = next(iter(rows.values()))[0]
     width_in = 1.75
     row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
@@ -111,8 +112,10 @@ def _draw_rows(
     for axes, title in zip(grid[0], SIDES_DEG, strict=True):
         axes.set_title(title)
     for line, scale in zip(grid, scales, strict=False):
-        colours = ScalarMappable(Normalize(*scale), INDEX_COLOURS)
-        figure.colorbar(colours, ax=line.tolist(), extend="both", fraction=0.04, aspect=18, pad=0.02)
+        if scale is not None:
+            low, high, colours = scale
+            shown = ScalarMappable(Normalize(low, high), colours)
+            figure.colorbar(shown, ax=line.tolist(), extend="both", fraction=0.04, aspect=18, pad=0.02)
     save_figure(figure, path)
 
 
@@ -123,7 +126,7 @@ def draw_classes(
     """The classes on the surface, with their areas; white is in no class, grey is unseen."""
     colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
-    painted[~surface.seen] = _GREY
+    painted[~surface.seen] = GREY
     pictures = views.on_white(painted)
     height, width = pictures[0].shape[:2]
     figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
@@ -138,7 +141,7 @@ def draw_classes(
     ]
     patches += [
         Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=f"in no class: {areas_cm2[-1]:.2f} cm²"),
-        Patch(color=str(_GREY), label="not seen"),
+        Patch(color=str(GREY), label="not seen"),
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)

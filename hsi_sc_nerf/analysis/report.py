@@ -19,7 +19,7 @@ from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
 # Name, unit, and the unit's factor on metres, square metres or litres.
-_SIZES = {
+SIZES = {
     "area_m2": ("surface area", "cm²", 1e4),
     "volume_l": ("volume", "mL", 1e3),
     "height_m": ("height", "mm", 1e3),
@@ -128,7 +128,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
             note += f" Not known, and not in it: {', '.join(missing)}."
     rows = [
         [name, _with_sd(factor * size[key], factor * spread[key]) if spread else f"{factor * size[key]:.4g}", unit]
-        for key, (name, unit, factor) in _SIZES.items()
+        for key, (name, unit, factor) in SIZES.items()
     ]
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
     if content["classes"]:

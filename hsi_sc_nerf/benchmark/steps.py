@@ -40,13 +40,14 @@ class StepCost:
     peak_memory_mib: float
 
 
-def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
+def run_step(name: str, argv: Sequence[str], log: Path, errors: int | None = None) -> StepCost:
     """Run a command in a process of its own.
 
     Args:
         name: name of the step.
         argv: command; its progress bars appear on the terminal.
         log: file for its standard output.
+        errors: `subprocess.STDOUT` where errors and progress go there as well.
 
     Raises:
         InputError: the command failed; the message names its log.
@@ -60,8 +61,8 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")
     with log.open("wb") as output:
         # A step that outlives its run would write into the folder of the next one.
-        orphans = _end_with_parent if sys.platform == "linux" else None
-        process = subprocess.Popen(list(argv), stdout=output, env=environment, preexec_fn=orphans)
+        orphans = end_with_parent if sys.platform == "linux" else None
+        process = subprocess.Popen(list(argv), stdout=output, stderr=errors, env=environment, preexec_fn=orphans)
         try:
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:
@@ -70,9 +71,8 @@ def run_step(name: str, argv: Sequence[str], log: Path) -> StepCost:
             raise
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
-        raise InputError(
-            f"the step '{name}' failed with status {process.returncode}; its output is above and in {log}."
-        )
+        where = "above and in" if errors is None else "in"
+        raise InputError(f"the step '{name}' failed with status {process.returncode}; its output is {where} {log}.")
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
 
 
@@ -90,9 +90,10 @@ def typed_command(words: Sequence[object]) -> list[str]:
     return [sys.executable, "-c", f"from nerfstudio.scripts.{script} import entrypoint; entrypoint()", *rest]
 
 
-def _end_with_parent() -> None:
-    """In a new process: end when the process that started it is killed (Linux)."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def end_with_parent() -> None:
+    """In a new process: end when the process that started it is killed (Linux; elsewhere nothing is done)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def available_cores() -> int:

@@ -22,6 +22,7 @@ COMMANDS = {
     "demo": Command("workflows", "DemoCommand", "Simulate, reconstruct and judge a fruit: try this first."),
     "simulate": Command("sessions", "SimulateCommand", "Simulate a turntable session, with its truth."),
     "run": Command("workflows", "RunCommand", "Do all steps from a capture session to traits and a report."),
+    "batch": Command("batch", "BatchCommand", "Do all steps on many sessions, here or on a cluster."),
     "markers": Command("sessions", "MarkersCommand", "Write ArUco markers to print."),
     "inspect": Command("sessions", "InspectCommand", "Check a session in seconds, before you process it."),
     "process": Command("sessions", "ProcessCommand", "Calibrate captures, estimate poses and masks, pack a dataset."),
@@ -31,7 +32,9 @@ COMMANDS = {
     "render": Command("trained_runs", "RenderCommand", "Render views of a trained run as ENVI cubes and videos."),
     "compare": Command("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
     "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
+    "change": Command("clouds", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
     "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
+    "collect": Command("collect", "CollectCommand", "Write one table and one page of all objects of a batch."),
     "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
 }
 """The commands, in the order in which the help lists them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from dataclasses import replace
 from typing import Any
 
 from hsi_sc_nerf.errors import InputError
@@ -26,7 +27,12 @@ def main() -> None:
         ignore_library_warnings()
         # Reading the options can already raise InputError.
         needed = commands.named_commands(sys.argv[1:])
-        command = tyro.cli(commands.command_line(needed), description=commands.__doc__)
+        if needed == ("batch",):
+            # The words that it does not know are Snakemake's.
+            command, others = tyro.cli(commands.command_line(needed), return_unknown_args=True)
+            command = replace(command, other_words=tuple(others))
+        else:
+            command = tyro.cli(commands.command_line(needed), description=commands.__doc__)
         command.main()
     except InputError as error:
         _tell("Error: ", str(error))
@@ -39,7 +45,7 @@ def main() -> None:
     except KeyboardInterrupt:
         # Another Ctrl-C, while what was begun is ended and cleared away, would only print where it came.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        goes_on = type(command).__name__ in ("ProcessCommand", "RunCommand")
+        goes_on = type(command).__name__ in ("ProcessCommand", "RunCommand", "BatchCommand")
         _tell("", f"Stopped{'; the same command goes on where it stopped' if goes_on else ''}.")
         sys.exit(130)
 

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from hsi_sc_nerf import __version__
-from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.batch.session_steps import (
+    MATERIAL_NAME,
+    STEPS_NAME,
+    SessionSettings,
+    StepRunner,
+    bring_up_to_date,
+    session_steps,
+)
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import atomic_write, make_folder, read_json, write_json
-from hsi_sc_nerf.models.presets import Preset
+from hsi_sc_nerf.files import atomic_write, make_folder
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.settings_file import between, check_options
 
-STEPS_NAME = "steps.json"
-"""File of the output folder that says which steps were done with what; it marks the folder as a run's."""
-MATERIAL_NAME = "point_cloud-material.json"
-"""File of the output folder that says what was decided of the light on the object."""
 DEMO_MARK = ".hsi-sc-nerf-demo"
 """File that marks the folder of a demo, whose contents may be replaced."""
-StepRunner = Callable[[str, Sequence[str], Path], StepCost]
-"""Runs a command; gets the step's name, the command and the file for its output."""
 
 DEMO_TRAINING = {
     "preset": "fast",
@@ -47,36 +43,7 @@ DEMO_TRAINING = {
 
 
 @dataclass(frozen=True)
-class Step:
-    """A command of the run.
-
-    Attributes:
-        name: shown, and the name of the log.
-        words: the command as a user would type it.
-        inputs: files and folders that its results depend on.
-        outputs: files that it leaves.
-        needed: whether the run ends where it fails.
-    """
-
-    name: str
-    words: tuple[str, ...]
-    inputs: tuple[Path, ...]
-    outputs: tuple[Path, ...]
-    needed: bool = True
-
-    def fingerprint(self, outside: Path) -> str:
-        """Hash of command, version, and sizes and times of the inputs but for those inside the folder ``outside``."""
-        digest = hashlib.sha256(json.dumps([__version__, self.words]).encode())
-        for path in self.inputs:
-            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-                if file.is_file() and (path == file or outside not in file.parents):
-                    state = file.stat()
-                    digest.update(f"{file} {state.st_size} {state.st_mtime_ns}\n".encode())
-        return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class RunCommand:
+class RunCommand(SessionSettings):
     """Process a session, train, evaluate, export the cloud, tell material and light apart, measure traits, report.
 
     Where the light on the object is uneven beyond noise, point_cloud-material.ply holds the reflectance of the
@@ -90,22 +57,6 @@ class RunCommand:
     """Folder of the capture session."""
     output_dir: Path
     """Folder for the dataset, the trained run, the cloud, the traits and report.html."""
-    preset: Preset = "balanced"
-    """How long to train: on two cores without a GPU fast takes about one minute, balanced five and best twenty; on a
-    GPU 10 seconds, one minute and seven."""
-    max_num_iterations: int | None = between(1, math.inf, default=None)
-    """Training steps of both stages together, in place of the preset's."""
-    num_points: int = between(1, math.inf, default=200_000)
-    """Number of points of the cloud."""
-    process: str = ""
-    """More words for `hsi-sc-nerf process`, joined to the option by an equals sign: --process="--poses colmap"."""
-    train: str = ""
-    """More words for `ns-train hsi-sc-nerf`, likewise: --train="--pipeline.model.head direct"."""
-    material: str = ""
-    """More words for `hsi-sc-nerf material`, likewise, such as the direction that the white reference faced:
-    --material="--white-azimuth-deg -35"."""
-    traits: str = ""
-    """More words for `hsi-sc-nerf traits`, likewise: --traits="--index PRI --index CRI1"."""
 
     def main(self, run_step: StepRunner = run_step) -> None:
         """Run the steps that are not up to date and print what was found.
@@ -128,112 +79,19 @@ class RunCommand:
             raise InputError(f"{self.session}: holds no captures; give the folder of a capture session.")
         make_folder(out)
         console = Console(highlight=False, soft_wrap=True)
-        count = len(self._steps())
-        for number in range(1, count + 1):
-            # The traits are of the cloud that the material's step leaves, or not.
-            step = self._steps()[number - 1]
-            title = f"[bold]{number}/{count} {step.name}[/bold]"
-            self._bring_up_to_date(step, console, title, run_step)
-        _show_results(out, console)
-
-    def _steps(self) -> list[Step]:
-        """The commands, in order."""
-        out = self.output_dir
-        data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
-        material = out / "point_cloud-material.ply"
-        with_material = material if material.is_file() else cloud
-        run = out / "training" / "hsi-sc-nerf" / "run"
-        config, weights = run / "config.yml", run / "nerfstudio_models"
-        packed = data / "transforms.json"
-        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
-        training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", self.preset]
-        if self.max_num_iterations is not None:
-            training += ["--max-num-iterations", self.max_num_iterations]
-        evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
-        exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]
-        exporting += ["--num-points", self.num_points]
-        reporting = ["hsi-sc-nerf", "report", run, "--output", out / "report.html", "--cloud", cloud]
-        table: list[tuple[str, list[Any], tuple[Path, ...], tuple[Path, ...]]] = [
-            (
-                "process",
-                ["hsi-sc-nerf", "process", self.session, "--output-dir", data, *split_words(self.process)],
-                (self.session,),
-                (packed,),
-            ),
-            ("train", [*training, *split_words(self.train)], (packed, data / "masks"), (config,)),
-            ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
-            ("export", exporting, (packed, weights), (cloud,)),
-            (
-                "material",
-                ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(self.material)],
-                (packed, weights, cloud),
-                (material, out / MATERIAL_NAME),
-            ),
-            (
-                "traits",
-                [
-                    "hsi-sc-nerf",
-                    "traits",
-                    with_material,
-                    "--data",
-                    data,
-                    "--output-dir",
-                    traits,
-                    *split_words(self.traits),
-                ],
-                (packed, with_material),
-                (traits / "traits.json",),
-            ),
-            (
-                "report",
-                [*reporting, "--traits", traits / "traits.json"],
-                (packed, weights, cloud, traits / "traits.json"),
-                (out / "report.html",),
-            ),
-        ]
-        return [
-            Step(name, tuple(map(str, words)), inputs, outputs, name != "material")
-            for name, words, inputs, outputs in table
-        ]
-
-    def _bring_up_to_date(self, step: Step, console: Console, title: str, run_step: StepRunner) -> None:
-        """Run a step unless its results are those of the same command and inputs."""
-        steps_path = self.output_dir / STEPS_NAME
-        done = read_json(steps_path, "delete it to make all steps again") if steps_path.is_file() else {}
-        fingerprint = step.fingerprint(self.output_dir)
-        before = done.get(step.name, {})
-        same = before.get("fingerprint") == fingerprint
-        if same and before["finished"] and all(path.is_file() for path in step.outputs):
-            console.print(f"{title}: up to date")
-            return
-        words = [*step.words]
-        if step.name == "train":
-            run = step.outputs[0].parent
-            if not same:
-                shutil.rmtree(run, ignore_errors=True)
-            elif any(run.glob("nerfstudio_models/*.ckpt")):
-                words += ["--load-dir", str(run / "nerfstudio_models")]
-        console.print(f"{title}\n{escape(shlex.join(words))}")
-        entry = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
-        write_json(steps_path, done | {step.name: entry})
-        logs = self.output_dir / "logs"
-        make_folder(logs)
-        # A training whose last stage is kept was killed between its end and the next line of steps.json.
-        if step.name != "train" or not (same and any(run.glob("stage-masked/*.ckpt"))):
+        count = len(session_steps(self.session, out, self))
+        for number in range(count):
+            # Anew each time: the traits are of the cloud that the material's step leaves, or not.
+            step = session_steps(self.session, out, self)[number]
+            title = f"[bold]{number + 1}/{count} {step.name}[/bold]"
             try:
-                cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
+                bring_up_to_date(step, out, console, title, run_step)
             except InputError as error:
                 if step.needed:
                     raise
-                for path in step.outputs:
-                    path.unlink(missing_ok=True)
+                step.remove_outputs()
                 console.print(f"[yellow]{escape(str(error))} The other steps do without.")
-                return
-            entry["seconds"] = round(cost.seconds, 1)
-        missing = [path for path in step.outputs if not path.is_file()]
-        if missing:
-            raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
-        write_json(steps_path, done | {step.name: entry | {"finished": True}})
+        _show_results(out, console)
 
 
 def _show_results(out: Path, console: Console) -> None:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from PIL import Image, UnidentifiedImageError
 
@@ -143,10 +143,7 @@ def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], section
         key_figures: numbers with their units to begin with, by name.
         sections: in their order.
     """
-    environment = Environment(
-        loader=PackageLoader(_PACKAGE), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    return environment.get_template("page.html").render(
+    return page_template(_PACKAGE, "page.html").render(
         title=title,
         subtitle=subtitle,
         key_figures=key_figures,
@@ -154,15 +151,23 @@ def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], section
         words=_WORDS,
         most_good=_MOST_GOOD,
         long_cell=_LONG_CELL,
-        styles=_own_text("page.css"),
-        scripts=Markup("\n").join(map(_own_text, _SCRIPTS)),
+        styles=own_text(_PACKAGE, "page.css"),
+        scripts=Markup("\n").join(own_text(_PACKAGE, name) for name in _SCRIPTS),
         footer="Made by hsi-sc-nerf report. This file is complete: it needs no network and no other file.",
     )
 
 
-def _own_text(name: str) -> Markup:
-    """A template file, which is not escaped."""
-    return Markup((files(_PACKAGE) / "templates" / name).read_text(encoding="utf-8"))
+def page_template(package: str, name: str) -> Template:
+    """A template of a package, which escapes every text."""
+    environment = Environment(
+        loader=PackageLoader(package), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template(name)
+
+
+def own_text(package: str, name: str) -> Markup:
+    """A file among a package's templates, which is not escaped."""
+    return Markup((files(package) / "templates" / name).read_text(encoding="utf-8"))
 
 
 def embedded_array(image: UInt8[np.ndarray, "h w 3"], alt: str) -> Markup:
@@ -187,7 +192,12 @@ def embedded_file(path: Path, alt: str) -> Markup:
 
 
 def _img(image: Image.Image, alt: str, lossless: bool, css_class: str) -> Markup:
+    tag = Markup('<img class="{}" alt="{}" width="{}" height="{}" src="{}">')
+    return tag.format(css_class, alt, image.width, image.height, data_address(image, lossless))
+
+
+def data_address(image: Image.Image, lossless: bool = False, quality: int = _QUALITY) -> str:
+    """Address that is the picture itself."""
     memory = io.BytesIO()
-    image.save(memory, "WEBP", lossless=lossless, quality=_QUALITY)
-    tag = Markup('<img class="{}" alt="{}" width="{}" height="{}" src="data:image/webp;base64,{}">')
-    return tag.format(css_class, alt, image.width, image.height, base64.b64encode(memory.getvalue()).decode())
+    image.save(memory, "WEBP", lossless=lossless, quality=quality)
+    return f"data:image/webp;base64,{base64.b64encode(memory.getvalue()).decode()}"

@@ -15,10 +15,11 @@ from contextlib import redirect_stdout
 import pytest
 from rich.console import Console
 
+from hsi_sc_nerf.batch.session_steps import STEPS_NAME, Step
 from hsi_sc_nerf.benchmark.steps import own_cost
 from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.cli.sessions import MarkersCommand
-from hsi_sc_nerf.cli.workflows import STEPS_NAME, DemoCommand, RunCommand, Step, _show_results
+from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand, _show_results
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands

@@ -10,7 +10,7 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
-from headless_browser import launch, needs_browser
+from headless_browser import launch, needs_browser, quiet_page
 
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.report import trait_content
@@ -202,19 +202,10 @@ def browser():
 
 @contextmanager
 def opened(browser, report, **window):
-    """The report in a window of its own, and what its console said."""
-    page = browser.new_page(reduced_motion="reduce", **window)
-    page.set_default_timeout(120_000)
-    messages, requests = [], []
-    page.on("console", lambda message: messages.append(message.text))
-    page.on("pageerror", lambda error: messages.append(str(error)))
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto(report.as_uri())
-    assert page.locator("#cloud").get_attribute("data-state") == "ready"
-    yield page
-    assert messages == []
-    assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [report.as_uri()]
-    page.close()
+    """The report in a window of its own, with the object drawn."""
+    with quiet_page(browser, report, **window) as page:
+        assert page.locator("#cloud").get_attribute("data-state") == "ready"
+        yield page
 
 
 def picked_mm(page):

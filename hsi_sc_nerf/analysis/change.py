@@ -1,0 +1,101 @@
+"""Days beside the first one: what changed since then, which areas grew since the day before, and areas of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hsi_sc_nerf.analysis.change_days import Day
+from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, Quantity, changes
+from hsi_sc_nerf.analysis.change_regions import GrownRegion, grown_regions
+from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
+from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.traits import Classes, classified
+from hsi_sc_nerf.indices.formula import SpectralIndex
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A day beside the first one, and its areas beside those of the day before it.
+
+    Attributes:
+        before: name of the first day.
+        after: the day.
+        quantities: changes since the first day, by name.
+        earlier: name of the day before it.
+        grown: regions of each quantity that had changed since the first day, on the day before and on this one.
+        classes: regions of each class, on the first day and on this one; empty without a library.
+    """
+
+    before: str
+    after: Day
+    quantities: Mapping[str, Quantity]
+    earlier: str
+    grown: Mapping[str, list[GrownRegion]]
+    classes: Mapping[str, list[GrownRegion]]
+
+
+def compare_days(
+    days: Sequence[Day],
+    bands_nm: Sequence[float],
+    indices: Sequence[SpectralIndex],
+    session_sd: float,
+    smallest_m2: float,
+    library: SpectralLibrary | None = None,
+    angle_rad: float = np.inf,
+) -> Iterable[Comparison]:
+    """Compare each day with the first, one after the other.
+
+    Args:
+        days: on one mesh, at least two.
+        bands_nm: wavelengths whose reflectance is compared.
+        indices: that are compared.
+        session_sd: `hsi_sc_nerf.analysis.change_maps.changes`.
+        smallest_m2: smaller regions are left out.
+        library: spectra to classify the surface by.
+        angle_rad: largest spectral angle of a class.
+
+    Raises:
+        InputError: too little is seen on both days, or the library or a wavelength does not fit the bands.
+    """
+    first, earlier = days[0], None
+    mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
+    at_first = None if library is None else classified(first.surface, library, angle_rad, smallest_m2)
+    for before, after in pairwise(days):
+        quantities = changes(first, after, bands_nm, indices, session_sd, smallest_m2)
+        grown = {}
+        for name, quantity in quantities.items():
+            then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed
+            grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed, smallest_m2)
+        classes = {}
+        if library is not None and at_first is not None:
+            now = classified(after.surface, library, angle_rad, smallest_m2)
+            classes = _class_regions(first, at_first, now, _beyond_noise(quantities), areas_m2, smallest_m2)
+        yield Comparison(first.name, after, quantities, before.name, grown, classes)
+        earlier = quantities
+
+
+def _beyond_noise(quantities: Mapping[str, Quantity]) -> Bool[np.ndarray, "v"]:
+    """Where the spectrum or its brightness changed; elsewhere another class is noise at the edge of two."""
+    told = [quantities[name] for name in (SPECTRUM, BRIGHTNESS) if name in quantities]
+    return np.any([one.changed | (one.p < FALSE_DISCOVERIES) for one in told], axis=0)
+
+
+def _class_regions(
+    first: Day,
+    before: Classes,
+    after: Classes,
+    beyond_noise: Bool[np.ndarray, "v"],
+    areas_m2: Float[np.ndarray, "v"],
+    smallest_m2: float,
+) -> dict[str, list[GrownRegion]]:
+    regions = {}
+    for number, name in enumerate(before.names):
+        was = before.mixture_labels == number
+        became = np.where(beyond_noise, after.mixture_labels == number, was)
+        regions[name] = grown_regions(first.surface.mesh, areas_m2, was, became, smallest_m2)
+    return regions

@@ -1,0 +1,113 @@
+"""An object on several days on one mesh, that of the first: spectra and surface of each day at its vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.analysis.change_features import surface_samples
+from hsi_sc_nerf.analysis.change_registration import Attitude, find_attitude
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import NEIGHBOURS, SpectralMesh, with_spectra
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud, material_spectra
+from hsi_sc_nerf.geometry.camera import Similarity
+
+SAME_BAND_NM = 1.0
+"""Bands of two days that are further apart are others."""
+SEEN_WITHIN = 2.0
+"""Smoothing radii from a vertex within which a day's cloud must have points: surfaces move."""
+_ONE_SIDED = 0.6
+"""Distance of the nearest points' mean over that of the furthest of them: 0.42 at a straight edge."""
+
+
+@dataclass(frozen=True)
+class Day:
+    """An object on a day.
+
+    Attributes:
+        name: of the day.
+        surface: the first day's mesh with this day's spectra.
+        raised_m: distance of this day's points from the mesh along its normals.
+        attitude: how the object was set down relative to the first day; None on that.
+    """
+
+    name: str
+    surface: SpectralMesh
+    raised_m: Float[np.ndarray, "v"]
+    attitude: Attitude | None
+
+
+def days_on_one_mesh(
+    clouds: Sequence[SpectralCloud],
+    names: Sequence[str],
+    config: MeshConfig,
+    max_incidence_deg: float,
+    track: Callable[[list[Similarity]], Iterable[Similarity]] = iter,
+) -> list[Day]:
+    """Register each later cloud to the first, and bring its spectra and its surface to the first one's mesh.
+
+    Spectra are the material's if all clouds have them.
+
+    Args:
+        clouds: of one object, in the order of days.
+        names: of the days.
+        config: of the mesh.
+        max_incidence_deg: points that no camera sees at a smaller angle give no spectra.
+        track: wraps the starts of each registration, for a progress bar.
+
+    Raises:
+        InputError: the clouds have other bands, a cloud is too small, or a day cannot be registered.
+    """
+    nm = clouds[0].wavelengths_nm
+    for cloud, name in zip(clouds, names, strict=True):
+        if len(cloud.wavelengths_nm) != len(nm) or np.abs(cloud.wavelengths_nm - nm).max() > SAME_BAND_NM:
+            raise InputError(f"{name}: has other bands than {names[0]}; export both with the same ones (--bands).")
+    spectra = [material_spectra(cloud) for cloud in clouds]
+    if any(one is None for one in spectra):
+        kept = ("views", "spectral_std", INCIDENCE)
+        clouds = [replace(one, extra={k: one.extra[k] for k in kept if k in one.extra}) for one in clouds]
+        spectra = [cloud.spectra for cloud in clouds]
+    known = [np.isfinite(one).all(axis=1) for one in spectra if one is not None]
+    clouds = [cloud.select(rows) for cloud, rows in zip(clouds, known, strict=True)]
+    samples = surface_samples(
+        clouds, [one[rows] for one, rows in zip(spectra, known, strict=True) if one is not None]
+    )
+
+    mesh = closed_mesh(clouds[0].points, clouds[0].normals, config)
+    normals = mesh.vertex_normals()
+    days: list[Day] = []
+    for cloud, name, sample in zip(clouds, names, samples, strict=True):
+        attitude, moved = None, cloud
+        if days:
+            try:
+                attitude = find_attitude(sample, samples[0], track)
+            except InputError as error:
+                raise InputError(f"{name} beside {names[0]}: {error}") from error
+            moved = replace(cloud, points=attitude.transform(cloud.points))
+        surface = with_spectra(mesh, moved, SEEN_WITHIN * config.smoothing_radius_m, max_incidence_deg)
+        raised_m, beyond_edge = _raised_m(moved.points, mesh.vertices, normals, config.smoothing_radius_m)
+        seen = surface.seen & ~beyond_edge
+        days.append(Day(name, replace(surface, seen=seen), np.where(seen, raised_m, np.nan), attitude))
+    return days
+
+
+def _raised_m(
+    points: Float[np.ndarray, "n 3"],
+    vertices_m: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    detail_m: float,
+) -> tuple[Float[np.ndarray, "v"], Bool[np.ndarray, "v"]]:
+    """Height of the points near each vertex above it, and whether it lies beyond their edge.
+
+    Beyond the edge, the nearest points all lie on one side, and their spectra say nothing of the vertex.
+    """
+    distance_m, near = cKDTree(points).query(vertices_m, k=min(NEIGHBOURS, len(points)))
+    offset = points[near].mean(axis=1) - vertices_m
+    raised_m = np.einsum("vj,vj->v", offset, normals)
+    aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
+    return raised_m, (aside_m > _ONE_SIDED * distance_m[:, -1]) & (aside_m > detail_m / 2.0)

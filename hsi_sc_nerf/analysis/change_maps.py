@@ -1,0 +1,185 @@
+"""What changed on a surface from one day to another: spectrum, brightness, bands, indices and the surface itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from hsi_sc_nerf.analysis.change_days import Day
+from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
+from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
+from hsi_sc_nerf.analysis.change_significance import (
+    FALSE_DISCOVERIES,
+    Patches,
+    Significance,
+    significance,
+    surface_patches,
+)
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.registration import robust_radius
+from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
+from hsi_sc_nerf.spectra import require_bands
+
+SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
+MISPLACED_M = 0.0003
+"""How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
+_LEAST_PATCHES = 20
+_NOISE_RATIO = 3.0
+"""Stated noise further from the usual one than this is not believed."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One property's change on the surface.
+
+    Attributes:
+        name: ``spectrum``, ``brightness``, ``surface``, ``R680`` or the name of an index.
+        unit: of the change; "rad" of the spectral angle, "mm" of the surface, else "1".
+        change: after less before at each vertex; of the spectrum, the spectral angle between the two. NaN where it is
+            not known.
+        p: adjusted for false discoveries, of the patch of each vertex; 1 where it is not known.
+        test: of the patches and of the whole surface.
+        region: number of each vertex's region, -1 outside.
+        regions: areas that changed beyond noise, and otherwise than the whole surface.
+    """
+
+    name: str
+    unit: str
+    change: Float[np.ndarray, "v"]
+    p: Float[np.ndarray, "v"]
+    test: Significance
+    region: Int[np.ndarray, "v"]
+    regions: list[ChangedRegion]
+
+    @property
+    def changed(self) -> Bool[np.ndarray, "v"]:
+        """Which vertices lie in a region."""
+        return self.region != OUTSIDE
+
+    @property
+    def whole(self) -> tuple[float, float]:
+        """Change of the whole surface and its standard deviation; of the spectrum, as an angle."""
+        if self.name == SPECTRUM:
+            return float(np.linalg.norm(self.test.whole)), float(np.linalg.norm(self.test.whole_sd))
+        return float(self.test.whole[0]), float(self.test.whole_sd[0])
+
+
+def changes(
+    before: Day,
+    after: Day,
+    bands_nm: Sequence[float],
+    indices: Sequence[SpectralIndex],
+    session_sd: float,
+    smallest_m2: float,
+) -> dict[str, Quantity]:
+    """The change of each quantity from one day to another, tested patch by patch, by name.
+
+    Args:
+        before: on the first day's mesh.
+        after: on the same mesh.
+        bands_nm: wavelengths whose reflectance is compared.
+        indices: that are compared.
+        session_sd: relative standard deviation of the reflectance that the white references of two sessions make
+            alike for the whole surface, as a level and as a slope over the bands.
+        smallest_m2: smaller regions are left out.
+
+    Raises:
+        InputError: too little of the surface is seen on both days, or a wavelength has no band near it.
+    """
+    one, other = before.surface, after.surface
+    seen = one.seen & other.seen
+    patches = surface_patches(one.mesh.vertices, one.areas_m2, seen)
+    if len(patches.areas_m2) < _LEAST_PATCHES:
+        raise InputError(
+            f"{after.name} beside {before.name}: hardly any surface is seen on both days; give clouds of one object."
+        )
+    misplaced_m = _misplaced_m(before, after, one.mesh.vertices)
+    noise = _relative_noise(before, after, patches)
+    modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
+    typical = np.median(one.spectra[seen], axis=0)[None]
+
+    def tested(
+        name: str,
+        unit: str,
+        values: tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]],
+        shared: Float[np.ndarray, "k"],
+        shown: Float[np.ndarray, "v"] | None = None,
+    ) -> Quantity:
+        first, last = (np.where(seen[:, None], each, np.nan) for each in values)
+        of_patches = patches.means(last - first, one.areas_m2)
+        slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
+        off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
+        test = significance(of_patches, patches.centres_m, noise, off, shared)
+        p = np.where(seen, test.p[patches.of_vertex], 1.0)
+        beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
+        region, regions = changed_regions(
+            one.mesh, one.areas_m2, patches, beyond, significant, test.noise, smallest_m2
+        )
+        change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
+        return Quantity(name, unit, change, p, test, region, regions)
+
+    found: dict[str, Quantity] = {}
+    if len(one.wavelengths_nm) > 1:
+        units = [unit_spectra(surface.spectra) for surface in (one, other)]
+        axes = _axes((units[1] - units[0])[seen])
+        shared = unit_spectra(typical * (1.0 + modes)) - unit_spectra(typical)
+        angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(units[1] - units[0], axis=1) / 2.0, 0.0, 1.0))
+        found[SPECTRUM] = tested(
+            SPECTRUM, "rad", (units[0] @ axes.T, units[1] @ axes.T), np.linalg.norm(shared @ axes.T, axis=0), angle
+        )
+    measured, then, usual = (
+        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (one.spectra, other.spectra, typical)
+    )
+    moved = [_scalars(typical * (1.0 + mode), one.wavelengths_nm, bands_nm, indices) for mode in modes]
+    for name, values in measured.items():
+        # An index of hardly any light is not defined.
+        if np.isfinite(patches.means((then[name] - values)[:, None], one.areas_m2)).sum() >= _LEAST_PATCHES:
+            shared = np.linalg.norm([each[name] - usual[name] for each in moved], axis=0)
+            found[name] = tested(name, "1", (values[:, None], then[name][:, None]), shared)
+    raised_mm = 1e3 * before.raised_m[:, None], 1e3 * after.raised_m[:, None]
+    found[SURFACE] = tested(SURFACE, "mm", raised_mm, np.zeros(1))
+    return found
+
+
+def _scalars(
+    spectra: Float[np.ndarray, "n bands"],
+    nm: Float[np.ndarray, "bands"],
+    bands_nm: Sequence[float],
+    indices: Sequence[SpectralIndex],
+) -> Mapping[str, Float[np.ndarray, "n"]]:
+    """Logarithm of brightness (its change is relative), reflectances and indices, by name."""
+    values = {BRIGHTNESS: np.log(np.maximum(spectra.mean(axis=1), 1e-4))}
+    for wavelength in bands_nm:
+        (band,) = require_bands(nm, [wavelength], "--band-nm")
+        values[f"R{wavelength:g}"] = spectra[:, band]
+    return values | {index.name: index_values(index, spectra, nm) for index in indices}
+
+
+def _axes(change: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "k bands"]:
+    """Principal components of the changes of spectra."""
+    vectors = np.linalg.eigh(np.cov(change, rowvar=False))[1]
+    return vectors[:, ::-1][:, : min(COMPONENTS, change.shape[1] - 1)].T
+
+
+def _misplaced_m(before: Day, after: Day, vertices_m: Float[np.ndarray, "v 3"]) -> float:
+    """Standard deviation of the distance between what is taken for one place on two days."""
+    radius_m, variance = robust_radius(vertices_m), MISPLACED_M**2
+    for attitude in (before.attitude, after.attitude):
+        if attitude is not None:
+            variance += radius_m**2 * (np.deg2rad(attitude.turn_sd_deg) ** 2 + attitude.growth_sd**2)
+    return float(np.sqrt(variance))
+
+
+def _relative_noise(before: Day, after: Day, patches: Patches) -> Float[np.ndarray, "p"]:
+    """Scatter of the frames on each patch on both days, relative to the usual one; 1 where it is not stated."""
+    first, last = before.surface.scatter, after.surface.scatter
+    if first is None or last is None:
+        return np.ones(len(patches.areas_m2))
+    of_patches = patches.means(np.hypot(first, last)[:, None], before.surface.areas_m2)[:, 0]
+    if not np.isfinite(of_patches).any():
+        return np.ones(len(patches.areas_m2))
+    ratio = of_patches / max(float(np.nanmedian(of_patches)), 1e-12)
+    return np.clip(np.nan_to_num(ratio, nan=1.0), 1.0 / _NOISE_RATIO, _NOISE_RATIO)

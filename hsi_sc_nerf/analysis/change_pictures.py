@@ -1,0 +1,119 @@
+"""Pictures of what changed on a surface, from four sides, and the days as a film."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps, rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.change import Comparison
+from hsi_sc_nerf.analysis.change_days import Day
+from hsi_sc_nerf.analysis.change_maps import SPECTRUM, Quantity
+from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
+from hsi_sc_nerf.analysis.pictures import GREY, SIDES_DEG, SideViews, draw_rows
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.plotting import ANGLE_COLOURS, INDEX_COLOURS, STYLE, new_figure, show_image
+from hsi_sc_nerf.rendering.pictures import open_video
+from hsi_sc_nerf.spectra import nearest_bands
+
+_FRAMES_PER_SECOND, _HELD_FRAMES, _FADE_FRAMES = 10, 15, 10
+_SMALLEST_P = 1e-6
+_BOTH_WAYS = "RdBu_r"
+
+
+@rc_context(STYLE)
+def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, views: SideViews) -> None:
+    """A quantity on the four sides: before, after, its change, and the p-values; grey is not seen on both days."""
+    colours, low, high, name = _scale(quantity)
+    p = -np.log10(np.clip(quantity.p, _SMALLEST_P, 1.0))
+    lit = colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3]
+    lit[~quantity.changed] *= 0.6
+    rows = {
+        "before": views.on_white(_natural(first, first)),
+        "after": views.on_white(_natural(one.after, first)),
+        f"{quantity.name}\nchange ({quantity.unit})": views.on_white(colours(quantity.change)),
+        "p-value, -log10\noutlined areas lit": views.on_white(
+            np.where(np.isfinite(quantity.change)[:, None], lit, GREY)
+        ),
+    }
+    draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
+
+
+@rc_context(STYLE)
+def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views: SideViews, shown: str) -> None:
+    """The days one after the other on one mesh, faded into each other: pseudo-RGB, and change since the first.
+
+    Args:
+        path: of the film, MP4.
+        first: the first day.
+        comparisons: the later days.
+        views: of the mesh.
+        shown: name of the quantity.
+    """
+    last = comparisons[-1].quantities[shown]
+    colours, *_ = _scale(last)
+    still = np.where(np.isfinite(last.change), 0.0, np.nan)
+    stills = [_frame(first.name, first, first, colours(still), views, shown)]
+    for one in comparisons:
+        changed = one.quantities[shown]
+        lit = np.where(
+            changed.p < FALSE_DISCOVERIES, changed.change, np.where(np.isfinite(changed.change), 0.0, np.nan)
+        )
+        stills.append(_frame(one.after.name, one.after, first, colours(lit), views, shown))
+    with atomic_write(path) as (temporary,), open_video(temporary, _FRAMES_PER_SECOND) as add_frame:
+        for before, after in pairwise([*stills, stills[-1]]):
+            for _ in range(_HELD_FRAMES):
+                add_frame(before)
+            for part in np.arange(1, _FADE_FRAMES + 1) / _FADE_FRAMES:
+                add_frame(np.rint((1.0 - part) * before + part * after).astype(np.uint8))
+
+
+def _frame(
+    name: str, day: Day, first: Day, change: Float[np.ndarray, "v 3"], views: SideViews, shown: str
+) -> UInt8[np.ndarray, "h w 3"]:
+    figure = new_figure(7.5, 4.2)
+    figure.suptitle(name)
+    grid = figure.subplots(2, len(SIDES_DEG))
+    for line, label, pictures in zip(
+        grid,
+        ("pseudo-RGB", f"{shown}\nsince {first.name}"),
+        map(views.on_white, (_natural(day, first), change)),
+        strict=True,
+    ):
+        for axes, picture in zip(line, pictures, strict=True):
+            show_image(axes, picture)
+        line[0].set_ylabel(label)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _natural(day: Day, first: Day) -> Float[np.ndarray, "v 3"]:
+    """Pseudo-RGB, brightened alike on all days."""
+    bands = nearest_bands(day.surface.wavelengths_nm, paper.PSEUDO_RGB_NM)
+    brightest = np.percentile(first.surface.spectra[first.surface.seen][:, bands], 99.0)
+    values = np.clip(day.surface.spectra[:, bands].astype(float) / max(brightest, 1e-6), 0.0, 1.0)
+    values[~day.surface.seen] = GREY
+    return values
+
+
+def _scale(
+    quantity: Quantity,
+) -> tuple[Callable[[Float[np.ndarray, "v"]], Float[np.ndarray, "v 3"]], float, float, str]:
+    """Colours of a change, and the ends and the name of their scale, up to the 99th percentile of this one."""
+    size = np.abs(quantity.change[np.isfinite(quantity.change)])
+    high = max(float(np.percentile(size, 99.0)) if len(size) else 0.0, 1e-6)
+    low, name = (0.0, ANGLE_COLOURS) if quantity.name == SPECTRUM else (-high, _BOTH_WAYS)
+
+    def colours(values: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
+        painted = colormaps[name](np.clip((np.nan_to_num(values) - low) / (high - low), 0.0, 1.0))[:, :3]
+        painted[~np.isfinite(values)] = GREY
+        return painted
+
+    return colours, low, high, name

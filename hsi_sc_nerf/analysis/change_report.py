@@ -1,0 +1,180 @@
+"""What changed over days as change.json, as a table with a row a region and pair of days, as a page, as PLY."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hsi_sc_nerf.analysis.change import Comparison
+from hsi_sc_nerf.analysis.change_days import Day
+from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
+from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.terminal import markdown_table, markdown_text
+
+COLUMNS = (
+    *("before", "after", "kind", "name", "region", "unit", "change", "change_sd", "p"),
+    *("area_before_cm2", "area_after_cm2", "area_change_cm2", "area_change_sd_cm2", "x_mm", "y_mm", "z_mm"),
+)
+"""Of change.csv."""
+WHOLE = "whole surface"
+_CM2_PER_M2 = 1e4
+_PAGE_REGIONS = 12
+
+
+def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
+    """The rows of change.csv: of each quantity the whole surface and its regions, areas grown since the day before,
+    and regions of classes that changed. Absent numbers are None."""
+    rows: list[dict[str, Any]] = []
+    for one in comparisons:
+        areas_m2 = one.after.surface.areas_m2
+        for name, quantity in one.quantities.items():
+            head = {"before": one.before, "after": one.after.name, "name": name, "unit": quantity.unit}
+            change, sd = quantity.whole
+            changed_m2 = float(areas_m2[quantity.changed].sum())
+            whole = {"region": WHOLE, "change": change, "change_sd": sd, "p": quantity.test.whole_p}
+            rows.append(head | {"kind": "change", **whole, **_areas(0.0, changed_m2)})
+            for number, region in enumerate(quantity.regions):
+                inside = quantity.region == number
+                mean = float(np.average(quantity.change[inside], weights=areas_m2[inside]))
+                told = {"region": str(number + 1), "change": mean, "p": float(quantity.p[inside].min())}
+                if name != SPECTRUM:
+                    told["change_sd"] = float(quantity.test.noise[0])
+                told |= _areas(0.0, region.area_m2, region.centre_m) | {
+                    "area_change_sd_cm2": _CM2_PER_M2 * region.area_sd_m2
+                }
+                rows.append(head | {"kind": "change"} | told)
+        # Beside the first day, the regions themselves are what grew.
+        grown = one.grown if one.earlier != one.before else {}
+        for kind, before, groups in (("grown", one.earlier, grown), ("class", one.before, one.classes)):
+            rows += [
+                {"before": before, "after": one.after.name, "kind": kind, "name": name, "region": str(number + 1)}
+                | _areas(region.before_m2, region.after_m2, region.centre_m)
+                for name, regions in groups.items()
+                for number, region in enumerate(regions)
+                if region.before_m2 != region.after_m2
+            ]
+    return [dict.fromkeys(COLUMNS) | row for row in rows]
+
+
+def _areas(before_m2: float, after_m2: float, centre_m: Sequence[float] = ()) -> dict[str, float]:
+    before, after = _CM2_PER_M2 * before_m2, _CM2_PER_M2 * after_m2
+    told = {"area_before_cm2": before, "area_after_cm2": after, "area_change_cm2": after - before}
+    return told | dict(zip(("x_mm", "y_mm", "z_mm"), (1e3 * x for x in centre_m), strict=False))
+
+
+def write_tables(
+    folder: Path, comparisons: Sequence[Comparison], settings: Mapping[str, Any], pictures: Mapping[str, str]
+) -> None:
+    """Write change.csv, change.md, and last change.json; NaN is null or empty.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    rows = change_rows(comparisons)
+    with (
+        atomic_write(folder / "change.csv") as (temporary,),
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows([_cell(row[column]) for column in COLUMNS] for row in rows)
+    parts = ["# Change over time", *_set_down(comparisons)]
+    parts += ["## What changed", *_table([row for row in rows if row["kind"] == "change"])]
+    for kind, heading in (("grown", "Areas since the day before"), ("class", "Areas of classes")):
+        if some := [row for row in rows if row["kind"] == kind]:
+            parts += [f"## {heading}", *_table(some)]
+    parts += ["## Pictures", *(f"{title}:\n\n![{title}]({name})" for title, name in pictures.items())]
+    parts.append("[The days as a film](change.mp4)")
+    with atomic_write(folder / "change.md") as (temporary,):
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    write_json(folder / "change.json", _content(comparisons, rows, settings))
+
+
+def _content(
+    comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    days = []
+    for one in comparisons:
+        assert one.after.attitude is not None
+        attitude = asdict(one.after.attitude)
+        attitude["transform"] = one.after.attitude.transform.matrix().tolist()
+        noise = {
+            name: {
+                "noise": quantity.test.noise.tolist(),
+                "correlation_length_m": quantity.test.length_m,
+                "independent_parts": quantity.test.independent,
+                "patches": len(quantity.test.p),
+            }
+            for name, quantity in one.quantities.items()
+        }
+        days.append({"name": one.after.name, "attitude": _plain(attitude), "noise": noise})
+    return {
+        "settings": dict(settings),
+        "first_day": comparisons[0].before,
+        "days": days,
+        "rows": [_plain(row) for row in rows],
+    }
+
+
+def _set_down(comparisons: Sequence[Comparison]) -> list[str]:
+    rows = []
+    for one in comparisons:
+        found = one.after.attitude
+        assert found is not None
+        rows.append(
+            [
+                *(one.after.name, f"{found.turn_deg:.2f} ± {found.turn_sd_deg:.2f}", f"{found.tip_deg:.1f}"),
+                *(f"{found.growth:.4f} ± {found.growth_sd:.4f}", f"{1e3 * found.residual_m:.2f}"),
+                "none" if math.isnan(found.rival_p) else f"{found.rival_turn_deg:.0f}° away, p = {found.rival_p:.1g}",
+            ]
+        )
+    header = ["day", "turn, °", "tip, °", "size relative to the first day", "distance of the surfaces, mm"]
+    note = (
+        f"Compared with {markdown_text(comparisons[0].before)}. The turn is about the table's axis, ± is a standard "
+        "deviation, and p the probability that another attitude fits so much worse by chance."
+    )
+    return ["## How the object was set down", markdown_table([*header, "next best attitude"], rows), note]
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    columns = [name for name in COLUMNS[:13] if name != "kind" and any(row[name] is not None for row in rows)]
+    listed = [row for row in rows if row["region"] == WHOLE or int(row["region"]) <= _PAGE_REGIONS]
+    cells = [[_cell(row[name], ".3g") for name in columns] for row in listed]
+    header = [name.replace("_cm2", ", cm²").replace("_", " ") for name in columns]
+    return [markdown_table(header, cells)] + (
+        [f"The largest {_PAGE_REGIONS} regions of each; change.csv has all."] if len(listed) < len(rows) else []
+    )
+
+
+def _cell(value: Any, numbers: str = ".6g") -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return ""
+    return format(value, numbers) if isinstance(value, float) else str(value)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
+
+
+def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:
+    """The first day's mesh and spectra; of each later day change, p-value and region of each quantity.
+
+    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` (0 outside) of the
+    second cloud. The surface's change is in metres, as all lengths of the file.
+    """
+    extra = {}
+    for day, one in enumerate(comparisons, start=1):
+        for name, quantity in one.quantities.items():
+            word = re.sub(r"\W+", "_", name.lower())
+            extra[f"{word}_change_{day}"] = quantity.change * (1e-3 if name == SURFACE else 1.0)
+            extra[f"{word}_p_{day}"] = quantity.p
+            extra[f"{word}_region_{day}"] = quantity.region + 1.0
+    write_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})

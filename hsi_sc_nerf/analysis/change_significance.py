@@ -1,0 +1,189 @@
+"""Whether a part of a surface changed by more than the errors of two clouds, which are smooth over centimetres.
+
+The errors of a cloud from a radiance field are biases that neighbours share, other ones in each run; the scatter of
+frames, which a cloud's columns state, says little of them. Their size is therefore taken from the changes themselves,
+robustly, as what most of the surface shows; how many independent parts that estimate rests on, from how far the
+changes of two patches are alike; and the test is Student's (or Hotelling's), whose tails know that they are few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import stats
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+PATCH_M = 0.005
+"""Size of the patches that are tested; finer ones would test the noise of single points."""
+FALSE_DISCOVERIES = 0.05
+"""Expected fraction of the patches called changed that did not (Benjamini and Yekutieli 2001)."""
+_BIWEIGHT = 9.0
+_BIWEIGHT_EFFICIENCY = 0.87
+"""Of the biweight scale with this constant, for normal errors: so much of the sample counts."""
+_CLIPPED = 3.0
+_BINS = 24
+_MOST_PATCHES = 1500
+"""Patches that the correlation is found from."""
+
+
+@dataclass(frozen=True)
+class Patches:
+    """The seen surface in compact pieces of about one size.
+
+    Attributes:
+        of_vertex: number of the patch of each vertex, -1 where it is not seen.
+        centres_m: of each patch.
+        areas_m2: of each patch.
+    """
+
+    of_vertex: Int[np.ndarray, "v"]
+    centres_m: Float[np.ndarray, "p 3"]
+    areas_m2: Float[np.ndarray, "p"]
+
+    def means(self, values: Float[np.ndarray, "v k"], areas_m2: Float[np.ndarray, "v"]) -> Float[np.ndarray, "p k"]:
+        """Mean of the vertices' values over each patch, weighted by area; NaN where one is not finite."""
+        seen = self.of_vertex >= 0
+        at, weight = self.of_vertex[seen], areas_m2[seen]
+        sums = [np.bincount(at, weight * column, len(self.areas_m2)) for column in values[seen].T]
+        return np.stack(sums, axis=1) / self.areas_m2[:, None]
+
+
+@dataclass(frozen=True)
+class Significance:
+    """Test of a change of each patch beyond that of the whole surface, and of the whole surface's.
+
+    Attributes:
+        p: probability of so large a change of each patch without one, adjusted for false discoveries; 1 if unknown.
+        noise: standard deviation of the changes of a usual patch, of each of the tested numbers.
+        length_m: distance at which the errors of two patches are correlated by 1 / e.
+        independent: number of independent parts of the surface.
+        whole: change of the whole surface (median over the patches).
+        whole_sd: its standard deviation.
+        whole_p: probability of so large a change without one.
+    """
+
+    p: Float[np.ndarray, "p"]
+    noise: Float[np.ndarray, "k"]
+    length_m: float
+    independent: float
+    whole: Float[np.ndarray, "k"]
+    whole_sd: Float[np.ndarray, "k"]
+    whole_p: float
+
+
+def surface_patches(
+    vertices_m: Float[np.ndarray, "v 3"], areas_m2: Float[np.ndarray, "v"], seen: Bool[np.ndarray, "v"]
+) -> Patches:
+    """Divide the seen vertices into patches: each belongs to the nearest centre of an occupied cube."""
+    points = vertices_m[seen]
+    if len(points) == 0:
+        return Patches(np.full(len(vertices_m), -1), np.zeros((0, 3)), np.zeros(0))
+    _, cube = np.unique(np.floor(points / PATCH_M).astype(int), axis=0, return_inverse=True)
+    count = np.bincount(cube.ravel())
+    seeds = np.stack([np.bincount(cube.ravel(), axis) for axis in points.T], axis=1) / count[:, None]
+    # A cube that the surface only grazes makes no patch.
+    nearest = cKDTree(seeds[count >= np.median(count) / 3.0]).query(points)[1]
+    _, number = np.unique(nearest, return_inverse=True)
+    of_vertex = np.full(len(vertices_m), -1)
+    of_vertex[seen] = number.ravel()
+    area = np.bincount(number.ravel(), areas_m2[seen])
+    centres = [np.bincount(number.ravel(), areas_m2[seen] * axis) for axis in points.T]
+    return Patches(of_vertex, np.stack(centres, axis=1) / area[:, None], area)
+
+
+def significance(
+    change: Float[np.ndarray, "p k"],
+    centres_m: Float[np.ndarray, "p 3"],
+    relative_noise: Float[np.ndarray, "p"],
+    misplaced: Float[np.ndarray, "p k"],
+    session_sd: Float[np.ndarray, "k"],
+) -> Significance:
+    """Test each patch's change against the errors that the changes of all patches show.
+
+    The change of a patch is k numbers, such as principal components of its spectrum. Beyond the whole surface's, it
+    has the variance ``noise² (1 + relative_noise²) / 2 + misplaced²``, whose ``noise`` is the biweight scale of all
+    patches; patches that changed hardly count in it while they are fewer than half. T², the sum of the k squared
+    ratios, is compared with Hotelling's distribution for as many observations as there are independent parts.
+
+    Args:
+        change: after less before, NaN where it is not known.
+        centres_m: of the patches.
+        relative_noise: stated noise of each patch relative to that of the usual one.
+        misplaced: change of each patch that an error of the registration would make.
+        session_sd: standard deviation of errors that a whole session shares.
+
+    Example:
+        >>> centres_m = np.random.default_rng(0).random((400, 3))
+        >>> change = np.random.default_rng(1).normal(size=(400, 1))
+        >>> change[0] = 30.0
+        >>> found = significance(change, centres_m, np.ones(400), np.zeros((400, 1)), np.zeros(1))
+        >>> np.flatnonzero(found.p < FALSE_DISCOVERIES)
+        array([0])
+    """
+    known = np.isfinite(change).all(axis=1)
+    used, dimensions = change[known], change.shape[1]
+    spread = np.sqrt((1.0 + np.square(relative_noise[known, None])) / 2.0)
+    whole = np.median(used, axis=0)
+    beyond = used - whole
+    noise = np.array([biweight_scale(column) for column in (beyond / spread).T])
+    ratio = beyond / np.sqrt(np.square(noise * spread) + np.square(misplaced[known]))
+    length_m, independent = correlation(ratio, centres_m[known])
+    observations = max(independent * _BIWEIGHT_EFFICIENCY, dimensions + 2.0)
+    p = np.ones(len(change))
+    p[known] = stats.false_discovery_control(
+        hotelling_p(np.square(ratio).sum(axis=1), dimensions, observations), method="by"
+    )
+    # The median of normal errors has pi / 2 times the variance of the mean.
+    whole_sd = np.sqrt(np.pi / 2.0 * np.square(noise) / independent + np.square(session_sd))
+    whole_p = hotelling_p(np.square(whole / whole_sd).sum(), dimensions, observations)
+    return Significance(p, noise, length_m, independent, whole, whole_sd, float(whole_p))
+
+
+def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
+    """Tukey's biweight midvariance as a standard deviation (Mosteller and Tukey 1977): outliers do not count.
+
+    Never 0, so that ratios to it are finite.
+    """
+    off = values - np.median(values)
+    within = 1.0 - np.square(off / max(_BIWEIGHT * np.median(np.abs(off)), 1e-12))
+    kept = within > 0.0
+    off, within = off[kept], within[kept]
+    weight = np.sum(within * (5.0 * within - 4.0))
+    variance = len(off) * np.sum(np.square(off) * within**4) / max(weight, 1e-12) ** 2
+    return float(max(np.sqrt(variance), 1e-9))
+
+
+def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
+    """Length over which changes of patches, in standard deviations, are alike, and how many are independent.
+
+    The mean product of pairs over their distance falls to 1 / e at that length. For errors that decay exponentially
+    the variance of a mean over n patches is that of ``n² / sum exp(-distance / length)`` independent ones.
+    """
+    if len(ratio) > _MOST_PATCHES:
+        chosen = np.random.default_rng(0).choice(len(ratio), _MOST_PATCHES, replace=False)
+        ratio, centres_m = ratio[chosen], centres_m[chosen]
+    clipped = np.clip(ratio, -_CLIPPED, _CLIPPED)
+    clipped = clipped - clipped.mean(axis=0)
+    distance_m = cdist(centres_m, centres_m)
+    product = clipped @ clipped.T / max(np.square(clipped).sum() / len(clipped), 1e-12)
+    edges = np.arange(_BINS + 1) * PATCH_M + PATCH_M / 2.0
+    each = np.digitize(distance_m.ravel(), edges)
+    count = np.bincount(each, minlength=_BINS + 2)
+    mean = np.bincount(each, product.ravel(), _BINS + 2) / np.maximum(count, 1)
+    # Bin 0 holds each patch with itself; bin b the pairs about b patches apart.
+    at, value = np.arange(_BINS + 1) * PATCH_M, np.concatenate([[1.0], mean[1 : _BINS + 1]])
+    below = np.flatnonzero((value < np.exp(-1.0)) & (count[: _BINS + 1] > 0))
+    last = int(below[0]) if len(below) else _BINS
+    high, low = value[last - 1], min(value[last], np.exp(-1.0))
+    length_m = float(at[last - 1] + PATCH_M * (high - np.exp(-1.0)) / max(high - low, 1e-12))
+    return length_m, float(len(ratio) ** 2 / np.exp(-distance_m / max(length_m, 1e-9)).sum())
+
+
+def hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:
+    """Chance of a larger T² of so many numbers whose variances come from so many observations (Hotelling 1931)."""
+    free = observations - 1.0
+    last = free - dimensions + 1.0
+    return stats.f.sf(squares * last / (dimensions * free), dimensions, last)

@@ -1,0 +1,180 @@
+"""One object's row of the table, from the files of its folder; whatever is damaged there becomes its status."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hsi_sc_nerf.analysis.report import SIZES
+from hsi_sc_nerf.analysis.traits import WHOLE
+from hsi_sc_nerf.batch import columns
+from hsi_sc_nerf.batch.columns import Column, Value
+from hsi_sc_nerf.batch.plan import STEPS
+from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME
+from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
+from hsi_sc_nerf.report.page import content_of
+
+OPTIONAL_STEPS = ("inspect", "material")
+"""Where one of these fails, the others do without."""
+_AGAIN = "delete it and start the batch again"
+_LEVELS = ("green", "amber", "red")
+_CM2_PER_M2 = 1e4
+Cells = dict[Column, Value]
+Tells = Callable[[dict[str, Any]], Iterator[tuple[Column, Value]]]
+"""What is to be read from the content of a file."""
+
+
+class _Trouble(NamedTuple):
+    status: str
+    step: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """What is known of one object.
+
+    Attributes:
+        cells: values by column; what is missing has none.
+        report: its report, if there is one.
+    """
+
+    cells: Cells
+    report: Path | None
+
+
+def read_object(folder: Path) -> ObjectRow:
+    """The row of the object whose results lie in ``folder``; nothing there can make it fail.
+
+    Example:
+        >>> row = read_object(Path("season/objects/pear_01"))
+        >>> row.cells[STATUS]
+        'done'
+    """
+    wrong: list[_Trouble] = []
+
+    def tried(step: str, path: Path, tells: Tells) -> Cells:
+        """What a file tells; nothing where it is not there or damaged."""
+        try:
+            return _read(path, step, tells)
+        except InputError as error:
+            wrong.append(_Trouble("damaged", step, str(error).replace(f"{folder}/", "")))
+            return {}
+
+    cells: Cells = {}
+    for step in STEPS:
+        found = tried(step, folder / "steps" / f"{step}.json", partial(_cost, step))
+        if found.pop(columns.STATUS, None) == "failed":
+            wrong.append(_Trouble("failed", step, str(found[columns.SENTENCE])))
+        cells |= {column: value for column, value in found.items() if column is not columns.SENTENCE}
+    failed = [one.step for one in wrong if one.status == "failed" and one.step not in OPTIONAL_STEPS]
+    # What lies there of later steps is of an earlier attempt.
+    lost = STEPS[STEPS.index(failed[0]) :] if failed else ()
+    for total, parts, combined in ((columns.TOTAL, columns.SECONDS, math.fsum), (columns.PEAK, columns.MEMORY, max)):
+        known = [value for column in parts.values() if isinstance(value := cells.get(column), float)]
+        if known:
+            cells[total] = combined(known)
+
+    checks = folder / "data" / CHECKS_PATH
+    cells |= tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)
+    traits = {} if "traits" in lost else tried("traits", folder / "traits" / "traits.json", _traits)
+    scores = {} if "evaluate" in lost else tried("evaluate", folder / "eval.json", _scores)
+    serious = [one for one in wrong if one.status == "damaged" or one.step not in OPTIONAL_STEPS]
+    status = serious[0].status if serious else "done" if traits and scores else "unfinished"
+    told = (serious or wrong or [_Trouble("", "", "")])[0]
+    state: Cells = {columns.STATUS: status, columns.STEP: told.step, columns.SENTENCE: told.sentence}
+    report = folder / "report.html"
+    return ObjectRow(cells | traits | scores | state, report if report.is_file() and "report" not in lost else None)
+
+
+def _read(path: Path, step: str, tells: Tells) -> Cells:
+    """What a file tells; nothing where it is not there.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    if not path.is_file():
+        return {}
+    with content_of(path, f"results of the step {step}", _AGAIN):
+        return dict(tells(read_json(path, _AGAIN)))
+
+
+def _cost(step: str, content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+    """Of a step: whether it was done, failed or was skipped after a failure; the sentence; time and memory."""
+    yield columns.STATUS, str(content["status"])
+    # As an error's text it is one line, of a length that can be read.
+    yield columns.SENTENCE, str(InputError(content.get("sentence") or ""))
+    # Nothing was run, and 0 recorded, where a step was skipped or up to date.
+    yield columns.SECONDS[step], _number(content.get("seconds")) or None
+    yield columns.MEMORY[step], _number(content.get("peak_memory_mib")) or None
+
+
+def _traits(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+    closed = bool(content["watertight"])
+    for key, (_, _, factor) in SIZES.items():
+        value, sd = columns.SIZE[key]
+        if closed or key not in ("volume_l", "equivalent_diameter_m"):
+            yield value, _number(content["size"][key], factor)
+            yield sd, _number((content["size_sd"] or {}).get(key), factor)
+    yield columns.WATERTIGHT, closed
+    yield columns.SEEN_AREA, _number(content["seen_area_m2"], _CM2_PER_M2)
+    regions: Mapping[str, Any] = content["regions"]
+    for key, value in regions[WHOLE]["reflectance"].items():
+        if key in columns.REFLECTANCE:
+            yield columns.REFLECTANCE[key], _number(value)
+    for index, found in regions[WHOLE]["indices"].items():
+        yield from zip(columns.index_columns(index), (_number(found["mean"]), _number(found["sd"])), strict=True)
+    for name, found in regions[WHOLE]["calibrations"].items():
+        of = columns.calibration_columns(name, str(content["calibrations"][name]["unit"]))
+        yield from zip(of, (_number(found["mean"]), _number(found["sd"])), strict=True)
+    if content["classes"]:
+        yield from _classes(content["classes"], float(content["seen_area_m2"]))
+    for name, region in regions.items():
+        if name != WHOLE:
+            area, *reflectance = columns.region_columns(name)
+            yield area, _number(region["area_m2"], _CM2_PER_M2)
+            yield from zip(reflectance, (_number(region["reflectance"][key]) for key in ("mean", "std")), strict=True)
+            for index, found in region["indices"].items():
+                yield columns.region_index_column(name, index), _number(found["mean"])
+
+
+def _classes(classes: Mapping[str, Any], seen_m2: float) -> Iterator[tuple[Column, Value]]:
+    areas_m2 = {**classes["areas_m2"], "in no class": classes["unclassified_m2"]}
+    mixtures_m2 = {**classes["mixture_areas_m2"], "in no class": classes["mixture_unclassified_m2"]}
+    for name, area_m2 in areas_m2.items():
+        area, fraction, mixture = columns.class_columns(name)
+        yield area, _number(area_m2, _CM2_PER_M2)
+        yield fraction, _number(area_m2, 1.0 / seen_m2)
+        yield mixture, _number(mixtures_m2[name], 1.0 / seen_m2)
+
+
+def _scores(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+    for key, column in columns.SCORES.items():
+        yield column, _number(content["results"][key])
+
+
+def _findings(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+    levels = [(_LEVELS.index(finding["level"]), str(finding["name"])) for finding in content["findings"]]
+    if levels:
+        yield columns.QUALITY, _LEVELS[max(levels)[0]]
+        yield columns.FLAGS, ";".join(dict.fromkeys(name for level, name in levels if level))
+
+
+def _number(value: Any, factor: float = 1.0) -> float | None:
+    """A number of a file in the column's unit; None where it is null or not finite.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{shown(value)} is no number")
+    scaled = factor * float(value)
+    return scaled if math.isfinite(scaled) else None

@@ -1,0 +1,123 @@
+"""What a batch is to do: its objects with their steps, kept in its folder where every machine reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, cast, get_args
+
+from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions, sessions_table
+from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date, session_steps
+from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.files import atomic_write, read_json, write_json
+from hsi_sc_nerf.models.presets import Preset
+
+LIST_NAME, SETTINGS_NAME = "sessions.csv", "settings.json"
+INSPECTION_NAME = "inspection.json"
+"""As in `inspection.inspect`, whose import takes seconds: each step of each object would wait for it."""
+STEPS = ("inspect", "process", "train", "evaluate", "export", "material", "traits", "report")
+"""The steps of an object, in order."""
+_AGAIN = "start `hsi-sc-nerf batch` again"
+
+
+@dataclass(frozen=True)
+class PlannedObject:
+    """One object of a batch.
+
+    Attributes:
+        session: folder of its captures.
+        folder: of its results.
+        settings: of its steps.
+    """
+
+    session: Path
+    folder: Path
+    settings: SessionSettings
+
+    def step(self, name: str) -> Step:
+        """The command of a step, as things stand in the folder."""
+        if name == "inspect":
+            words = ("hsi-sc-nerf", "inspect", str(self.session), "--output-dir", str(self.folder))
+            # What is red there may have been accepted for `process`, which makes the same checks and decides.
+            return Step(name, words, (self.session,), (self.folder / INSPECTION_NAME,), needed=False)
+        return {step.name: step for step in session_steps(self.session, self.folder, self.settings)}[name]
+
+    def record(self, step: str) -> Path:
+        """The file that says how a step ended."""
+        return self.folder / "steps" / f"{step}.json"
+
+
+def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings) -> None:
+    """Keep what is to be done in ``out``, where `read_plan` finds it; what is unchanged is not written anew.
+
+    Raises:
+        InputError: words of a row cannot be used.
+    """
+    for row in rows:
+        _settings_of(row, settings)
+    table = sessions_table(rows)
+    path = out / LIST_NAME
+    if not path.is_file() or path.read_text(encoding="utf-8") != table:
+        with atomic_write(path) as (temporary,):
+            temporary.write_text(table, encoding="utf-8")
+    write_json(out / SETTINGS_NAME, asdict(settings))
+
+
+def read_plan(out: Path) -> dict[str, PlannedObject]:
+    """The objects of a batch by their names.
+
+    Args:
+        out: folder of the batch.
+
+    Raises:
+        InputError: there is no batch, or its files were changed.
+
+    Example:
+        >>> read_plan(Path("season"))["pear_01"].step("process").words[:2]
+        ('hsi-sc-nerf', 'process')
+    """
+    known: Mapping[str, Any] = read_json(out / SETTINGS_NAME, _AGAIN)
+    try:
+        settings = SessionSettings(**known)
+    except TypeError as error:
+        raise InputError(f"{out / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
+    root = out.resolve() / "objects"
+    return {
+        row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings))
+        for row in read_sessions(out / LIST_NAME, may_be_gone=True)
+    }
+
+
+def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
+    """Records of steps that are to be made again: inputs, words or results are not those of the record.
+
+    Args:
+        objects: of the batch.
+        retry: also of the steps that failed.
+    """
+    found = []
+    for one in objects.values():
+        for name in STEPS:
+            if not one.record(name).is_file():
+                continue
+            status = read_json(one.record(name), f"delete it and {_AGAIN}").get("status")
+            step = one.step(name)
+            if status == "done" and not is_up_to_date(step, one.folder):
+                found.append(one.record(name))
+            if status == "failed" and (retry or not step.was_tried(one.folder)):
+                found.append(one.record(name))
+    return found
+
+
+def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
+    """The settings of an object: the batch's, its own preset, and its own words after the batch's."""
+    preset = row.get("preset") or settings.preset
+    if preset not in get_args(Preset):
+        choices = ", ".join(get_args(Preset))
+        raise InputError(f"the object {row[OBJECT]}: its preset {shown(preset)} is none; there are {choices}.")
+    process, train = (f"{getattr(settings, key)} {row.get(key, '')}".strip() for key in ("process", "train"))
+    for text in (process, train):
+        split_words(text)
+    return replace(settings, preset=cast(Preset, preset), process=process, train=train)

@@ -1,0 +1,105 @@
+"""The list of sessions that a batch works on: a folder of sessions, or a table of the user."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hsi_sc_nerf.errors import InputError, shown
+
+OBJECT, SESSION = "object", "session"
+_NAME = re.compile(r"[^\W_][\w.-]*")
+_NAME_RULE = "a name is of letters, digits, dots, dashes and underscores and begins with a letter or a digit"
+Row = dict[str, str]
+"""Cells by column: the object, its session, and the user's own."""
+
+
+def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
+    """The objects and their sessions, in order; the sessions as absolute paths.
+
+    Args:
+        path: a folder whose folders are sessions, or a CSV with the columns ``object`` and ``session`` and any
+            others, as a spreadsheet writes it (commas, semicolons or tabs; UTF-8). There, a session's folder is
+            relative to the file's own.
+        may_be_gone: whether folders of sessions may be missing by now.
+
+    Raises:
+        InputError: a column or a folder is missing, a name is no folder's or comes twice, or it is no table.
+
+    Example:
+        >>> rows = read_sessions(Path("season.csv"))
+        >>> rows[0]["object"]
+        'pear_01'
+    """
+    if path.is_dir():
+        # Deferred because it takes a second to import: each step of each object would wait for it.
+        from hsi_sc_nerf.capture.session import is_session
+
+        folders = sorted(one for one in path.iterdir() if one.is_dir() and is_session(one))
+        if not folders:
+            raise InputError(f"{path}: holds no sessions; give the folder that the folders of the sessions lie in.")
+        rows = [(str(one), {OBJECT: one.name, SESSION: str(one.resolve())}) for one in folders]
+    else:
+        rows = [(f"{path}, line {line}", row) for line, row in _read_table(path)]
+        if not rows:
+            raise InputError(f"{path}: lists no sessions; write a line for each below its titles.")
+    names: set[str] = set()
+    for where, row in rows:
+        name = row[OBJECT]
+        if not _NAME.fullmatch(name) or len(name) > 100:
+            raise InputError(f"{where}: {shown(name)} cannot be the name of a folder; {_NAME_RULE}.")
+        # Some file systems take names for the same that differ in case only.
+        if name.casefold() in names:
+            raise InputError(f"{where}: the object {shown(name)} comes twice; give each session a name of its own.")
+        names.add(name.casefold())
+        if not row[SESSION]:
+            raise InputError(f"{where}: names no session; write its folder in the column '{SESSION}'.")
+        folder = path.parent / row[SESSION]
+        if not (may_be_gone or folder.is_dir()):
+            raise InputError(f"{where}: there is no folder {folder}; mend the path or leave out the line.")
+        row[SESSION] = str(folder.resolve())
+    return [row for _, row in rows]
+
+
+def sessions_table(rows: Sequence[Row]) -> str:
+    """The list as CSV text, object and session first."""
+    text = io.StringIO()
+    titles = [OBJECT, SESSION, *(title for title in rows[0] if title not in (OBJECT, SESSION))]
+    writer = csv.DictWriter(text, titles, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
+    """Line and cells of each row of a CSV."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a folder of sessions or a CSV.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no UTF-8 text; save it as 'CSV UTF-8' in the spreadsheet.") from error
+    first = text.partition("\n")[0]
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count), strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: is no table after line {reader.line_num} ({error}); save it as CSV.") from error
+    titles = lines[0][1] if lines else []
+    for title in (OBJECT, SESSION):
+        if title not in titles:
+            raise InputError(f"{path}: has no column '{title}'; its first line names {OBJECT}, {SESSION} and others.")
+    if "" in titles or len(set(titles)) < len(titles):
+        raise InputError(f"{path}: a column has no title, or two have the same; give each a title of its own.")
+    for line, cells in lines[1:]:
+        if not any(cells):
+            continue
+        if len(cells) != len(titles):
+            raise InputError(
+                f"{path}, line {line}: has {len(cells)} cells and not {len(titles)}; put quotation marks around a "
+                "cell that holds the separator."
+            )
+        yield line, dict(zip(titles, cells, strict=True))

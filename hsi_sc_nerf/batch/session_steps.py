@@ -1,0 +1,216 @@
+"""The commands of one session, from captures to a report: what `run` and the workflow of `batch` both do."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shlex
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf import __version__
+from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.benchmark.steps import StepCost, typed_command
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import make_folder, read_json, write_json
+from hsi_sc_nerf.models.presets import Preset
+from hsi_sc_nerf.settings_file import between
+
+STEPS_NAME = "steps.json"
+"""File of the output folder that says which steps were done with what; it marks the folder as a run's."""
+MATERIAL_NAME = "point_cloud-material.json"
+"""File of the output folder that says what was decided of the light on the object."""
+StepRunner = Callable[[str, Sequence[str], Path], StepCost]
+"""Runs a command; gets the step's name, the command and the file for its output."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of the run.
+
+    Attributes:
+        name: shown, and the name of the log.
+        words: the command as a user would type it.
+        inputs: files and folders that its results depend on.
+        outputs: files that it leaves.
+        needed: whether the run ends where it fails.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    inputs: tuple[Path, ...]
+    outputs: tuple[Path, ...]
+    needed: bool = True
+
+    def fingerprint(self, outside: Path) -> str:
+        """Hash of command, version, and sizes and times of the inputs but for those in the folder ``outside``.
+
+        An input that lies in that folder itself is a result of an earlier step, and counts.
+        """
+        digest = hashlib.sha256(json.dumps([__version__, self.words]).encode())
+        for path in self.inputs:
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                if file.is_file() and (outside in path.parents or outside not in file.parents):
+                    state = file.stat()
+                    digest.update(f"{file} {state.st_size} {state.st_mtime_ns}\n".encode())
+        return digest.hexdigest()
+
+    def was_tried(self, out: Path) -> bool:
+        """Whether it was started with the same command and inputs, however it ended."""
+        return bool(_entries(out).get(self.name, {}).get("fingerprint") == self.fingerprint(out))
+
+    def remove_outputs(self) -> None:
+        """Remove what the command left, such as half of its results where it failed."""
+        for path in self.outputs:
+            path.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionSettings:
+    """What a user may choose of the steps."""
+
+    preset: Preset = "balanced"
+    """How long to train: on two cores without a GPU fast takes about one minute, balanced five and best twenty; on a
+    GPU 10 seconds, one minute and seven."""
+    max_num_iterations: int | None = between(1, math.inf, default=None)
+    """Training steps of both stages together, in place of the preset's."""
+    num_points: int = between(1, math.inf, default=200_000)
+    """Number of points of the cloud."""
+    process: str = ""
+    """More words for `hsi-sc-nerf process`, joined to the option by an equals sign: --process="--poses colmap"."""
+    train: str = ""
+    """More words for `ns-train hsi-sc-nerf`, likewise: --train="--pipeline.model.head direct"."""
+    material: str = ""
+    """More words for `hsi-sc-nerf material`, likewise, such as the direction that the white reference faced:
+    --material="--white-azimuth-deg -35"."""
+    traits: str = ""
+    """More words for `hsi-sc-nerf traits`, likewise: --traits="--index PRI --index CRI1"."""
+
+
+def session_steps(session: Path, out: Path, settings: SessionSettings) -> list[Step]:
+    """The commands from a session to its report, in order.
+
+    Args:
+        session: folder of the captures.
+        out: folder for all results. The traits are of the cloud that the material's step leaves there, or not.
+        settings: what the user chose.
+
+    Example:
+        >>> [step.name for step in session_steps(Path("session"), Path("out"), SessionSettings())][:3]
+        ['process', 'train', 'evaluate']
+    """
+    data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
+    material = out / "point_cloud-material.ply"
+    with_material = material if material.is_file() else cloud
+    run = out / "training" / "hsi-sc-nerf" / "run"
+    config, weights = run / "config.yml", run / "nerfstudio_models"
+    packed = data / "transforms.json"
+    training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
+    training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", settings.preset]
+    if settings.max_num_iterations is not None:
+        training += ["--max-num-iterations", settings.max_num_iterations]
+    evaluating = ["ns-eval", "--load-config", config, "--output-path", out / "eval.json"]
+    exporting = ["ns-export", "pointcloud", "--load-config", config, "--output-dir", out]
+    exporting += ["--num-points", settings.num_points]
+    measuring = ["hsi-sc-nerf", "traits", with_material, "--data", data, "--output-dir", traits]
+    reporting = ["hsi-sc-nerf", "report", run, "--output", out / "report.html", "--cloud", cloud]
+    table: list[tuple[str, list[Any], tuple[Path, ...], tuple[Path, ...]]] = [
+        (
+            "process",
+            ["hsi-sc-nerf", "process", session, "--output-dir", data, *split_words(settings.process)],
+            (session,),
+            (packed,),
+        ),
+        ("train", [*training, *split_words(settings.train)], (packed, data / "masks"), (config,)),
+        ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
+        ("export", exporting, (packed, weights), (cloud,)),
+        (
+            "material",
+            ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(settings.material)],
+            (packed, weights, cloud),
+            (material, out / MATERIAL_NAME),
+        ),
+        (
+            "traits",
+            [*measuring, *split_words(settings.traits)],
+            (packed, with_material),
+            (traits / "traits.json",),
+        ),
+        (
+            "report",
+            [*reporting, "--traits", traits / "traits.json"],
+            (packed, weights, cloud, traits / "traits.json"),
+            (out / "report.html",),
+        ),
+    ]
+    return [
+        Step(name, tuple(map(str, words)), inputs, outputs, name != "material")
+        for name, words, inputs, outputs in table
+    ]
+
+
+def is_up_to_date(step: Step, out: Path) -> bool:
+    """Whether a step's results are there, of the same command and inputs."""
+    finished = step.was_tried(out) and _entries(out)[step.name]["finished"]
+    return finished and all(path.is_file() for path in step.outputs)
+
+
+def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_step: StepRunner) -> StepCost:
+    """Run a step unless its results are those of the same command and inputs; a training goes on where it stopped.
+
+    Args:
+        step: one of `session_steps`.
+        out: folder of the results.
+        console: for the title and the command.
+        title: of the step.
+        run_step: runs the command.
+
+    Returns:
+        What it cost, now or when it was done.
+
+    Raises:
+        InputError: it failed, or left no results.
+    """
+    if is_up_to_date(step, out):
+        console.print(f"{title}: up to date")
+        return _cost(step.name, _entries(out)[step.name])
+    done, fingerprint = _entries(out), step.fingerprint(out)
+    words = [*step.words]
+    same = step.was_tried(out)
+    run = step.outputs[0].parent
+    if step.name == "train":
+        if not same:
+            shutil.rmtree(run, ignore_errors=True)
+        elif any(run.glob("nerfstudio_models/*.ckpt")):
+            words += ["--load-dir", str(run / "nerfstudio_models")]
+    console.print(f"{title}\n{escape(shlex.join(words))}")
+    entry: dict[str, Any] = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
+    write_json(out / STEPS_NAME, done | {step.name: entry})
+    logs = out / "logs"
+    make_folder(logs)
+    # A training whose last stage is kept was killed between its end and the next line of steps.json.
+    if step.name != "train" or not (same and any(run.glob("stage-masked/*.ckpt"))):
+        cost = run_step(step.name, typed_command(words), logs / f"{step.name}.log")
+        entry |= {"seconds": round(cost.seconds, 1), "peak_memory_mib": round(cost.peak_memory_mib, 1)}
+    missing = [path for path in step.outputs if not path.is_file()]
+    if missing:
+        raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
+    write_json(out / STEPS_NAME, done | {step.name: entry | {"finished": True}})
+    return _cost(step.name, entry)
+
+
+def _cost(name: str, entry: dict[str, Any]) -> StepCost:
+    return StepCost(name, entry.get("seconds", 0.0), entry.get("peak_memory_mib", 0.0))
+
+
+def _entries(out: Path) -> dict[str, Any]:
+    """What the output folder says of its steps, by name."""
+    path = out / STEPS_NAME
+    return read_json(path, "delete it to make all steps again") if path.is_file() else {}

@@ -1,0 +1,117 @@
+"""Command on many sessions: ``batch``, a workflow that Snakemake runs on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from hsi_sc_nerf import batch
+from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, write_plan
+from hsi_sc_nerf.batch.session_list import read_sessions
+from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import make_folder, read_json
+from hsi_sc_nerf.settings_file import check_options
+
+SNAKEFILE = Path(batch.__file__).with_name("Snakefile")
+_ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
+"""Words of Snakemake after which another than this machine, or the user's profile, says how many jobs may run."""
+
+
+@dataclass(frozen=True)
+class BatchCommand(SessionSettings):
+    """Do the steps of `run` on many sessions, here or on a cluster, and collect them in one table and one page.
+
+    A session that fails does not stop the others; the table has its sentence. Started again, the command does what is
+    missing, and what failed where its session or its words were changed. Words that it does not know, after its own,
+    go to Snakemake unchanged, such as --executor slurm --jobs 50.
+    """
+
+    sessions: tyro.conf.Positional[Path | None] = None
+    """Folder of the sessions' folders, or a CSV with the columns object and session, and others of your own. Its
+    columns preset, process and train hold settings of single sessions; their words follow those of the options."""
+    output_dir: Path | None = None
+    """Folder for the results: sessions.csv, objects/NAME, traits.csv and index.html."""
+    dry_run: bool = False
+    """Show what would be done, and do nothing."""
+    retry: bool = False
+    """Try the steps again that failed."""
+    gpu: bool = shutil.which("nvidia-smi") is not None
+    """Ask for a GPU for each step that computes on one; by default where this machine has one."""
+    snakefile: bool = False
+    """Print where the workflow lies, and end."""
+    other_words: tyro.conf.Suppress[tuple[str, ...]] = ()
+    """Words for Snakemake."""
+
+    def main(self) -> None:
+        """Start the workflow.
+
+        Raises:
+            InputError: the list of sessions cannot be used, another batch works in the folder, or a job was lost.
+        """
+        check_options(self)
+        if self.snakefile:
+            print(SNAKEFILE)
+            return
+        if self.sessions is None or self.output_dir is None:
+            raise InputError(
+                "sessions or --output-dir are missing; write hsi-sc-nerf batch SESSIONS --output-dir OUT."
+            )
+        if find_spec("snakemake") is None:
+            raise InputError("Snakemake is not installed; pip install 'hsi-sc-nerf[batch]' (Python 3.11 or newer).")
+        out, rows = self.output_dir, read_sessions(self.sessions)
+        if any((out / ".snakemake" / "locks").glob("*")) and not {"--unlock", "--nolock"} & {*self.other_words}:
+            raise InputError(
+                f"{out}: another batch works there, or was killed; if none runs on any machine, start this one once "
+                "with --unlock, and again."
+            )
+        make_folder(out)
+        settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
+        write_plan(out, rows, settings)
+        again = [str(path.relative_to(out.resolve())) for path in outdated(read_plan(out), self.retry)]
+        words = ["--config", f"gpu={self.gpu}", "--keep-going", "--rerun-incomplete"]
+        words += ["--rerun-triggers", "mtime", "input"]
+        words += ["--forcerun", *again] if again else []
+        words += ["--dry-run"] if self.dry_run else []
+        if not any(word.split("=")[0] in _ELSEWHERE for word in self.other_words):
+            memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
+            words += ["--resources", "gpu=1", f"mem_mb={memory_mb}", "--cores", "all"]
+        # Last a word that takes one value: the user's may begin with the name of a rule.
+        words += ["--snakefile", str(SNAKEFILE.resolve()), "--directory", str(out)]
+        status = _snakemake([*words, *self.other_words])
+        if status != 0:
+            raise InputError(f"{out}: Snakemake ended early, see above; the same command goes on where it stopped.")
+        if not self.dry_run:
+            _show_failures(out)
+
+
+def _snakemake(words: list[str]) -> int:
+    """Run Snakemake in this process, so that what ends one ends the other; its exit status."""
+    from snakemake.cli import main
+
+    try:
+        main(words)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0
+
+
+def _show_failures(out: Path) -> None:
+    """Print the sentence of each object that failed, and how many are done."""
+    console = Console(highlight=False, soft_wrap=True)
+    plan, done = read_plan(out), 0
+    for name, one in plan.items():
+        for step in STEPS:
+            path = one.record(step)
+            record = read_json(path, "delete it and start again") if path.is_file() else {}
+            done += step == STEPS[-1] and record.get("status") == "done"
+            if record.get("status") == "failed" and one.step(step).needed:
+                console.print(f"[yellow]{escape(name)}, {step}: {escape(record['sentence'])}")
+    console.print(f"{done} of {len(plan)} objects are done.", style="bold")

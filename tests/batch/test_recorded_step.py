@@ -1,0 +1,138 @@
+"""Whatever happens to a session, its records say it; and what is to be made again."""
+
+import json
+from functools import partial
+
+import pytest
+from quick_steps import quick_run
+
+from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
+from hsi_sc_nerf.batch.recorded_step import record_step
+from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.inspection import inspect
+
+
+@pytest.fixture
+def planned(tmp_path, monkeypatch):
+    """One object of a batch; gives what reads it anew."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "session").mkdir()
+    rows = [{"object": "pear", "session": str(tmp_path / "session"), "train": "--own 1"}]
+
+    def plan(**settings):
+        write_plan(tmp_path, rows, SessionSettings(**settings))
+        return read_plan(tmp_path)
+
+    plan()
+    return plan
+
+
+def do(one, steps=STEPS, run=None):
+    for name in steps:
+        record_step(one, name, run or partial(quick_run, one))
+
+
+def records(one):
+    return {name: json.loads(one.record(name).read_text()) for name in STEPS}
+
+
+def forced(plan, retry=False):
+    return [path.stem for path in outdated(plan, retry)]
+
+
+def test_the_inspection_has_its_name():
+    assert INSPECTION_NAME == inspect.INSPECTION_NAME
+
+
+def test_words_of_a_row_come_after_those_of_the_batch(planned):
+    plan = planned(train="--all 2", preset="fast")
+    assert plan["pear"].step("train").words[-5:] == ("fast", "--all", "2", "--own", "1")
+
+
+@pytest.mark.parametrize(("key", "value", "told"), [("preset", "slow", "'slow' is none"), ("train", "'", "split")])
+def test_words_that_cannot_be_used_are_told_before_the_start(tmp_path, key, value, told):
+    with pytest.raises(InputError, match=told):
+        write_plan(tmp_path, [{"object": "a", "session": "s", key: value}], SessionSettings())
+    assert not any(tmp_path.iterdir())
+
+
+def test_all_steps_are_recorded_and_nothing_is_done_twice(planned, tmp_path):
+    one = planned()["pear"]
+    do(one)
+    found = records(one)
+    assert {record["status"] for record in found.values()} == {"done"}
+    assert found["train"] == {
+        "step": "train",
+        "status": "done",
+        "seconds": 1.0,
+        "peak_memory_mib": 100.0,
+        "sentence": "",
+    }
+    do(one)  # as where the records were lost
+    assert records(one) == found
+    assert (tmp_path / "ran.txt").read_text().split()[1::2] == list(STEPS)
+    assert forced(planned()) == []
+
+
+def test_what_was_changed_or_removed_is_made_again(planned, tmp_path):
+    do(planned()["pear"])
+    assert forced(planned(num_points=5)) == ["export"]
+    assert forced(planned(train="--new 3")) == ["train"]
+    (tmp_path / "objects" / "pear" / "eval.json").unlink()
+    assert forced(planned()) == ["evaluate"]
+    (tmp_path / "session" / "new.raw").write_text("counts")
+    assert forced(planned()) == ["inspect", "process", "evaluate"]
+    # Results of a training that was repeated are not those of the one before.
+    write_json(tmp_path / "objects/pear/training/hsi-sc-nerf/run/nerfstudio_models/step-10.ckpt", {"new": 1})
+    assert forced(planned())[-4:] == ["evaluate", "export", "material", "report"]
+
+
+def test_a_failure_has_its_sentence_and_ends_only_what_needs_it(planned, tmp_path):
+    (tmp_path / "session" / "broken").write_text("")
+    one = planned()["pear"]
+    do(one)
+    found = records(one)
+    assert found["process"]["sentence"] == "the white reference is missing; capture it."
+    assert [record["status"] for record in found.values()] == ["done", "failed", *["skipped"] * 6]
+    assert found["report"]["sentence"] == "The step 'process' failed."
+    assert forced(planned()) == []
+    assert forced(planned(), retry=True) == ["process"]
+    assert forced(planned(process="--poses angles")) == ["process"]
+    (tmp_path / "session" / "broken").unlink()
+    assert forced(planned()) == ["inspect", "process"]
+
+
+def test_without_the_material_the_other_steps_do_without(planned):
+    one = planned()["pear"]
+
+    def run(name, argv, log):
+        cost = quick_run(one, name, argv, log)
+        if name == "material":
+            raise InputError("no light was found.")
+        return cost
+
+    do(one, run=run)
+    found = records(one)
+    assert {name for name, record in found.items() if record["status"] == "failed"} == {"material"}
+    assert found["material"]["sentence"] == "no light was found."
+    assert not (one.folder / "point_cloud-material.ply").exists()
+    assert forced(planned()) == []
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_what_is_red_is_left_to_process_which_may_accept_it(planned, opened):
+    one = planned()["pear"]
+
+    def run(name, argv, log):
+        if opened:
+            quick_run(one, name, argv, log)
+        raise InputError("no markers are seen.")
+
+    write_json(one.folder / INSPECTION_NAME, {"of": "an earlier attempt"})
+    do(one, ["inspect"], run)
+    record = json.loads(one.record("inspect").read_text())
+    assert (record["status"], record["sentence"]) == ("done" if opened else "failed", "no markers are seen.")
+    do(one, ["process"])
+    assert json.loads(one.record("process").read_text())["status"] == "done"

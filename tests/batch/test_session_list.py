@@ -1,0 +1,82 @@
+"""The list of sessions as people have it, and one sentence for each that cannot be used."""
+
+import pytest
+
+from hsi_sc_nerf.batch.session_list import read_sessions, sessions_table
+from hsi_sc_nerf.errors import InputError
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Writes a table beside two sessions; the second has a name that a spreadsheet quotes."""
+    for name in ("a", "b, c"):
+        (tmp_path / name / "one" / "capture").mkdir(parents=True)
+
+    def write(content):
+        path = tmp_path / "list.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        'object,session,day\np1,a,3\np2,"b, c",\n',
+        "object;session;day\r\np1;a;3\r\n;;\r\np2;b, c;\r\n",
+        "\ufeffsession\tobject\tday\na\tp1\t3\nb, c\tp2\t\n",
+    ],
+    ids=["commas", "semicolons of Excel", "tabs with a byte order mark"],
+)
+def test_tables_of_spreadsheets_are_read(table, content):
+    path = table(content)
+    rows = read_sessions(path)
+    assert [(row["object"], row["session"], row["day"]) for row in rows] == [
+        ("p1", str(path.parent / "a"), "3"),
+        ("p2", str(path.parent / "b, c"), ""),
+    ]
+    # The normalised copy says the same, wherever it lies.
+    copy = path.parent / "elsewhere" / "copy.csv"
+    copy.parent.mkdir()
+    copy.write_text(sessions_table(rows))
+    assert copy.read_text().startswith("object,session,day\n")
+    assert read_sessions(copy) == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("", "no column 'object'"),
+        ("object,folder\np,a\n", "no column 'session'"),
+        ("object,session\n", "lists no sessions"),
+        ("object,session,day,day\np,a,1,2\n", "two have the same"),
+        ("object,session,\np,a,1\n", "has no title"),
+        ("object,session\np,a\nP,a\n", "line 3: the object 'P' comes twice"),
+        ("object,session\n../p,a\n", "line 2: '../p' cannot be the name of a folder"),
+        ("object,session\n,a\n", "'' cannot be the name"),
+        ("object,session\n" + "p" * 101 + ",a\n", "cannot be the name"),
+        ("object,session\np,\n", "line 2: names no session"),
+        ("object,session\np,nowhere\n", "line 2: there is no folder .*nowhere"),
+        ("object,session\np,b, c\n", "line 2: has 3 cells and not 2"),
+        ('object,session\np,"a\n', "is no table after line 2"),
+        ("object,session\nÄ,a\n".encode("latin-1"), "is no UTF-8"),
+        ("object,session\np,a\n".encode("utf-16"), "is no UTF-8"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_one_sentence(table, content, told):
+    with pytest.raises(InputError, match=told) as raised:
+        read_sessions(table(content))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_folder_of_sessions_is_a_list(table, tmp_path):
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(InputError, match="'b, c' cannot be the name"):
+        read_sessions(tmp_path)
+    (tmp_path / "b, c").rename(tmp_path / "b-c")
+    assert [row["object"] for row in read_sessions(tmp_path)] == ["a", "b-c"]
+    with pytest.raises(InputError, match="holds no sessions"):
+        read_sessions(tmp_path / "notes")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_sessions(tmp_path / "nowhere.csv")

@@ -1,0 +1,172 @@
+"""`hsi-sc-nerf batch`: the plan, restarts, kills and the lock, through Snakemake, with commands that take no time.
+
+The real commands are those of `run` (test_workflows.py); benchmarks/batch_slurm.py runs both together.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from quick_steps import quick_snakefile
+
+from hsi_sc_nerf.batch.plan import STEPS
+from hsi_sc_nerf.cli import batch
+from hsi_sc_nerf.cli.batch import SNAKEFILE, BatchCommand
+from hsi_sc_nerf.cli.main import main
+from hsi_sc_nerf.errors import InputError
+
+START = "from hsi_sc_nerf.cli import batch, main; batch.SNAKEFILE = batch.Path({!r}); main.main()"
+"""A process with the quick commands."""
+
+
+def make_sessions(folder, names):
+    for name in names:
+        (folder / name / "one" / "capture").mkdir(parents=True)
+    return folder
+
+
+def words(folder, *more):
+    """Everything but the table and the page, whose command has tests of its own."""
+    return ["batch", str(folder / "sessions"), "--output-dir", str(folder / "out"), "objects", "--cores", "1", *more]
+
+
+def start(folder, *more):
+    code = START.format(str(quick_snakefile(folder)))
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *words(folder, *more)],
+        env=os.environ | {"PYTHONPATH": path},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ran(folder):
+    """What was run since the last call."""
+    path = folder / "out" / "ran.txt"
+    lines = path.read_text().splitlines() if path.is_file() else []
+    path.unlink(missing_ok=True)
+    return lines
+
+
+def statuses(folder):
+    """Of each object the status of each step."""
+    folders = sorted((folder / "out" / "objects").iterdir())
+    return {
+        one.name: [json.loads((one / "steps" / f"{s}.json").read_text())["status"] for s in STEPS] for one in folders
+    }
+
+
+def test_the_workflow_is_shipped(capsys):
+    assert SNAKEFILE.is_file()
+    BatchCommand(snakefile=True).main()
+    assert capsys.readouterr().out == f"{SNAKEFILE}\n"
+
+
+@pytest.mark.parametrize("missing", ["sessions", "output_dir"])
+def test_what_is_missing_is_one_sentence(tmp_path, missing):
+    given = {"sessions": tmp_path, "output_dir": tmp_path / "out"} | {missing: None}
+    with pytest.raises(InputError, match="--output-dir are missing"):
+        BatchCommand(**given).main()
+
+
+def test_without_snakemake_one_sentence_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"hsi-sc-nerf\[batch\]"):
+        BatchCommand(sessions=tmp_path, output_dir=tmp_path / "out").main()
+
+
+def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch):
+    found = []
+    monkeypatch.setattr(batch, "_snakemake", lambda given: found.append(given) or 0)
+    make_sessions(tmp_path / "sessions", ["a"])
+    for more in (["--retries", "2"], ["--executor", "slurm", "--jobs", "50"]):
+        monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path, *more), "--gpu"])
+        main()
+        assert found[-1][-3 - len(more) :] == ["objects", "--cores", "1", *more]
+        assert "gpu=True" in found[-1]
+    # How much may run at once is this machine's affair only where the jobs run there.
+    assert ("all" in found[0], "all" in found[1]) == (True, False)
+
+
+@pytest.mark.slow
+def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
+    """First the plan; then all; then nothing; then what was mended; then what was asked for."""
+    pytest.importorskip("snakemake")
+    names = ["apple", "broken", "maize", "pear", "pepper", "unmarked"]
+    make_sessions(tmp_path / "sessions", names)
+    for name in ("broken", "unmarked"):
+        (tmp_path / "sessions" / name / "broken").write_text("")
+    monkeypatch.setattr(batch, "SNAKEFILE", quick_snakefile(tmp_path))
+
+    def do(*more):
+        monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path, *more)])
+        main()
+        return capfd.readouterr()
+
+    told = do("--dry-run")
+    assert "train: pepper" in told.err + told.out
+    assert "total          49" in told.err + told.out
+    assert ran(tmp_path) == []
+
+    # Each step of each takes a second; one that is whole is enough.
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for name in names[2:5]:
+        (tmp_path / "sessions" / name).rename(kept / name)
+    told = do()
+    assert "broken, process: the white reference is missing; capture it." in told.out
+    assert "1 of 3 objects are done." in told.out
+    assert statuses(tmp_path) == {
+        "apple": ["done"] * 8,
+        "broken": ["done", "failed", *["skipped"] * 6],
+        "unmarked": ["done", "failed", *["skipped"] * 6],
+    }
+    assert len(ran(tmp_path)) == 12
+
+    do()
+    assert ran(tmp_path) == []
+    (tmp_path / "sessions" / "broken" / "broken").unlink()
+    do("--retry")
+    assert sorted(ran(tmp_path)) == sorted([f"broken {step}" for step in STEPS] + ["unmarked process"])
+
+
+@pytest.mark.slow
+def test_killed_and_started_again_it_loses_the_running_step_only(tmp_path, monkeypatch):
+    """Another one does not disturb it, nor take its place before somebody says that none runs."""
+    pytest.importorskip("snakemake")
+    make_sessions(tmp_path / "sessions", ["pear"])
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "wait").write_text("")
+    first = start(tmp_path)
+    checkpoint = out / "objects/pear/training/hsi-sc-nerf/run/nerfstudio_models/step-10.ckpt"
+    while not checkpoint.exists():
+        assert first.poll() is None, first.stderr.read()
+        time.sleep(0.05)
+    before = (out / "sessions.csv").stat().st_mtime_ns
+    second = start(tmp_path)
+    told = second.communicate()[1]
+    assert second.returncode == 2
+    assert told.startswith(f"Error: {out}: another batch works there")
+    assert told.count("\n") == 1
+    assert (out / "sessions.csv").stat().st_mtime_ns == before
+
+    first.kill()
+    first.communicate()
+    (out / "wait").unlink()
+    time.sleep(1.0)  # an orphan of the workflow would come to its end
+    assert not (out / "objects/pear/steps/train.json").exists()
+    assert ran(tmp_path) == ["pear inspect", "pear process", "pear train"]
+    unlocking = start(tmp_path, "--unlock")
+    told = unlocking.communicate()[1]
+    assert unlocking.returncode == 0, told
+    third = start(tmp_path)
+    told = third.communicate()[1]
+    assert third.returncode == 0, told
+    assert ran(tmp_path) == [f"pear {step}" for step in STEPS[2:]]
+    assert statuses(tmp_path) == {"pear": ["done"] * 8}

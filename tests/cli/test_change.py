@@ -1,0 +1,114 @@
+"""`hsi-sc-nerf change` on three days of a simulated apple."""
+
+import csv
+import json
+
+import av
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.cli.clouds import ChangeCommand
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of
+
+NM = np.linspace(400.0, 1000.0, 13)
+DAYS = {
+    "monday": SetDown(bruise_diameter_m=0.012),
+    "monday_again": SetDown(bruise_diameter_m=0.012, turn_deg=120.0),
+    "friday": SetDown(bruise_diameter_m=0.024, dried=0.3, turn_deg=40.0, keeps_stem=False),
+}
+LIBRARY = ("apple_skin", "apple_blush", "lenticel", "bruise")
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("days")
+    for seed, (name, day) in enumerate(DAYS.items()):
+        cloud = cloud_of(fruit_of(day, NM), day, CloudErrors(), 25_000, seed)
+        (folder / name).mkdir()
+        write_spectral_ply(folder / name / "point_cloud.ply", cloud)
+    fruit = fruit_of(DAYS["monday"], NM)
+    with (folder / "library.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([("nm", *LIBRARY), *zip(NM, *fruit.endmembers[:4], strict=True)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def written(clouds, tmp_path_factory):
+    out = tmp_path_factory.mktemp("change")
+    days = tuple(clouds / name for name in DAYS)
+    mesh = MeshConfig(octree_depth=6)
+    ChangeCommand(days, out, mesh, band_nm=(670.0,), library=clouds / "library.csv").main()
+    return out
+
+
+def rows_of(written, **wanted):
+    with (written / "change.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in wanted.items())]
+
+
+def true_growth_cm2():
+    areas = []
+    for name in ("monday", "friday"):
+        fruit = fruit_of(DAYS[name], NM)
+        of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
+        areas.append(1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum())
+    return areas[1] - areas[0]
+
+
+@pytest.mark.slow
+def test_a_second_capture_of_the_same_day_shows_no_change(written):
+    rows = rows_of(written, after="2 monday_again", kind="change")
+    assert {row["name"] for row in rows} >= {"spectrum", "brightness", "R670", "NDVI", "WI", "surface"}
+    assert all(row["region"] == "whole surface" and float(row["p"]) > 0.01 for row in rows)
+
+
+@pytest.mark.slow
+def test_the_bruise_grew_by_its_area_and_the_fruit_dried(written):
+    (bruise, *_) = rows_of(written, after="3 friday", kind="class", name="bruise")
+    assert float(bruise["area_change_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.2)
+    (darker, *_) = (row for row in rows_of(written, after="3 friday", name="brightness") if row["region"] == "1")
+    assert float(darker["area_after_cm2"]) == pytest.approx(true_growth_cm2(), rel=0.1)
+    assert float(darker["change"]) < -0.3
+    (water,) = rows_of(written, after="3 friday", name="WI", region="whole surface")
+    assert float(water["p"]) < 1e-4
+    assert -0.1 < float(water["change"]) < -0.04
+    grown = rows_of(written, before="2 monday_again", kind="grown", name="brightness")
+    assert grown[0]["area_before_cm2"] == "0"
+
+
+@pytest.mark.slow
+def test_files_hold_the_attitudes_the_maps_and_the_film(written):
+    content = json.loads((written / "change.json").read_text())
+    again, friday = (day["attitude"] for day in content["days"])
+    assert again["turn_deg"] == pytest.approx(120.0, abs=0.5)
+    assert friday["turn_deg"] == pytest.approx(40.0, abs=0.5)
+    mesh = read_spectral_ply(written / "change.ply")
+    assert {"ndvi_change_1", "spectrum_p_2", "surface_region_2", "r670_change_2"} <= set(mesh.extra)
+    changed = mesh.extra["brightness_region_2"] > 0
+    assert np.median(mesh.extra["brightness_change_2"][changed]) < -0.3
+    assert (mesh.extra["brightness_region_1"] == 0).all()
+    with av.open(str(written / "change.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 75
+    page = (written / "change.md").read_text()
+    assert all((written / name).is_file() for name in ("wi_1.png", "spectrum_2.png"))
+    assert "![Spectrum, 3 friday](spectrum_2.png)" in page
+
+
+def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
+    first, out = clouds / "monday", tmp_path / "out"
+    with pytest.raises(InputError, match="two clouds or more"):
+        ChangeCommand((first,), out).main()
+    with pytest.raises(InputError, match=r"holds no point_cloud\.ply"):
+        ChangeCommand((first, clouds), out).main()
+    cloud = read_spectral_ply(first / "point_cloud.ply").select(slice(0, 500))
+    other = tmp_path / "other.ply"
+    write_spectral_ply(other, type(cloud)(*list(vars(cloud).values())[:3], cloud.spectra[:, :4], NM[:4]))
+    with pytest.raises(InputError, match="2 other: has other bands than 1 monday"):
+        ChangeCommand((first, other), out).main()
+    with pytest.raises(InputError, match="session-std"):
+        ChangeCommand((first, other), out, session_std=-1.0).main()
+    assert not out.exists()
