@@ -24,6 +24,8 @@ _BIWEIGHT = 9.0
 _BIWEIGHT_EFFICIENCY = 0.87
 """Of the biweight scale with this constant, for normal errors: so much of the sample counts."""
 _CLIPPED = 3.0
+_ROUNDING = 1e-5
+"""In every unit that is compared: radians, reflectance, millimetres."""
 _BINS = 24
 _MOST_PATCHES = 1500
 """Patches that the correlation is found from."""
@@ -145,7 +147,7 @@ def significance(
 def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
     """Tukey's biweight midvariance as a standard deviation (Mosteller and Tukey 1977): outliers do not count.
 
-    Never 0, so that ratios to it are finite.
+    At least what rounding in files of single precision makes, which is no change.
     """
     off = values - np.median(values)
     within = 1.0 - np.square(off / max(_BIWEIGHT * np.median(np.abs(off)), 1e-12))
@@ -153,7 +155,7 @@ def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
     off, within = off[kept], within[kept]
     weight = np.sum(within * (5.0 * within - 4.0))
     variance = len(off) * np.sum(np.square(off) * within**4) / max(weight, 1e-12) ** 2
-    return float(max(np.sqrt(variance), 1e-9))
+    return float(max(np.sqrt(variance), _ROUNDING))
 
 
 def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n 3"]) -> tuple[float, float]:

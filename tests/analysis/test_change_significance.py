@@ -132,3 +132,11 @@ def test_the_mean_of_smooth_errors_is_no_change_of_the_whole_surface():
     centres_m = ball_patches()
     fields = (smooth_noise(centres_m, 0.02, np.random.default_rng(seed))[:, None] for seed in range(40))
     assert np.mean([outcome(field, centres_m).whole_p < 0.05 for field in fields]) <= 0.15
+
+
+def test_rounding_of_equal_clouds_is_no_change():
+    rng = np.random.default_rng(0)
+    change = 1e-9 * rng.normal(size=(400, 1))
+    change[:20] = 7e-6
+    found = significance(change, rng.random((400, 3)), np.ones(400), np.zeros((400, 1)), np.zeros(1))
+    assert found.p.min() > FALSE_DISCOVERIES
