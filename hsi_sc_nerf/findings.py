@@ -17,6 +17,8 @@ Level = Literal["green", "amber", "red"]
 
 CERTAIN = 3.0
 """Multiple of the noise that the evidence of an effect has to exceed."""
+INSPECTION_NAME = "inspection.json"
+"""File that findings of a session are kept in."""
 EFFECT_COLUMNS = ("effect", "found", "evidence", "noise", "threshold", "unit")
 """Columns of a table; a sentence may follow."""
 

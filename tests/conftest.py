@@ -50,6 +50,18 @@ def one_blas_thread():
         yield
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """For the tests that look at pages as users do."""
+    from headless_browser import launch
+
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
+    with sync_api.sync_playwright() as playwright:
+        browser = launch(playwright)
+        yield browser
+        browser.close()
+
+
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory):
     """A processed session of ten small frames with few bands, and the session that it was made from.

@@ -198,12 +198,13 @@ def analyse(
     def of_region(name: str, where: Bool[np.ndarray, "v"]) -> RegionTraits:
         areas_m2 = surface.areas_m2[where]
         spectrum, light = region_spectrum(surface, where), _light(surface, where)
+        noise = _noise_std(surface, where, pixel_m, light)
         return RegionTraits(
             name,
             float(areas_m2.sum()),
             spectrum,
-            {one.name: _map_mean(one, where, surface, spectrum, _noise_std(surface, where, pixel_m)) for one in maps},
-            _reflectance_std(surface, where, pixel_m, spectrum, light),
+            {one.name: _map_mean(one, where, surface, spectrum, noise) for one in maps},
+            _reflectance_std(surface, where, pixel_m, noise, spectrum, light),
             light,
         )
 
@@ -219,11 +220,11 @@ def _reflectance_std(
     surface: SpectralMesh,
     chosen: Bool[np.ndarray, "v"],
     pixel_m: float | None,
+    noise: float,
     spectrum: MeanAndSd,
     light: RegionLight | None,
 ) -> float:
     """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
-    noise = _noise_std(surface, chosen, pixel_m)
     if pixel_m is None or math.isnan(noise):
         return math.nan
     mixed = _mixed(surface, chosen, pixel_m)
@@ -234,7 +235,9 @@ def _reflectance_std(
     return float(np.sqrt(variance))
 
 
-def _noise_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None) -> float:
+def _noise_std(
+    surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float | None, light: RegionLight | None
+) -> float:
     """Standard deviation of a region's reflectance in a band, by how much frames disagree over its pixels."""
     if surface.scatter is None or pixel_m is None:
         return math.nan
@@ -244,7 +247,6 @@ def _noise_std(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: fl
         return math.nan
     pixels = max(1.0, areas_m2.sum() / pixel_m**2)
     noise = float(areas_m2[known] @ scatter[known] / areas_m2[known].sum()) / math.sqrt(pixels)
-    light = _light(surface, chosen)
     return noise if light is None else noise / float(light.irradiance.mean)
 
 

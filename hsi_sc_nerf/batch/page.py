@@ -16,8 +16,9 @@ from PIL import Image
 
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column
+from hsi_sc_nerf.batch.plan import OBJECTS_NAME
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
-from hsi_sc_nerf.batch.tables import OBJECTS_NAME, Table
+from hsi_sc_nerf.batch.tables import Table
 from hsi_sc_nerf.files import atomic_write, read_picture
 from hsi_sc_nerf.inspection.inspect import THUMBNAIL_GAMMA
 from hsi_sc_nerf.report.page import data_address, own_text, page_template

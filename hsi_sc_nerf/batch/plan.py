@@ -12,11 +12,10 @@ from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import atomic_write, read_json, write_json
+from hsi_sc_nerf.findings import INSPECTION_NAME
 from hsi_sc_nerf.models.presets import Preset
 
-LIST_NAME, SETTINGS_NAME = "sessions.csv", "settings.json"
-INSPECTION_NAME = "inspection.json"
-"""As in `inspection.inspect`, whose import takes seconds: each step of each object would wait for it."""
+LIST_NAME, SETTINGS_NAME, OBJECTS_NAME = "sessions.csv", "settings.json", "objects"
 STEPS = ("inspect", "process", "train", "evaluate", "export", "material", "traits", "report")
 """The steps of an object, in order."""
 _AGAIN = "start `hsi-sc-nerf batch` again"
@@ -41,7 +40,7 @@ class PlannedObject:
         if name == "inspect":
             words = ("hsi-sc-nerf", "inspect", str(self.session), "--output-dir", str(self.folder))
             # What is red there may have been accepted for `process`, which makes the same checks and decides.
-            return Step(name, words, (self.session,), (self.folder / INSPECTION_NAME,), needed=False)
+            return Step(name, words, (self.session,), (self.folder / INSPECTION_NAME,))
         return {step.name: step for step in session_steps(self.session, self.folder, self.settings)}[name]
 
     def record(self, step: str) -> Path:
@@ -83,7 +82,7 @@ def read_plan(out: Path) -> dict[str, PlannedObject]:
         settings = SessionSettings(**known)
     except TypeError as error:
         raise InputError(f"{out / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
-    root = out.resolve() / "objects"
+    root = out.resolve() / OBJECTS_NAME
     return {
         row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings))
         for row in read_sessions(out / LIST_NAME, may_be_gone=True)

@@ -27,6 +27,8 @@ STEPS_NAME = "steps.json"
 """File of the output folder that says which steps were done with what; it marks the folder as a run's."""
 MATERIAL_NAME = "point_cloud-material.json"
 """File of the output folder that says what was decided of the light on the object."""
+OPTIONAL_STEPS = ("inspect", "material")
+"""Where one of these fails, the others do without."""
 StepRunner = Callable[[str, Sequence[str], Path], StepCost]
 """Runs a command; gets the step's name, the command and the file for its output."""
 
@@ -40,14 +42,17 @@ class Step:
         words: the command as a user would type it.
         inputs: files and folders that its results depend on.
         outputs: files that it leaves.
-        needed: whether the run ends where it fails.
     """
 
     name: str
     words: tuple[str, ...]
     inputs: tuple[Path, ...]
     outputs: tuple[Path, ...]
-    needed: bool = True
+
+    @property
+    def needed(self) -> bool:
+        """Whether the others cannot do without it."""
+        return self.name not in OPTIONAL_STEPS
 
     def fingerprint(self, outside: Path) -> str:
         """Hash of command, version, and sizes and times of the inputs but for those in the folder ``outside``.
@@ -150,16 +155,12 @@ def session_steps(session: Path, out: Path, settings: SessionSettings) -> list[S
             (out / "report.html",),
         ),
     ]
-    return [
-        Step(name, tuple(map(str, words)), inputs, outputs, name != "material")
-        for name, words, inputs, outputs in table
-    ]
+    return [Step(name, tuple(map(str, words)), inputs, outputs) for name, words, inputs, outputs in table]
 
 
 def is_up_to_date(step: Step, out: Path) -> bool:
     """Whether a step's results are there, of the same command and inputs."""
-    finished = step.was_tried(out) and _entries(out)[step.name]["finished"]
-    return finished and all(path.is_file() for path in step.outputs)
+    return _is_finished(step, _entries(out).get(step.name, {}), step.fingerprint(out))
 
 
 def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_step: StepRunner) -> StepCost:
@@ -178,12 +179,14 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
     Raises:
         InputError: it failed, or left no results.
     """
-    if is_up_to_date(step, out):
-        console.print(f"{title}: up to date")
-        return _cost(step.name, _entries(out)[step.name])
+    # Once: of a session it looks at all files, which may lie on a slow network.
     done, fingerprint = _entries(out), step.fingerprint(out)
+    before = done.get(step.name, {})
+    if _is_finished(step, before, fingerprint):
+        console.print(f"{title}: up to date")
+        return _cost(step.name, before)
     words = [*step.words]
-    same = step.was_tried(out)
+    same = before.get("fingerprint") == fingerprint
     run = step.outputs[0].parent
     if step.name == "train":
         if not same:
@@ -204,6 +207,11 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
     write_json(out / STEPS_NAME, done | {step.name: entry | {"finished": True}})
     return _cost(step.name, entry)
+
+
+def _is_finished(step: Step, entry: dict[str, Any], fingerprint: str) -> bool:
+    finished = entry.get("fingerprint") == fingerprint and entry["finished"]
+    return finished and all(path.is_file() for path in step.outputs)
 
 
 def _cost(name: str, entry: dict[str, Any]) -> StepCost:

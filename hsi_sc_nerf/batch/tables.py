@@ -10,11 +10,11 @@ from pathlib import Path
 
 from hsi_sc_nerf.batch.columns import GROUPS, STANDING, Column, Value
 from hsi_sc_nerf.batch.objects import read_object
+from hsi_sc_nerf.batch.plan import LIST_NAME, OBJECTS_NAME
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 
-SESSIONS_NAME, OBJECTS_NAME = "sessions.csv", "objects"
 CSV_NAME, PARQUET_NAME, DICTIONARY_NAME = "traits.csv", "traits.parquet", "traits_dictionary.csv"
 _MEANINGS = {OBJECT: "name of the object, and of its folder", SESSION: "folder of its captures"}
 _NUMBER = re.compile(r"[+-]?(0|[1-9]\d{0,14})(\.\d*)?([eE][+-]?\d{1,2})?")
@@ -84,7 +84,7 @@ def listed_sessions(out: Path) -> list[Row]:
     Raises:
         InputError: there is no batch, or its list of sessions cannot be read.
     """
-    path = out / SESSIONS_NAME
+    path = out / LIST_NAME
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the --output-dir of `hsi-sc-nerf batch`.")
     return read_sessions(path, may_be_gone=True)

@@ -330,7 +330,7 @@ class ChangeCommand:
         for day, one, quantity in track(each, "Drawing", console=console, transient=True):
             file = f"{quantity.name.lower().replace(' ', '_')}_{day}.png"
             change_pictures.draw_change(self.output_dir / file, days[0], one, quantity, views)
-            pictures[f"{quantity.name.capitalize()}, {one.after.name}"] = file
+            pictures[f"{quantity.name[0].upper()}{quantity.name[1:]}, {one.after.name}"] = file
         with console.status("film and tables"):
             shown = SPECTRUM if SPECTRUM in comparisons[0].quantities else BRIGHTNESS
             film = self.output_dir / "change.mp4"

@@ -15,7 +15,8 @@ from hsi_sc_nerf import paper as published
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import require_writable, write_json
-from hsi_sc_nerf.inspection.inspect import INSPECTION_NAME, Inspection, draw_inspection, inspect_session, suggestion
+from hsi_sc_nerf.findings import INSPECTION_NAME
+from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session, suggestion
 from hsi_sc_nerf.inspection.watch import Watch
 from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 from hsi_sc_nerf.processing.effects import show_effects

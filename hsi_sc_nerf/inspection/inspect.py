@@ -25,7 +25,6 @@ from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_i
 from hsi_sc_nerf.poses.feature_poses import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
-INSPECTION_NAME = "inspection.json"
 WHOLE_TURN_DEG = 0.05
 """Frames that fill a turn to this fraction are taken for one whole turn."""
 THUMBNAIL_COLUMNS = 12

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.findings import Finding, refuse_red
+from hsi_sc_nerf.findings import INSPECTION_NAME, Finding, refuse_red
 from hsi_sc_nerf.inspection.inspect import Inspection
 
 _log = logging.getLogger(__name__)
 
-CHECKS_PATH = Path("report") / "inspection.json"
+CHECKS_PATH = Path("report") / INSPECTION_NAME
 """In the dataset; the inspection's content and the findings of all later steps."""
 MAY_BE_RED = (
     *("angles", "binning", "copies", "damaged", "dates", "exposure", "other-object", "scale", "turn"),

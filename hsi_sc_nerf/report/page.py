@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from PIL import Image, UnidentifiedImageError
 
@@ -158,10 +158,9 @@ def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], section
 
 
 def page_template(package: str, name: str) -> Template:
-    """A template of a package, which escapes every text."""
-    environment = Environment(
-        loader=PackageLoader(package), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
+    """A template of a package, which escapes every text and may extend ``layout.html``."""
+    loader = ChoiceLoader([PackageLoader(package), PackageLoader(_PACKAGE)])
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.get_template(name)
 
 

@@ -12,7 +12,7 @@ from urllib.request import url2pathname
 import numpy as np
 import pytest
 from batch_folder import traits_of, write_object, write_season, write_sessions
-from headless_browser import launch, needs_browser, quiet_page
+from headless_browser import needs_browser, quiet_page
 from PIL import Image
 
 from hsi_sc_nerf.batch.page import thumbnail, write_overview
@@ -70,15 +70,6 @@ def test_the_page_needs_nothing_else_and_texts_from_outside_stay_texts(tmp_path)
     payload = json.loads(re.search(r'id="objects">(.*?)</script>', text, re.DOTALL)[1])
     assert payload["reports"] == [None, "objects/%C3%A4/report.html"]
     assert payload["columns"][2]["label"] == HOSTILE
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
-    with sync_api.sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def names(page):

@@ -9,9 +9,9 @@ from quick_steps import quick_run
 from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
 from hsi_sc_nerf.batch.recorded_step import record_step
 from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.cli import sessions
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.inspection import inspect
 
 
 @pytest.fixture
@@ -42,8 +42,9 @@ def forced(plan, retry=False):
     return [path.stem for path in outdated(plan, retry)]
 
 
-def test_the_inspection_has_its_name():
-    assert INSPECTION_NAME == inspect.INSPECTION_NAME
+def test_the_inspection_has_its_name(planned):
+    one = planned()["pear"]
+    assert one.step("inspect").outputs == (one.folder / sessions.INSPECTION_NAME,)
 
 
 def test_words_of_a_row_come_after_those_of_the_batch(planned):

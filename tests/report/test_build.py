@@ -10,7 +10,7 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
-from headless_browser import launch, needs_browser, quiet_page
+from headless_browser import needs_browser, quiet_page
 
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.report import trait_content
@@ -189,15 +189,6 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     with pytest.raises(InputError, match=r"config\.yml"):
         write_report(tmp_path, tmp_path / "report.html", ReportSources())
     assert not (tmp_path / "report.html").exists()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
-    with sync_api.sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import capture_factory as factory
 import matplotlib
 import numpy as np
 import pytest
-from headless_browser import launch, needs_browser
+from headless_browser import needs_browser
 from PIL import Image
 
 WINDOW = {"width": 900, "height": 700}
@@ -42,17 +42,14 @@ def ball_viewer(tmp_path):
 
 
 @pytest.fixture
-def page(ball_viewer):
+def page(ball_viewer, browser):
     """A browser's page that shows the viewer as it opens."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
     address = re.search(r"http://\S+", ball_viewer.viewer_info[0])[0].replace("0.0.0.0", "localhost")
-    with sync_api.sync_playwright() as playwright:
-        browser = launch(playwright)
-        page = browser.new_page(viewport=WINDOW)
-        page.set_default_timeout(120_000)
-        page.goto(address, wait_until="domcontentloaded")
-        yield page
-        browser.close()
+    page = browser.new_page(viewport=WINDOW)
+    page.set_default_timeout(120_000)
+    page.goto(address, wait_until="domcontentloaded")
+    yield page
+    page.close()
 
 
 def shows(page, ball, beside_it=255 * factory.BACKGROUND):
