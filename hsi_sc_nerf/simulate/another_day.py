@@ -117,5 +117,6 @@ def set_down(day: SetDown, vertices_m: Float[np.ndarray, "v 3"]) -> Similarity:
     """How the fruit of the first day, at the axis on z = 0, was brought onto the container."""
     turn = Rotation.from_euler("yz", [day.tip_deg, day.turn_deg], degrees=True).as_matrix()
     lowest_m = float((day.growth * vertices_m @ turn.T)[:, 2].min())
-    aside_m = 0.003 * np.array([np.cos(day.turn_deg), np.sin(day.turn_deg)])
+    turn_rad = np.deg2rad(day.turn_deg)
+    aside_m = 0.003 * np.array([np.cos(turn_rad), np.sin(turn_rad)])
     return Similarity(day.growth, turn, np.array([*aside_m, STAND_M - lowest_m]))
