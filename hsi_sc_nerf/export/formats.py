@@ -1,10 +1,7 @@
 """Write spectral point clouds as PLY, LAS, NetCDF or Zarr.
 
-LAS 1.4 holds each band as a dimension of extra bytes (ASPRS LAS 1.4 R15, "Extra Bytes"). NetCDF-4 and Zarr are tables
-that xarray opens, with the dimensions ``point`` and ``wavelength`` (nm): ``reflectance`` (point, wavelength),
-likewise ``material`` where the cloud has the material's columns, and per point ``x y z`` (metres, object frame),
-``nx ny nz``, ``red green blue`` and the other extra columns. They are written without xarray, which needs the whole
-table at once.
+LAS 1.4 holds each band as a dimension of extra bytes (ASPRS LAS 1.4 R15, "Extra Bytes"). NetCDF-4 and Zarr are the
+tables of `table`, which xarray opens. They are written without xarray, which needs the whole table at once.
 """
 
 from __future__ import annotations
@@ -23,15 +20,12 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
     CHUNK_POINTS,
-    COLUMNS,
-    MATERIAL,
-    REFLECTANCE,
     CloudStream,
     band_property_names,
-    cloud_attributes,
     comment_lines,
     write_spectral_ply,
 )
+from hsi_sc_nerf.export.table import WAVELENGTH_ATTRIBUTES, table_attributes, table_columns, table_variables
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, delete_remains, make_folder
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
@@ -49,9 +43,8 @@ _LAS_TEXT_RECORD = 3
 _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals
 _COLOURS = ("red", "green", "blue")
 _EIGHT_TO_SIXTEEN_BITS = 257
-
-_NORMALS = ("nx", "ny", "nz")
-_WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band", "standard_name": "radiation_wavelength"}
+_PLACES = {"coordinates": "x y z"}
+"""Attribute of variables with a wavelength."""
 
 
 def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: CloudFormat) -> Path:
@@ -140,44 +133,16 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
 
 
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
-    """Name, type, dimensions and attributes of each variable."""
-    meanings = {"reflectance": REFLECTANCE, "material": MATERIAL} | COLUMNS
-    of_material = _of_material(cloud)
-    spectral = ("reflectance", "material") if of_material else ("reflectance",)
-    others = (name for name in cloud.extra_names if name not in of_material)
-    for name in (*spectral, "x", "y", "z", *_NORMALS, *_COLOURS, *others):
-        attributes = dict(zip(("units", "long_name"), meanings.get(name, ()), strict=False))
-        if name in spectral:
-            yield name, "<f4", ("point", "wavelength"), attributes | {"coordinates": "x y z"}
-        else:
-            yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
-
-
-def _of_material(cloud: CloudStream) -> list[str]:
-    """Names of the columns that hold the material's reflectance, one a band; none if the cloud lacks any."""
-    names = band_property_names(cloud.wavelengths_nm, "material")
-    return names if set(names) <= set(cloud.extra_names) else []
-
-
-def _table_attributes(cloud: CloudStream) -> dict[str, str]:
-    return {"Conventions": "CF-1.11", **cloud_attributes(cloud.run)}
+    """Name, type, dimensions and attributes of each variable as they stand in a file."""
+    for name, dtype, dimensions, attributes in table_variables(cloud.wavelengths_nm, cloud.extra_names):
+        yield name, dtype, dimensions, attributes | (_PLACES if "wavelength" in dimensions else {})
 
 
 def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:
     """Write the chunks into the variables of a table."""
-    start, of_material = 0, _of_material(cloud)
+    start = 0
     for chunk in cloud.chunks:
-        extra = dict(chunk.extra)
-        material = [extra.pop(name) for name in of_material]
-        columns = {
-            "reflectance": chunk.spectra,
-            **({"material": np.stack(material, axis=-1)} if material else {}),
-            **dict(zip("xyz", chunk.points.T, strict=True)),
-            **dict(zip(_NORMALS, chunk.normals.T, strict=True)),
-            **dict(zip(_COLOURS, chunk.colours.T, strict=True)),
-            **extra,
-        }
-        for name, values in columns.items():
+        for name, values in table_columns(chunk).items():
             variables[name][start : start + len(chunk)] = values
         start += len(chunk)
 
@@ -186,10 +151,10 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
     import h5netcdf
 
     with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
-        file.attrs.update(_table_attributes(cloud))
+        file.attrs.update(table_attributes(cloud.run))
         file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
         wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
-        wavelength.attrs.update(_WAVELENGTH_ATTRIBUTES)
+        wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
         for name, dtype, dimensions, attributes in _variables(cloud):
             file.create_variable(name, dimensions, dtype).attrs.update(attributes)
         _fill(file.variables, cloud)
@@ -207,7 +172,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
         make_folder(path.parent)
         delete_remains(path)
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
-        group.attrs.update(_table_attributes(cloud))
+        group.attrs.update(table_attributes(cloud.run))
 
         def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: Mapping[str, str]) -> Any:
             return group.create_array(
@@ -219,7 +184,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
                 attributes=dict(attributes),
             )
 
-        create("wavelength", "<f8", ("wavelength",), _WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
+        create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
         _fill({variable[0]: create(*variable) for variable in _variables(cloud)}, cloud)
         if path.exists():
             shutil.rmtree(path)

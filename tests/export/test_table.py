@@ -1,0 +1,52 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from random_cloud import BAND_NAMES, assert_equal, random_cloud
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import stream
+from hsi_sc_nerf.export.formats import write_cloud
+from hsi_sc_nerf.export.table import from_xarray, to_xarray
+
+xarray = pytest.importorskip("xarray")
+
+
+def full_cloud():
+    """A cloud with the columns of views, material and light."""
+    names = ["views", "spectral_std", "irradiance", "irradiance_std", *(f"material_{name}" for name in BAND_NAMES)]
+    columns = np.random.default_rng(0).random((len(names), 50), dtype=np.float32)
+    return random_cloud(extra=dict(zip(names, columns, strict=True)))
+
+
+@pytest.mark.slow
+def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_own(tmp_path):
+    pytest.importorskip("h5netcdf")
+    cloud = full_cloud()
+    table = to_xarray(cloud, "pear/hsi-sc-nerf/now")
+    exported = write_cloud(tmp_path / "cloud", replace(stream(cloud, 7), run="pear/hsi-sc-nerf/now"), "netcdf")
+    table.to_netcdf(tmp_path / "own.nc", engine="h5netcdf")
+    for path in (exported, tmp_path / "own.nc"):
+        with xarray.open_dataset(path, engine="h5netcdf") as read:
+            xarray.testing.assert_identical(read.load(), table)
+            assert_equal(from_xarray(read), cloud)
+
+
+def test_names_and_units_are_those_of_cf():
+    table = to_xarray(full_cloud())
+    assert set(table.coords) == {"wavelength", "x", "y", "z"}
+    assert (table.wavelength.units, table.wavelength.standard_name) == ("nm", "radiation_wavelength")
+    assert {table[name].units for name in "xyz"} == {"m"}
+    assert {table[name].units for name in ("reflectance", "material", "irradiance", "spectral_std")} == {"1"}
+    assert table.reflectance.ancillary_variables == "spectral_std"
+    assert table.irradiance.ancillary_variables == "irradiance_std"
+    assert "ancillary_variables" not in to_xarray(random_cloud()).reflectance.attrs
+    assert not any("grid_mapping" in table[name].attrs for name in table.variables)
+
+
+def test_a_table_of_something_else_is_refused():
+    table = to_xarray(random_cloud())
+    with pytest.raises(InputError, match=r"has no nx;"):
+        from_xarray(table.drop_vars("nx"))
+    with pytest.raises(InputError, match=r"reflectance \(point, wavelength\)"):
+        from_xarray(table.transpose())
