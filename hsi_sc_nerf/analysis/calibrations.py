@@ -9,6 +9,7 @@ import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,12 @@ class Calibration:
                 values[start + np.flatnonzero(known)] = self.predict(chunk[known])
         return values
 
+    def of(
+        self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"], only_inside: bool = False
+    ) -> Float[np.ndarray, "n"]:
+        """Predictions of spectra at wavelengths ``nm``, interpolated linearly to its own (`values`)."""
+        return self.values(spectra.astype(float) @ self.interpolation(nm), only_inside)
+
     def interpolation(self, nm: Float[np.ndarray, "others"]) -> Float[np.ndarray, "others bands"]:
         """The matrix that interpolates spectra at wavelengths ``nm`` to its own.
 
@@ -131,16 +138,12 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         InputError: the calibration needs wavelengths that the surface's bands do not reach.
     """
     nm = surface.wavelengths_nm
-    weights = calibration.interpolation(nm)
-
-    def of(spectra: np.ndarray, only_inside: bool = False) -> np.ndarray:
-        return calibration.values(spectra.astype(float) @ weights, only_inside)
-
+    of = partial(calibration.of, nm=nm)
     values, resampling_error = of(surface.spectra, only_inside=True), 0.0
-    if not np.isin(weights, (0.0, 1.0)).all():
+    if not np.isin(calibration.interpolation(nm), (0.0, 1.0)).all():
         order = np.argsort(nm)
         coarse = np.union1d(order[::2], order[-1:])
-        other = calibration.values(surface.spectra[:, coarse] @ calibration.interpolation(nm[coarse]))
+        other = calibration.of(surface.spectra[:, coarse], nm[coarse])
         change = (other - values)[surface.seen & np.isfinite(other - values)]
         resampling_error = float(np.sqrt(np.mean(change**2))) / 3.0 if len(change) else math.nan
     return SurfaceMap(
@@ -154,12 +157,13 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
     )
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration from a CSV table, whose header may name an ONNX model beside it.
 
     Raises:
         InputError: the table or the model cannot be read, or does not hold what it needs.
     """
+    path = Path(path)
     try:
         head, columns = _read_table(path)
         if unknown := head.keys() - _KEYS:

@@ -1,17 +1,19 @@
 """Named reference spectra from an ENVI spectral library or a CSV table, resampled to the bands of a cloud.
 
-Libraries are read here and not by SPy, whose reader ignores the header's offset and knows only one spelling of the
-file type.
+SPy writes libraries. They are not read by SPy, whose reader ignores the header's offset and knows only one spelling of
+the file type.
 """
 
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from spectral.io import envi
 
 from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.errors import InputError
@@ -95,17 +97,35 @@ def read_library(path: Path) -> SpectralLibrary:
     return SpectralLibrary(tuple(names), wavelengths_nm, np.where(spectra < _DELETED, np.nan, spectra))
 
 
-def write_table(path: Path, library: SpectralLibrary) -> None:
-    """Write the CSV table that `read_library` reads.
+def write_library(path: Path | str, library: SpectralLibrary) -> None:
+    """Write a file that `read_library` reads: an ENVI spectral library (``.sli``, with its header) or a CSV table.
+
+    In the names of an ENVI library commas and braces become low lines, because they end a name there.
 
     Raises:
-        InputError: the operating system refused to write.
+        InputError: the file's name ends in neither, or the operating system refused to write.
+
+    Example:
+        >>> library = SpectralLibrary(("skin", "leaf"), np.array([500.0, 700.0]), np.array([[0.1, 0.6], [0.2, 0.3]]))
+        >>> write_library("materials.sli", library)
+        >>> read_library("materials.sli").names
+        ('skin', 'leaf')
     """
-    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["wavelength_nm", *library.names])
-        rows = zip(library.wavelengths_nm, *library.spectra, strict=True)
-        writer.writerows([f"{number:.6g}" for number in row] for row in rows)
+    path = Path(path)
+    if path.suffix == ".csv":
+        with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["wavelength_nm", *library.names])
+            rows = zip(library.wavelengths_nm, *library.spectra, strict=True)
+            writer.writerows([f"{number:.6g}" for number in row] for row in rows)
+    elif path.suffix == ".sli":
+        names = [re.sub(r"[,{}\n\r]", "_", name) for name in library.names]
+        nm = [float(wavelength) for wavelength in library.wavelengths_nm]
+        header = {"wavelength": nm, "wavelength units": "Nanometers", "spectra names": names}
+        with atomic_write(path, path.with_suffix(".hdr")) as (temporary, _):
+            envi.SpectralLibrary(np.asarray(library.spectra, "<f4"), header).save(str(temporary.with_suffix("")))
+    else:
+        raise InputError(f"{path}: is no name of a library; let it end in .sli or .csv.")
 
 
 def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:

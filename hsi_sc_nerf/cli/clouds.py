@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -21,13 +21,6 @@ from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.terminal import screen_table
-
-if TYPE_CHECKING:
-    from hsi_sc_nerf.analysis.components import Components
-    from hsi_sc_nerf.analysis.size import Size
-    from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
-    from hsi_sc_nerf.analysis.traits import Traits
-    from hsi_sc_nerf.packed.dataset import PackedDataset
 
 
 @dataclass(frozen=True)
@@ -123,131 +116,37 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
-        from hsi_sc_nerf.analysis.calibrations import calibration_map, read_calibration
-        from hsi_sc_nerf.analysis.closed_mesh import closed_mesh
-        from hsi_sc_nerf.analysis.components import find_components
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.maps import index_maps
-        from hsi_sc_nerf.analysis.size import (
-            pixel_on_object_m,
-            shared_errors,
-            size_of,
-            size_uncertainty,
-            sizes_to_find,
-        )
-        from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
-        from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse, classified
+        from hsi_sc_nerf.analysis.measurement import measure_traits
+        from hsi_sc_nerf.analysis.measurement_files import write_measurement
         from hsi_sc_nerf.export.cloud import read_spectral_ply
-        from hsi_sc_nerf.indices.catalogue import find_indices
         from hsi_sc_nerf.packed.dataset import open_packed
-        from hsi_sc_nerf.terminal import progress_bar
 
         check_options(self)
         if self.classes and self.library is None:
             raise InputError("--classes names spectra of a library; give it with --library.")
         require_writable(self.output_dir)
-        picked = [RegionOfInterest(name, (x_m, y_m, z_m), radius_m) for name, x_m, y_m, z_m, radius_m in self.roi]
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
             library = library.only(self.classes)
-        dataset = None if self.data is None else open_packed(self.data)
-        config = replace(self.mesh, base_height_m=self._base_height_m(dataset))
-        cloud = read_spectral_ply(self.cloud)
-        indices = find_indices(self.index, cloud.wavelengths_nm)
-        calibrations = [read_calibration(path) for path in self.calibration]
-        for calibration in calibrations:
-            calibration.interpolation(cloud.wavelengths_nm)  # which refuses before the work
-        if library is not None:
-            library = library.at(cloud.wavelengths_nm)
-
+        measured = measure_traits(
+            read_spectral_ply(self.cloud),
+            None if self.data is None else open_packed(self.data),
+            mesh=self.mesh,
+            splits=self.splits,
+            max_incidence_deg=self.max_incidence_deg,
+            library=library,
+            angle_rad=self.angle_rad,
+            smallest_region_cm2=self.smallest_region_cm2,
+            regions={name: (x_m, y_m, z_m, radius_m) for name, x_m, y_m, z_m, radius_m in self.roi},
+            indices=self.index,
+            calibrations=self.calibration,
+            components=self.components,
+        )
         console = Console(stderr=True)
-        with console.status("closing the surface"):
-            mesh = closed_mesh(cloud.points, cloud.normals, config)
-        size, uncertainty = size_of(mesh), {}
-        if self.splits:
-            shared = None
-            if dataset is not None:
-                shared = shared_errors(dataset, base_known=config.base_height_m is not None)
-            with progress_bar("uncertainty", "meshes", sizes_to_find(self.splits, shared)) as done:
-                uncertainty = size_uncertainty(
-                    cloud.points, cloud.normals, mesh, config, self.splits, shared, done=done
-                )
-        with console.status("spectra on the surface"):
-            surface = with_spectra(mesh, cloud, config.smoothing_radius_m, self.max_incidence_deg)
-            found = classified(surface, library, self.angle_rad, self.smallest_region_cm2 * 1e-4) if library else None
-            pixel_m = None if dataset is None else pixel_on_object_m(dataset)
-            maps = [*index_maps(surface, indices), *(calibration_map(surface, one) for one in calibrations)]
-            traits = analyse(surface, picked, found, pixel_m, maps)
-            components = find_components(surface, self.components) if self.components else None
         with console.status("tables and pictures"):
-            self._write(surface, size, uncertainty, traits, components, config)
+            write_measurement(self.output_dir, measured, self.cloud.name)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
-
-    def _base_height_m(self, dataset: PackedDataset | None) -> float | None:
-        """Height of the object's base above the turntable, if it is known."""
-        if self.mesh.base_height_m is not None or dataset is None or dataset.container is None:
-            return self.mesh.base_height_m
-        return dataset.container.height_m
-
-    def _write(
-        self,
-        surface: SpectralMesh,
-        size: Size,
-        uncertainty: dict[str, Size],
-        traits: Traits,
-        components: Components | None,
-        config: MeshConfig,
-    ) -> None:
-        """Write pictures, mesh and tables, and last the page that links them."""
-        from hsi_sc_nerf.analysis import pictures, report
-        from hsi_sc_nerf.analysis.closed_mesh import open_edges
-        from hsi_sc_nerf.analysis.library import write_table
-        from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
-        from hsi_sc_nerf.files import write_json
-        from hsi_sc_nerf.spectra import available_composites
-
-        views = pictures.SideViews(surface.mesh)
-        drawn, extra = {}, {}
-        if (found := traits.classes) is not None:
-            for caption, picture, column, labels in (
-                ("Classes by angle", "classes.png", "class", found.labels),
-                ("Classes by mixture", "classes_by_mixture.png", "class_by_mixture", found.mixture_labels),
-            ):
-                pictures.draw_classes(self.output_dir / picture, found.names, labels, surface, views)
-                drawn[caption], extra[column] = picture, labels.astype("float32")
-        drawn["Spectra of regions"] = "region_spectra.png"
-        pictures.draw_region_spectra(self.output_dir / "region_spectra.png", surface.wavelengths_nm, traits)
-        if available_composites(surface.wavelengths_nm):
-            drawn["Composites"] = "composites.png"
-            pictures.draw_composites(self.output_dir / "composites.png", surface, views)
-        maps = {
-            ("Indices", "indices.png"): {one.caption: one.values for one in traits.maps if one.definition},
-            ("Calibrations", "calibrations.png"): {
-                one.caption: one.values for one in traits.maps if not one.definition
-            },
-        }
-        extra |= {one.column: one.values.astype("float32") for one in traits.maps}
-        if components is not None:
-            scores, fractions = components.columns()
-            maps |= {
-                ("Principal components", "components.png"): scores,
-                ("Fractions of endmembers", "endmembers.png"): fractions,
-            }
-            extra |= {name: column.astype("float32") for name, column in (scores | fractions).items()}
-            write_table(self.output_dir / "endmembers.csv", components.endmembers)
-        for (caption, picture), of_picture in maps.items():
-            if of_picture:
-                pictures.draw_maps(self.output_dir / picture, of_picture, surface, views)
-                drawn[caption] = picture
-        write_mesh(self.output_dir / "mesh.ply", surface, extra)
-        report.write_spectra(self.output_dir / "spectra.csv", surface.wavelengths_nm, traits)
-        options = {"splits": self.splits, "max_incidence_deg": self.max_incidence_deg}
-        settings = {"cloud": self.cloud.name, **asdict(config), **options}
-        content = report.trait_content(size, uncertainty, open_edges(surface.mesh) == 0, traits, settings)
-        if components is not None:
-            content["components"] = report.component_content(components)
-        write_json(self.output_dir / "traits.json", content)
-        report.write_page(self.output_dir / "traits.md", self.cloud.name, content, drawn)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,7 +12,6 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.markup import escape
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -56,6 +55,7 @@ class MaterialCommand:
         """
         check_options(self)
         from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream
+        from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
@@ -68,10 +68,10 @@ class MaterialCommand:
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
         run = open_run(self.load_config)
-        bands = bands_of(cloud.wavelengths_nm, run.model.wavelengths_nm, self.cloud)
+        require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
         found = light_of_run(run, self._white_normal())
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
-        result = with_material(cloud, found, bands, corrected=corrected)
+        result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
         told = summary(found, result, corrected=corrected)
         write_cloud(stem, stream(result), file_format)
         write_json(output.with_suffix(".json"), told)
@@ -101,35 +101,6 @@ def sentences(told: dict[str, Any]) -> list[str]:
             "that of other objects."
         )
     return lines
-
-
-def bands_of(cloud_nm: Float[np.ndarray, "selected"], run_nm: Float[np.ndarray, "bands"], path: Path) -> np.ndarray:
-    """Index of each band of the cloud in the run.
-
-    Raises:
-        InputError: the run has no such band.
-    """
-    bands = np.abs(cloud_nm[:, None] - run_nm).argmin(axis=1)
-    if np.abs(run_nm[bands] - cloud_nm).max() > 0.01:
-        raise InputError(f"{path}: its bands are not those of the run; give the run that it was exported from.")
-    return bands
-
-
-def with_material(cloud: SpectralCloud, found: RunLight, bands: np.ndarray, *, corrected: bool) -> SpectralCloud:
-    """The cloud with the columns of material and irradiance."""
-    from hsi_sc_nerf.export.cloud import band_property_names
-    from hsi_sc_nerf.light.fit import WHITE_STD
-
-    # Shade that is found but not corrected is an error of unknown size.
-    std = np.full(len(cloud), np.nan if found.evidence.shaded else WHITE_STD)
-    material, irradiance = cloud.spectra, np.ones(len(cloud))
-    if corrected:
-        by_band, std = found.irradiance(cloud.points.astype(float))
-        material, irradiance = cloud.spectra / by_band[:, bands], by_band.mean(axis=1)
-    names = band_property_names(cloud.wavelengths_nm, "material")
-    columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True))
-    extra = {name: column for name, column in cloud.extra.items() if name not in columns}
-    return replace(cloud, extra=extra | {name: column.astype(np.float32) for name, column in columns.items()})
 
 
 def summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:

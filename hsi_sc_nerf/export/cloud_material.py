@@ -1,4 +1,4 @@
-"""The material's reflectance at any point of an object, from a cloud by `hsi-sc-nerf material`.
+"""The material's reflectance: on a cloud, by the light in its run, and from there at any point of the object.
 
 The irradiance in that cloud is that of the view that gave a point its spectrum: the object turns under lamps that
 stand still. The material's reflectance is the same in all views, so that it is what other points and views get.
@@ -6,16 +6,24 @@ stand still. The material's reflectance is the same in all views, so that it is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS, material_spectra, read_spectral_ply
+from hsi_sc_nerf.export.cloud import (
+    LIGHT_COLUMNS,
+    SpectralCloud,
+    band_property_names,
+    material_spectra,
+    read_spectral_ply,
+)
+from hsi_sc_nerf.light.fit import WHITE_STD
+from hsi_sc_nerf.light.of_run import RunLight
 
 NEIGHBOURS = 4
 """Points of the cloud whose mean a point gets."""
@@ -62,6 +70,52 @@ class CloudMaterial:
             spectra[rows] = np.einsum("mk,mkb->mb", weights, self.spectra[nearest])
             std[rows] = (weights * self.relative_std[nearest]).sum(axis=1)
         return spectra, std
+
+
+def with_material(
+    cloud: SpectralCloud, found: RunLight, run_nm: Float[np.ndarray, "bands"], *, corrected: bool
+) -> SpectralCloud:
+    """The cloud with the columns of material and irradiance.
+
+    Args:
+        cloud: of the run.
+        found: the light in the run.
+        run_nm: bands of the run.
+        corrected: whether the light is taken out; else the material is what was measured.
+
+    Raises:
+        InputError: the run lacks a band of the cloud.
+    """
+    bands = require_bands_of_run(cloud, run_nm, "the cloud")
+    # Shade that is found but not corrected is an error of unknown size.
+    std = np.full(len(cloud), np.nan if found.evidence.shaded else WHITE_STD)
+    material, irradiance = cloud.spectra, np.ones(len(cloud))
+    if corrected:
+        by_band, std = found.irradiance(cloud.points.astype(float))
+        material, irradiance = cloud.spectra / by_band[:, bands], by_band.mean(axis=1)
+    names = band_property_names(cloud.wavelengths_nm, "material")
+    columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True))
+    extra = {name: column for name, column in cloud.extra.items() if name not in columns}
+    return replace(cloud, extra=extra | {name: column.astype(np.float32) for name, column in columns.items()})
+
+
+def require_bands_of_run(
+    cloud: SpectralCloud, run_nm: Float[np.ndarray, "bands"], what: str
+) -> Int[np.ndarray, "selected"]:
+    """Index of each band of a cloud in its run.
+
+    Args:
+        cloud: of the run.
+        run_nm: bands of the run.
+        what: the cloud, in the message.
+
+    Raises:
+        InputError: the run has no such band.
+    """
+    bands = np.abs(cloud.wavelengths_nm[:, None] - run_nm).argmin(axis=1)
+    if np.abs(run_nm[bands] - cloud.wavelengths_nm).max() > 0.01:
+        raise InputError(f"{what}: its bands are not those of the run; give the run that it was exported from.")
+    return bands
 
 
 def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> CloudMaterial:

@@ -26,6 +26,7 @@ from hsi_sc_nerf.export.cloud import (
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.files import require_writable
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
@@ -64,6 +65,20 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
     require_writable(target.parent)
     bands = select_bands(run.model.wavelengths_nm, options.bands)
     require_format(target, options.format, len(bands), len(EXTRA))
+    cloud = render_cloud(run, options, name)
+    path = write_cloud(target, cloud, options.format)
+    summary = f"{cloud.count:,} points with {len(bands)} bands, in metres: {escape(str(path))}"
+    CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
+    return path
+
+
+def render_cloud(run: TrainedRun, options: CloudOptions, name: str = "") -> CloudStream:
+    """The cloud of a run: the points on its surface, whose spectra are rendered when the chunks are iterated over.
+
+    Raises:
+        InputError: the model holds no object, or the options contradict the run.
+    """
+    bands = select_bands(run.model.wavelengths_nm, options.bands)
     sampler, dataset = run.manager.train_pixel_sampler, run.manager.train_dataset
     painted_masks = None
     if options.roi_masks is not None:
@@ -84,11 +99,7 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
     if options.normal_method == "open3d":
         normals = estimate_normals(surface.points, surface.mesh_normals).astype(np.float32)
     chunks = _render_chunks(run, renders, surface, normals, bands, batch)
-    cloud = CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name)
-    path = write_cloud(target, cloud, options.format)
-    summary = f"{len(surface):,} points with {len(bands)} bands, in metres: {escape(str(path))}"
-    CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
-    return path
+    return CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name)
 
 
 def _region(
@@ -149,8 +160,13 @@ def _render_points(
     model = run.model
     rays = camera_rays(run.manager.train_dataset.cameras, surface.frames, surface.xy_px, model.device)
     outputs, spectra = render_object(model, rays)
-    points = torch.from_numpy(surface.points).float().to(model.device)
-    normals = -functional.normalize(model.field.density_gradient(points), dim=-1)
+    normals = density_normals(model, surface.points)
     away = (normals * rays.directions).sum(dim=-1, keepdim=True) > 0.0
     normals = torch.where(away, -normals, normals)
     return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy(), normals.cpu().numpy()
+
+
+def density_normals(model: SpectralModel, points: Float[np.ndarray, "n 3"]) -> Float[torch.Tensor, "n 3"]:
+    """Unit normals out of a model's surface at points of the scene, by the gradient of its density."""
+    positions = torch.from_numpy(points).float().to(model.device)
+    return -functional.normalize(model.field.density_gradient(positions), dim=-1)

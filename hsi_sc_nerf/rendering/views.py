@@ -72,12 +72,18 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
         count: views in the turn.
         size: factor on the size of the camera's images.
     """
+    cameras = cameras_at(run, np.arange(count) * 360.0 / count, size)
+    return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
+
+
+def cameras_at(run: TrainedRun, angles_deg: Float[np.ndarray, "cameras"], size: float = 1.0) -> Cameras:
+    """The session's camera with the object turned counter-clockwise by angles from where the first frame saw it."""
     first = run.refined_poses_m()[0]
-    poses = np.stack([turntable_camera_to_world(first, angle) for angle in np.arange(count) * 360.0 / count])
+    poses = np.stack([turntable_camera_to_world(first, angle) for angle in angles_deg])
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
     cameras = pinhole_cameras(poses, run.dataset.intrinsics, run.dataset.distortion)
     cameras.rescale_output_resolution(size)
-    return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
+    return cameras
 
 
 def views_of_path(path: Path) -> Views:

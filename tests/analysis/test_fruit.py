@@ -136,6 +136,7 @@ def test_command_writes_all_results(tmp_path, capsys):
     pictures = ("components", "composites", "endmembers", "indices", "calibrations", "classes", "classes_by_mixture")
     assert written == {
         *("traits.md", "traits.json", "spectra.csv", "endmembers.csv", "mesh.ply", "region_spectra.png"),
+        *("regions.sli", "regions.hdr"),
         *(f"{picture}.png" for picture in pictures),
     }
     content = json.loads((output / "traits.json").read_text())
@@ -150,6 +151,9 @@ def test_command_writes_all_results(tmp_path, capsys):
     table = np.loadtxt(output / "spectra.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(table[:, 0], NM, rtol=1e-5)
     np.testing.assert_allclose(table[:, -2], true.endmembers[1], atol=0.002)
+    regions = read_library(output / "regions.sli")
+    assert regions.names == ("whole surface", "skin", "bruise", "spot")
+    np.testing.assert_allclose(regions.spectra[-1], table[:, -2], rtol=1e-5)
     mesh = read_spectral_ply(output / "mesh.ply")
     assert len(mesh.points) > 1000
     assert {"index_PRI", "index_own", "calibration_sum", "component_1", "endmember_1"} <= set(mesh.extra)

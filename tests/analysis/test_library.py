@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from spectral.io import envi
 
-from hsi_sc_nerf.analysis.library import read_library
+from hsi_sc_nerf.analysis.library import SpectralLibrary, read_library, write_library
 from hsi_sc_nerf.errors import InputError
 
 NM = np.linspace(400.0, 1000.0, 31)
@@ -125,3 +125,26 @@ def test_missing_or_broken_libraries_are_refused(tmp_path, given, files, says):
         (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=says):
         read_library(tmp_path / given)
+
+
+@pytest.mark.parametrize("name", ["library.sli", "library.csv"])
+def test_what_is_written_is_read_here_and_by_spy(tmp_path, name):
+    library = SpectralLibrary(("green", "brown"), NM, SPECTRA)
+    write_library(tmp_path / name, library)
+    read = read_library(tmp_path / name)
+    assert read.names == library.names
+    np.testing.assert_allclose(read.wavelengths_nm, NM)
+    np.testing.assert_allclose(read.spectra, SPECTRA, rtol=1e-5)
+    if name.endswith(".sli"):
+        by_spy = envi.open(str(tmp_path / "library.hdr"))
+        assert by_spy.names == ["green", "brown"]
+        np.testing.assert_allclose(by_spy.bands.centers, NM)
+        np.testing.assert_allclose(by_spy.spectra, SPECTRA, rtol=1e-6)
+
+
+def test_names_that_a_header_cannot_hold_are_mended_and_other_endings_refused(tmp_path):
+    library = SpectralLibrary(("a, {b}", "brown"), NM, SPECTRA)
+    write_library(tmp_path / "library.sli", library)
+    assert read_library(tmp_path / "library.sli").names == ("a_ _b_", "brown")
+    with pytest.raises(InputError, match=r"library\.txt: .* \.sli or \.csv"):
+        write_library(tmp_path / "library.txt", library)

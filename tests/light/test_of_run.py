@@ -7,11 +7,13 @@ import capture_factory as factory
 import numpy as np
 import pytest
 from light_on_a_ball import FACING, measured, turning_ball
+from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.light import bands_of, sentences, summary, with_material
+from hsi_sc_nerf.cli.light import sentences, summary
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
+from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
 from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
@@ -86,7 +88,7 @@ def upper_cloud(found, lit):
 def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert lit.evidence.shaded
     cloud = upper_cloud(lit, lit=True)
-    corrected = with_material(cloud, lit, np.arange(factory.BANDS), corrected=True)
+    corrected = with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True)
     assert list(corrected.extra)[-2:] == ["irradiance", "irradiance_std"]
     by_band, std = lit.irradiance(cloud.points.astype(float))
     for band, name in enumerate(list(corrected.extra)[: factory.BANDS]):
@@ -102,7 +104,7 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
 @pytest.mark.parametrize("file_format", ["ply", "netcdf"])
 def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, file_format):
     cloud = upper_cloud(lit, lit=True)
-    corrected = with_material(cloud, lit, np.arange(factory.BANDS), corrected=True)
+    corrected = with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True)
     path = write_cloud(tmp_path / "cloud", stream(corrected), file_format)
     if file_format == "ply":
         read = read_spectral_ply(path)
@@ -122,7 +124,7 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
 
 
 def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
-    same = with_material(upper_cloud(lit, lit=True), lit, np.arange(factory.BANDS), corrected=False)
+    same = with_material(upper_cloud(lit, lit=True), lit, factory.WAVELENGTHS_NM, corrected=False)
     assert np.isnan(same.extra["irradiance_std"]).all()
     assert summary(lit, same, corrected=False)["relative_std"] is None
 
@@ -140,16 +142,17 @@ def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
 def test_even_light_is_left_alone(even):
     assert not even.evidence.shaded
     cloud = upper_cloud(even, lit=False)
-    same = with_material(cloud, even, np.arange(factory.BANDS), corrected=False)
+    same = with_material(cloud, even, factory.WAVELENGTHS_NM, corrected=False)
     np.testing.assert_array_equal(same.extra["material_400.00nm"], cloud.spectra[:, 0])
     np.testing.assert_array_equal(same.extra["irradiance"], 1.0)
     # That of the white reference.
     np.testing.assert_allclose(same.extra["irradiance_std"], 0.01)
 
 
-def test_a_cloud_of_other_bands_is_refused(tmp_path):
-    with pytest.raises(InputError):
-        bands_of(np.array([500.0, 512.0]), np.array([500.0, 510.0]), tmp_path / "cloud.ply")
+def test_a_cloud_of_other_bands_is_refused():
+    cloud = random_cloud(wavelengths_nm=np.array([500.0, 512.0]))
+    with pytest.raises(InputError, match="its bands are not those of the run"):
+        require_bands_of_run(cloud, np.array([500.0, 510.0]), "cloud.ply")
 
 
 def shaded_ball():

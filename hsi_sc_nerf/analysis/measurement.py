@@ -1,0 +1,134 @@
+"""Everything that `hsi-sc-nerf traits` measures on a cloud, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from hsi_sc_nerf import paper
+from hsi_sc_nerf.analysis.calibrations import Calibration, calibration_map, read_calibration
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
+from hsi_sc_nerf.analysis.components import Components, find_components
+from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.maps import index_maps
+from hsi_sc_nerf.analysis.report import component_content, trait_content
+from hsi_sc_nerf.analysis.size import (
+    Size,
+    pixel_on_object_m,
+    shared_errors,
+    size_of,
+    size_uncertainty,
+    sizes_to_find,
+)
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
+from hsi_sc_nerf.analysis.traits import RegionOfInterest, Traits, analyse, classified
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
+from hsi_sc_nerf.indices.catalogue import find_indices
+from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.terminal import progress_bar
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """An object's size, and what is on its surface.
+
+    Attributes:
+        surface: the closed mesh with its spectra.
+        size: of the mesh.
+        uncertainty: standard deviation of each size by its cause; empty without splits.
+        traits: spectra, indices, calibrations and classes of the regions.
+        components: principal components and endmembers, if they were asked for.
+        settings: that it was made with.
+    """
+
+    surface: SpectralMesh
+    size: Size
+    uncertainty: Mapping[str, Size]
+    traits: Traits
+    components: Components | None
+    settings: Mapping[str, Any]
+
+    def content(self) -> dict[str, Any]:
+        """All but spectra, as ``traits.json`` holds it: metres, square metres, litres."""
+        watertight = open_edges(self.surface.mesh) == 0
+        content = trait_content(self.size, self.uncertainty, watertight, self.traits, self.settings)
+        return content | ({"components": component_content(self.components)} if self.components else {})
+
+    def region_spectra(self) -> SpectralLibrary:
+        """The mean spectra of the whole surface, the classes and the regions, by name."""
+        names, spectra = zip(*((one.name, one.spectrum.mean) for one in self.traits.regions), strict=True)
+        return SpectralLibrary(names, self.surface.wavelengths_nm, np.stack(spectra))
+
+
+def measure_traits(
+    cloud: SpectralCloud,
+    dataset: PackedDataset | None = None,
+    *,
+    mesh: MeshConfig | None = None,
+    splits: int = 6,
+    max_incidence_deg: float = MAX_INCIDENCE_DEG,
+    library: SpectralLibrary | None = None,
+    angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD,
+    smallest_region_cm2: float = 0.05,
+    regions: Mapping[str, Sequence[float]] | None = None,
+    indices: Sequence[str] = (),
+    calibrations: Sequence[Path | str | Calibration] = (),
+    components: int = 0,
+) -> Measurement:
+    """Measure an object's size, and the spectra, indices and classes on its surface, as `hsi-sc-nerf traits` does.
+
+    Args:
+        cloud: metres, z up.
+        dataset: that the cloud was made from, for the height of the base and the uncertainty of scale and pixels.
+        mesh: settings of the mesh.
+        splits: random splits of the cloud, for the uncertainty of the sizes; 0 for none.
+        max_incidence_deg: spectra come from points that are seen at this angle at most.
+        library: reference spectra to classify by.
+        angle_rad: largest spectral angle to a class.
+        smallest_region_cm2: smaller regions of a class are not listed.
+        regions: x, y, z of the centre and radius of each region of interest by its name, metres.
+        indices: names of the catalogue, or formulas as ``"CRI = 1/R510 - 1/R550"``.
+        calibrations: tables (`read_calibration`), or what was read of them.
+        components: principal components and endmembers to look for, at most.
+
+    Raises:
+        InputError: a file or a number cannot be used.
+
+    Example:
+        >>> found = measure_traits(read_spectral_ply("point_cloud.ply"), indices=["PRI"], splits=0)
+        >>> found.size.volume_l, found.traits.regions[0].maps["PRI"].surface.mean
+        (0.21, 0.04)
+    """
+    config = MeshConfig() if mesh is None else mesh
+    if config.base_height_m is None and dataset is not None and dataset.container is not None:
+        config = replace(config, base_height_m=dataset.container.height_m)
+    picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]
+    found_indices = find_indices(indices, cloud.wavelengths_nm)
+    read = [one if isinstance(one, Calibration) else read_calibration(one) for one in calibrations]
+    for calibration in read:
+        calibration.interpolation(cloud.wavelengths_nm)  # which refuses before the work
+    if library is not None:
+        library = library.at(cloud.wavelengths_nm)
+
+    console = Console(stderr=True)
+    with console.status("closing the surface"):
+        closed = closed_mesh(cloud.points, cloud.normals, config)
+    uncertainty: dict[str, Size] = {}
+    if splits:
+        shared = None if dataset is None else shared_errors(dataset, base_known=config.base_height_m is not None)
+        with progress_bar("uncertainty", "meshes", sizes_to_find(splits, shared)) as done:
+            uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, shared, done=done)
+    with console.status("spectra on the surface"):
+        surface = with_spectra(closed, cloud, config.smoothing_radius_m, max_incidence_deg)
+        classes = classified(surface, library, angle_rad, smallest_region_cm2 * 1e-4) if library else None
+        pixel_m = None if dataset is None else pixel_on_object_m(dataset)
+        maps = [*index_maps(surface, found_indices), *(calibration_map(surface, one) for one in read)]
+        traits = analyse(surface, picked, classes, pixel_m, maps)
+        unsupervised = find_components(surface, components) if components else None
+    settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
+    return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)

@@ -1,0 +1,68 @@
+"""The files of `hsi-sc-nerf traits`: page, tables, mesh and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from hsi_sc_nerf.analysis import pictures, report
+from hsi_sc_nerf.analysis.library import write_library
+from hsi_sc_nerf.analysis.measurement import Measurement
+from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.spectra import available_composites
+
+
+def write_measurement(folder: Path | str, measured: Measurement, name: str) -> None:
+    """Write pictures, mesh and tables, and last ``traits.md``, the page that links them.
+
+    Args:
+        folder: to write to.
+        measured: the traits.
+        name: of the cloud, which the page states.
+
+    Raises:
+        InputError: the files cannot be written.
+
+    Example:
+        >>> found = measure_traits(read_spectral_ply("point_cloud.ply"))
+        >>> write_measurement("traits", found, "apple, day 1")
+    """
+    folder, surface, traits, components = Path(folder), measured.surface, measured.traits, measured.components
+    views = pictures.SideViews(surface.mesh)
+    drawn, extra = {}, {}
+    if (found := traits.classes) is not None:
+        for caption, picture, column, labels in (
+            ("Classes by angle", "classes.png", "class", found.labels),
+            ("Classes by mixture", "classes_by_mixture.png", "class_by_mixture", found.mixture_labels),
+        ):
+            pictures.draw_classes(folder / picture, found.names, labels, surface, views)
+            drawn[caption], extra[column] = picture, labels.astype("float32")
+    drawn["Spectra of regions"] = "region_spectra.png"
+    pictures.draw_region_spectra(folder / "region_spectra.png", surface.wavelengths_nm, traits)
+    if available_composites(surface.wavelengths_nm):
+        drawn["Composites"] = "composites.png"
+        pictures.draw_composites(folder / "composites.png", surface, views)
+    maps = {
+        ("Indices", "indices.png"): {one.caption: one.values for one in traits.maps if one.definition},
+        ("Calibrations", "calibrations.png"): {one.caption: one.values for one in traits.maps if not one.definition},
+    }
+    extra |= {one.column: one.values.astype("float32") for one in traits.maps}
+    if components is not None:
+        scores, fractions = components.columns()
+        maps |= {
+            ("Principal components", "components.png"): scores,
+            ("Fractions of endmembers", "endmembers.png"): fractions,
+        }
+        extra |= {name: column.astype("float32") for name, column in (scores | fractions).items()}
+        write_library(folder / "endmembers.csv", components.endmembers)
+    for (caption, picture), of_picture in maps.items():
+        if of_picture:
+            pictures.draw_maps(folder / picture, of_picture, surface, views)
+            drawn[caption] = picture
+    write_mesh(folder / "mesh.ply", surface, extra)
+    report.write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
+    write_library(folder / "regions.sli", measured.region_spectra())
+    content = replace(measured, settings={"cloud": name, **measured.settings}).content()
+    write_json(folder / "traits.json", content)
+    report.write_page(folder / "traits.md", name, content, drawn)

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from random_cloud import BAND_NAMES, assert_equal, random_cloud
+
+import hsi_sc_nerf as hsn
+from hsi_sc_nerf.api.clouds import Cloud, read_cloud
+from hsi_sc_nerf.errors import InputError
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cloud.ply", "cloud.nc", "cloud.zarr"])
+def test_a_saved_cloud_is_read_again(tmp_path, name):
+    for package in ("xarray", "h5netcdf", "zarr"):
+        pytest.importorskip(package)
+    cloud = Cloud.of(random_cloud())
+    assert cloud.save(tmp_path / name) == tmp_path / name
+    assert_equal(hsn.read_cloud(str(tmp_path / name)), cloud)
+    assert isinstance(read_cloud(tmp_path / name).select(slice(3)), Cloud)
+
+
+def test_indices_and_calibrations_are_of_the_material_where_it_is_known(tmp_path):
+    table = tmp_path / "sugar.csv"
+    table.write_text("# intercept: 2\nwavelength_nm,coefficient\n397.32,1\n525.1,10\n650,100\n")
+    cloud = Cloud.of(random_cloud())
+    of_material = 0.5 * cloud.spectra
+    columns = dict(zip((f"material_{name}" for name in BAND_NAMES), of_material.T, strict=True))
+    for spectra, one in ((cloud.spectra, cloud), (of_material, Cloud.of(random_cloud(extra=columns)))):
+        spectra = spectra.astype(float)
+        np.testing.assert_allclose(one.index("x = R650 - R400"), spectra[:, 2] - spectra[:, 1])
+        half = spectra[:, 1:3].mean(axis=1)  # 525.1 nm lies between 400.2 and 650 nm
+        expected = 2 + spectra[:, 0] + 10 * half + 100 * spectra[:, 2]
+        np.testing.assert_allclose(one.calibration(str(table)), expected, rtol=1e-6)
+    assert cloud.material is None
+
+
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.nc", "cloud.zarr", "cloud.ply", "cloud.txt"])
+def test_what_is_no_cloud_is_one_sentence(tmp_path, name):
+    pytest.importorskip("xarray")
+    with pytest.raises(InputError, match=rf"{name}: "):
+        read_cloud(tmp_path / name)
+    (tmp_path / name).write_text("no cloud")
+    with pytest.raises(InputError, match=rf"{name}: "):
+        read_cloud(tmp_path / name)
+
+
+def test_a_table_of_something_else_names_the_file(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    xarray.Dataset({"a": ("point", np.zeros(3))}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=r"other\.nc: the table has no reflectance"):
+        read_cloud(tmp_path / "other.nc")
