@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import json
 import os
 import re
 import textwrap
@@ -42,7 +43,18 @@ def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
     pages = {"commands": commands_page(), "settings": settings_page(), "indices": indices_page()}
     for name, content in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=content))
+    for path in sorted((Path(config.docs_dir) / "notebooks").glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook_page(path)))
     return files
+
+
+def notebook_page(path: Path) -> str:
+    """The cells of a notebook, and behind the first one a link to the file."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
+    parts = [text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in texts]
+    parts.insert(1, f"Download [{path.name}]({path.name}) to open it as a notebook.")
+    return "\n\n".join(parts) + "\n"
 
 
 def results_table(name: str, folder: Path = RESULTS) -> str:

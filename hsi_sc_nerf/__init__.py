@@ -9,20 +9,23 @@ from typing import Any
 __version__ = "0.1.0"
 
 _API = {
-    "simulate_session": "simulate.session",
     "load_scene": "simulate.scene",
+    "simulate_session": "simulate.session",
+    "inspect_session": "inspection.inspect",
     "process_session": "processing.process",
     "open_dataset": "packed.dataset:open_packed",
     "open_run": "api.runs",
     "read_cloud": "api.clouds",
+    "from_xarray": "export.table",
     "read_calibration": "analysis.calibrations",
     "read_library": "analysis.library",
     "write_library": "analysis.library",
     "traits": "analysis.measurement:measure_traits",
     "write_traits": "analysis.measurement_files:write_measurement",
+    "read_reference": "evaluation.comparison",
+    "compare": "evaluation.comparison",
     "write_report": "report.build",
     "read_table": "batch.tables",
-    "from_xarray": "export.table",
 }
 """Module of each name; behind a colon its name there, where that is another one."""
 

@@ -1,7 +1,7 @@
 """Named reference spectra from an ENVI spectral library or a CSV table, resampled to the bands of a cloud.
 
-SPy writes libraries. They are not read by SPy, whose reader ignores the header's offset and knows only one spelling of
-the file type.
+SPy writes libraries. It does not read them: its reader ignores the header's offset and knows only one spelling of the
+file type.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -109,7 +109,8 @@ def read_cloud(path: Path | str) -> Cloud:
     try:
         import xarray
 
-        options = {"engine": "h5netcdf"} if kind == "netcdf" else {"engine": "zarr", "consolidated": False}
+        zarr = {"engine": "zarr", "backend_kwargs": {"consolidated": False}}
+        options: dict[str, Any] = zarr if kind == "zarr" else {"engine": "h5netcdf"}
         with xarray.open_dataset(path, **options) as table:
             return Cloud.of(from_xarray(table.load()))
     except (ImportError, OSError, ValueError) as error:

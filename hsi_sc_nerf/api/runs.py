@@ -117,13 +117,12 @@ class Run:
         """
         found = render_cloud(self.trained, CloudOptions(num_points=num_points, **options), self.name)
         chunks = list(found.chunks)
-
-        def joined(name: str) -> np.ndarray:
-            return np.concatenate([getattr(chunk, name) for chunk in chunks])
-
+        arrays = {
+            name: np.concatenate([getattr(chunk, name) for chunk in chunks])
+            for name in ("points", "normals", "colours", "spectra")
+        }
         extra = {name: np.concatenate([chunk.extra[name] for chunk in chunks]) for name in found.extra_names}
-        arrays = (joined(name) for name in ("points", "normals", "colours", "spectra"))
-        return Cloud(*arrays, found.wavelengths_nm, extra)
+        return Cloud(**arrays, wavelengths_nm=found.wavelengths_nm, extra=extra)
 
     def spectra_at(
         self,
