@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from hsi_sc_nerf.api.clouds import Cloud
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud, run_name
-from hsi_sc_nerf.export.cloud_material import with_material
+from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.sample_points import PointSpectra, sample_points
 from hsi_sc_nerf.export.spectral_export import density_normals, render_cloud
@@ -186,6 +186,7 @@ class Run:
         Raises:
             InputError: the cloud has other bands, or the light cannot be told.
         """
+        require_bands_of_run(cloud, self.wavelengths_nm, "the cloud")  # before the work
         found = light_of_run(self.trained, _TO_CAMERA)
         corrected = found.evidence.shaded if correct is None else correct
         return Cloud.of(with_material(cloud, found, self.wavelengths_nm, corrected=corrected))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import spectral
 from known_ball import CENTRE_M, RADIUS, SCALE, known_run, true_spectra
+from random_cloud import random_cloud
 
 import hsi_sc_nerf as hsn
 from hsi_sc_nerf.api.runs import Run
@@ -72,16 +73,26 @@ def test_a_frame_is_rendered_as_the_command_renders_it(run, tmp_path, monkeypatc
     ratio = view.index("x = R640 / R480")
     assert np.isnan(ratio[~view.valid]).all()
     assert np.isfinite(ratio[view.valid]).all()
-    turned = run.render(angle_deg=factory_angle(run, name))
+    turned = run.render(angle_deg=angle_of(run, name))
     assert turned.name.startswith("angle_")
     np.testing.assert_allclose(turned.reflectance, view.reflectance, atol=1e-4)
     with pytest.raises(InputError, match="no frame pear; it has ball_0, "):
         run.render("pear")
 
 
-def factory_angle(run, name):
+def angle_of(run, name):
     (frame,) = (frame for frame in run.dataset.frames if frame.capture == name)
     return frame.angle_deg
+
+
+@pytest.mark.slow
+def test_a_cloud_gets_the_material_as_measured_where_the_light_is_even(run):
+    cloud = random_cloud(wavelengths_nm=factory.WAVELENGTHS_NM)
+    found = run.with_material(cloud)
+    np.testing.assert_array_equal(found.material, cloud.spectra)
+    np.testing.assert_array_equal(found.extra["irradiance"], 1.0)
+    with pytest.raises(InputError, match="bands are not those of the run"):
+        run.with_material(random_cloud())
 
 
 def test_a_folder_without_a_run_is_one_sentence(tmp_path):
