@@ -1,6 +1,7 @@
 """How well `hsi-sc-nerf change` finds turns, bruises that grow and drying, and no change where none is, as a table.
 
     uv run python benchmarks/change_over_time.py
+    uv run python benchmarks/change_over_time.py --points 60000 --picture docs/images/change.png  # that alone
 
 The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface
 with the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
@@ -22,9 +23,11 @@ from hsi_sc_nerf.analysis.change import Comparison, compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
 from hsi_sc_nerf.analysis.change_features import surface_samples
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
+from hsi_sc_nerf.analysis.change_pictures import draw_change
 from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.indices.catalogue import CATALOGUE, find_indices
@@ -87,9 +90,14 @@ class ChangeOverTime:
     """Of each cloud, before what no camera sees is left out."""
     results: Path = RESULTS
     """Folder of the CSV file."""
+    picture: Path | None = None
+    """Draw nothing but a picture of the last apple of the table, to this file."""
 
     def main(self) -> None:
         """Measure, print, write."""
+        if self.picture is not None:
+            _draw(self.picture, self.points)
+            return
         rows = [row for kind in SERIES for row in self._series(kind)]
         write_results("change_over_time", COLUMNS, [*rows, self._ball()], seed="0 to 11", folder=self.results)
 
@@ -120,6 +128,15 @@ class ChangeOverTime:
         except InputError as error:
             told = f"refused: {str(error).split(';')[0]}"
         return ["ball of one colour", "second capture", "0", told, *[""] * (len(COLUMNS) - 4)]
+
+
+def _draw(path: Path, points: int) -> None:
+    """What `change` shows of the brightness of the apple that lost its stem."""
+    last = SERIES["apple"][-1][1]
+    clouds = [cloud_of(fruit_of(day, NM), day, CloudErrors(), points, seed) for seed, day in enumerate((FIRST, last))]
+    first, later = days_on_one_mesh(clouds, ["first", "last"], MeshConfig(), MAX_INCIDENCE_DEG)
+    (found,) = compare_days([first, later], (), (), SESSION_SD, SMALLEST_M2)
+    draw_change(path, first, found, found.quantities[BRIGHTNESS], SideViews(first.surface.mesh))
 
 
 def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparison) -> float:

@@ -65,6 +65,9 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
 
 
 def _write(one: PlannedObject, name: str, status: str, sentence: str, cost: StepCost) -> None:
+    # The page of all objects is handed on: it names files as they lie in the session and in the object's folder.
+    for folder in (one.folder, one.session):
+        sentence = sentence.replace(f"{folder}/", "").replace(str(folder), folder.name)
     content = {"step": name, "status": status, "seconds": round(cost.seconds, 1)}
     write_json(one.record(name), content | {"peak_memory_mib": round(cost.peak_memory_mib, 1), "sentence": sentence})
 

@@ -1,10 +1,10 @@
-"""Commands on clouds: ``compare`` with a reference, ``traits``, ``change`` over days."""
+"""Commands on clouds: ``compare`` with a reference, ``traits``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -147,111 +147,3 @@ class TraitsCommand:
         with console.status("tables and pictures"):
             write_measurement(self.output_dir, measured, self.cloud.name)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)
-
-
-@dataclass(frozen=True)
-class ChangeCommand:
-    """Find what changed on an object between days, beyond noise: spectra, indices, classes, and the surface.
-
-    The object may have been set down turned and tipped, may have grown a little and lost its stem. Writes change.md
-    (start here), change.json, change.csv, change.ply, pictures, and the days as a film.
-    """
-
-    clouds: tyro.conf.Positional[tuple[Path, ...]]
-    """The days in their order, the first one before the others: spectral point clouds (PLY, metres), or folders of
-    `hsi-sc-nerf run`."""
-    output_dir: Path
-    """Folder to write the results to."""
-    mesh: MeshConfig = field(default_factory=MeshConfig)
-    """Settings of the mesh, which is made from the first day."""
-    band_nm: tuple[float, ...] = ()
-    """Wavelengths (nm) whose reflectance is compared, beside spectra and indices."""
-    index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An index to compare, by its name or as a formula, as for `hsi-sc-nerf traits`. May be repeated. Default: NDVI,
-    NDVI705 and WI, where the bands allow."""
-    session_std: float = between(0.0, 1.0, default=0.01)
-    """Relative standard deviation of what the white references of two sessions make of one reflectance. It counts in
-    what is said of the whole surface, not in what changed here and not there."""
-    max_incidence_deg: float = MAX_INCIDENCE_DEG
-    """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees."""
-    library: Path | None = None
-    """Reference spectra to classify the surface by, as for `hsi-sc-nerf traits`: ENVI library (.sli) or CSV."""
-    angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
-    """Largest spectral angle, in radians, between a spectrum and the mixture of its classes."""
-    smallest_region_cm2: float = 0.05
-    """Regions below this area are left out."""
-
-    def main(self) -> None:
-        """Compare and write.
-
-        Raises:
-            InputError: a file or a number cannot be used, a day cannot be registered, or the results cannot be
-                written.
-        """
-        from hsi_sc_nerf.analysis import change_pictures, change_report
-        from hsi_sc_nerf.analysis.change import compare_days
-        from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
-        from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM
-        from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.pictures import SideViews
-        from hsi_sc_nerf.export.cloud import read_spectral_ply
-        from hsi_sc_nerf.indices.catalogue import find_indices
-
-        check_options(self)
-        if len(self.clouds) < 2:
-            raise InputError("a change needs two clouds or more; give the one before and those after.")
-        require_writable(self.output_dir)
-        library = read_library(self.library) if self.library else None
-        paths = [_cloud_of_run(path) for path in self.clouds]
-        names = [f"{day} {_day_name(path)}" for day, path in enumerate(self.clouds, start=1)]
-        console = Console(stderr=True)
-        clouds = [read_spectral_ply(path) for path in track(paths, "Reading", console=console, transient=True)]
-        indices = find_indices(self.index, clouds[0].wavelengths_nm)
-        if library is not None:
-            library = library.at(clouds[0].wavelengths_nm)
-        days = days_on_one_mesh(
-            clouds,
-            names,
-            self.mesh,
-            self.max_incidence_deg,
-            lambda starts: track(starts, "Registering", console=console, transient=True),
-        )
-        compared = compare_days(
-            days, self.band_nm, indices, self.session_std, self.smallest_region_cm2 * 1e-4, library, self.angle_rad
-        )
-        steps = track(compared, "Comparing", total=len(days) - 1, console=console, transient=True)
-        comparisons = list(steps)
-
-        views, pictures = SideViews(days[0].surface.mesh), {}
-        each = [
-            (day, one, quantity) for day, one in enumerate(comparisons, 1) for quantity in one.quantities.values()
-        ]
-        for day, one, quantity in track(each, "Drawing", console=console, transient=True):
-            file = f"{quantity.name.lower().replace(' ', '_')}_{day}.png"
-            change_pictures.draw_change(self.output_dir / file, days[0], one, quantity, views)
-            pictures[f"{quantity.name[0].upper()}{quantity.name[1:]}, {one.after.name}"] = file
-        with console.status("film and tables"):
-            shown = SPECTRUM if SPECTRUM in comparisons[0].quantities else BRIGHTNESS
-            film = self.output_dir / "change.mp4"
-            change_pictures.write_film(film, days[0], comparisons, views, shown)
-            change_report.write_change_ply(self.output_dir / "change.ply", days[0], comparisons)
-            settings = {"band_nm": list(self.band_nm), "session_std": self.session_std, **asdict(self.mesh)}
-            settings |= {"max_incidence_deg": self.max_incidence_deg, "smallest_region_cm2": self.smallest_region_cm2}
-            change_report.write_tables(self.output_dir, comparisons, settings, pictures)
-        page = escape(str(self.output_dir / "change.md"))
-        console.print(f"Changes, with pictures: {page}", soft_wrap=True)
-
-
-def _cloud_of_run(path: Path) -> Path:
-    """A cloud's file; that of the material, if a run has one."""
-    if not path.is_dir():
-        return path
-    for name in ("point_cloud-material.ply", "point_cloud.ply"):
-        if (path / name).is_file():
-            return path / name
-    raise InputError(f"{path}: holds no point_cloud.ply; give a cloud, or a folder of `hsi-sc-nerf run`.")
-
-
-def _day_name(path: Path) -> str:
-    """The run's folder, or the file without its suffix."""
-    return path.resolve().name if path.is_dir() else path.stem

@@ -32,7 +32,7 @@ COMMANDS = {
     "render": Command("trained_runs", "RenderCommand", "Render views of a trained run as ENVI cubes and videos."),
     "compare": Command("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
     "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
-    "change": Command("clouds", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
+    "change": Command("change", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
     "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
     "collect": Command("collect", "CollectCommand", "Write one table and one page of all objects of a batch."),
     "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),

@@ -105,6 +105,19 @@ def test_a_failure_has_its_sentence_and_ends_only_what_needs_it(planned, tmp_pat
     assert forced(planned()) == ["inspect", "process"]
 
 
+def test_sentences_name_files_as_they_lie_in_the_session_and_in_the_objects_folder(planned, tmp_path):
+    one = planned()["pear"]
+    told = f"{one.session}: holds a/b.raw ({one.session}/a/b.raw); see {one.folder}/logs in {one.folder}."
+
+    def run(name, argv, log):
+        raise InputError(told)
+
+    do(one, run=run)
+    found = records(one)
+    assert found["process"]["sentence"] == "session: holds a/b.raw (a/b.raw); see logs in pear."
+    assert not any(str(tmp_path) in record["sentence"] for record in found.values())
+
+
 def test_without_the_material_the_other_steps_do_without(planned):
     one = planned()["pear"]
 

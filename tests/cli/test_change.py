@@ -4,13 +4,17 @@ import csv
 import json
 
 import av
+import ball_run
+import capture_factory as factory
 import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
-from hsi_sc_nerf.cli.clouds import ChangeCommand
+from hsi_sc_nerf.cli import change
+from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of
 
 NM = np.linspace(400.0, 1000.0, 13)
@@ -98,11 +102,37 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     assert "![Spectrum, 3 friday](spectrum_2.png)" in page
 
 
+@pytest.mark.slow
+def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, monkeypatch):
+    config = ball_run.write_untrained_run(ball_run.write_ball_dataset(tmp_path / "data"), tmp_path / "runs")
+    opened = trained_run.open_run
+
+    def open_ball(path):
+        run = opened(path)
+        ball_run.fill_with_ball(run)
+        return run
+
+    monkeypatch.setattr(trained_run, "open_run", open_ball)
+    monkeypatch.setattr(change, "POINTS", 3000)
+    before = sorted(config.parent.rglob("*"))
+    cloud = change._read(change._file_of(config.parent))
+    radius_m = np.linalg.norm(cloud.points - factory.SPHERE_CENTRE_M, axis=1)
+    assert np.median(radius_m) == pytest.approx(factory.SPHERE_RADIUS_M, rel=0.03)
+    assert np.abs(cloud.spectra - factory.PLANT).max() < 0.02
+    ChangeCommand((config, config.parent), tmp_path / "out", MeshConfig(octree_depth=5)).main()
+    rows = rows_of(tmp_path / "out", before="1 ball/hsi-sc-nerf/run", after="2 ball/hsi-sc-nerf/run")
+    assert rows
+    assert {row["region"] for row in rows} == {"whole surface"}
+    assert sorted(config.parent.rglob("*")) == before
+    (config.parent / "point_cloud.ply").write_text("")
+    assert change._file_of(config) == change._file_of(config.parent) == config.parent / "point_cloud.ply"
+
+
 def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     first, out = clouds / "monday", tmp_path / "out"
     with pytest.raises(InputError, match="two clouds or more"):
         ChangeCommand((first,), out).main()
-    with pytest.raises(InputError, match=r"holds no point_cloud\.ply"):
+    with pytest.raises(InputError, match=r"holds no point_cloud\.ply and no config"):
         ChangeCommand((first, clouds), out).main()
     cloud = read_spectral_ply(first / "point_cloud.ply").select(slice(0, 500))
     other = tmp_path / "other.ply"
