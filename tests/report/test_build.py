@@ -11,6 +11,7 @@ import capture_factory as factory
 import numpy as np
 import pytest
 from headless_browser import needs_browser, quiet_page
+from PIL import Image
 
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.report import trait_content
@@ -243,6 +244,24 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(browser, report):
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)
         np.testing.assert_allclose(saved[:, 1], np.linspace(0.2, 0.4, len(saved)), atol=2e-3)
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_picture_is_saved_as_it_is_drawn(browser, report):
+    """As many pixels as the drawing has, the object's colours, and nothing behind the object."""
+    with opened(browser, report, viewport={"width": 700, "height": 900}) as page:
+        page.select_option("select[name=shown]", "band 0")
+        with page.expect_download() as download:
+            page.click("button[name=picture]")
+        assert download.value.suggested_filename == "object.png"
+        drawn = page.locator("#cloud canvas").evaluate("canvas => [canvas.height, canvas.width]")
+        with Image.open(download.value.path()) as opened_picture:
+            picture = np.asarray(opened_picture)
+        height, width = drawn
+        assert picture.shape == (height, width, 4)
+        np.testing.assert_allclose(picture[height // 4, width // 2], [253, 231, 37, 255], atol=12)
+        assert picture[2, 2, 3] == 0
 
 
 @pytest.mark.slow

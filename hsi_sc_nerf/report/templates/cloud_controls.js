@@ -19,6 +19,12 @@ function rgbOf(colour) {
   return [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16) / 255);
 }
 
+function download(blob, name) {
+  const href = URL.createObjectURL(blob);
+  element("a", { href, download: name }).click();
+  URL.revokeObjectURL(href);
+}
+
 function start(root, cloud) {
   const canvas = root.querySelector("canvas"), form = root.querySelector("form"), fields = form.elements;
   const legend = root.querySelector(".legend"), pickedBox = root.querySelector(".picked");
@@ -107,9 +113,7 @@ function start(root, cloud) {
     const names = picked.map(({ point }) => cloud.millimetres(point).map((mm) => mm.toFixed(1)).join(" "));
     const rows = cloud.wavelengths.map((nm, i) => [nm, ...picked.map(({ spectrum }) => spectrum[i].toFixed(5))]);
     const csv = [["wavelength_nm", ...names.map((name) => `reflectance at ${name} mm`)], ...rows];
-    const href = URL.createObjectURL(new Blob([csv.map((row) => row.join(",")).join("\n") + "\n"]));
-    element("a", { href, download: "spectra.csv" }).click();
-    URL.revokeObjectURL(href);
+    download(new Blob([csv.map((row) => row.join(",")).join("\n") + "\n"]), "spectra.csv");
   }
 
   function turn(right, up) {
@@ -147,6 +151,7 @@ function start(root, cloud) {
   fields.size.addEventListener("input", () => { renderer.size = Number(fields.size.value); renderer.draw(); });
   fields.clear.addEventListener("click", () => { picked.length = 0; drawSpectra(); });
   fields.save.addEventListener("click", () => { if (picked.length) save(); });
+  fields.picture.addEventListener("click", () => canvas.toBlob((blob) => download(blob, "object.png")));
 
   const pointers = new Map();
   let travelled = 0;
