@@ -19,6 +19,7 @@ _API = {
     "from_xarray": "export.table",
     "read_calibration": "analysis.calibrations",
     "read_library": "analysis.library",
+    "read_drawn_regions": "analysis.drawn_regions",
     "write_library": "analysis.library",
     "traits": "analysis.measurement:measure_traits",
     "write_traits": "analysis.measurement_files:write_measurement",

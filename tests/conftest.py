@@ -21,6 +21,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # Nothing here is compiled by PyTorch. nerfstudio's import compiles two functions of a method that is not used, for
 # which PyTorch loads its compiler: half of the import's time, in each process of the tests.
 os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")
+# Libraries load gRPC, whose threads may write a line to the standard error of a command that a test has just started.
+os.environ.setdefault("GRPC_VERBOSITY", "NONE")
 
 # A long file that comes last is waited for by all other processes.
 LONGEST = ["test_end_to_end.py", "test_workflows.py", "test_build.py", "test_viewer_in_browser.py", "test_mitsuba.py"]

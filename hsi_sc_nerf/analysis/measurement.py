@@ -14,6 +14,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.calibrations import Calibration, calibration_map, read_calibration
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.components import Components, find_components
+from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.maps import index_maps
 from hsi_sc_nerf.analysis.report import component_content, trait_content
@@ -76,6 +77,7 @@ def measure_traits(
     angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD,
     smallest_region_cm2: float = 0.05,
     regions: Mapping[str, Sequence[float]] | None = None,
+    drawn_regions: Sequence[DrawnRegion] = (),
     indices: Sequence[str] = (),
     calibrations: Sequence[Path | str | Calibration] = (),
     components: int = 0,
@@ -92,6 +94,7 @@ def measure_traits(
         angle_rad: largest spectral angle to a class.
         smallest_region_cm2: smaller regions of a class are not listed.
         regions: x, y, z of the centre and radius of each region of interest by its name, metres.
+        drawn_regions: regions that were drawn in the report (`read_drawn_regions`).
         indices: names of the catalogue, or formulas as ``"CRI = 1/R510 - 1/R550"``.
         calibrations: tables (`read_calibration`), or what was read of them.
         components: principal components and endmembers to look for, at most.
@@ -128,7 +131,7 @@ def measure_traits(
         classes = classified(surface, library, angle_rad, smallest_region_cm2 * 1e-4) if library else None
         pixel_m = None if dataset is None else pixel_on_object_m(dataset)
         maps = [*index_maps(surface, found_indices), *(calibration_map(surface, one) for one in read)]
-        traits = analyse(surface, picked, classes, pixel_m, maps)
+        traits = analyse(surface, [*picked, *drawn_regions], classes, pixel_m, maps)
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)

@@ -18,6 +18,7 @@ from hsi_sc_nerf.analysis.classes import (
     connected_regions,
     unmix,
 )
+from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.maps import SurfaceMap, propagated_std
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
@@ -165,7 +166,7 @@ class Traits:
 
 def analyse(
     surface: SpectralMesh,
-    regions: Sequence[RegionOfInterest] = (),
+    regions: Sequence[RegionOfInterest | DrawnRegion] = (),
     classes: Classes | None = None,
     pixel_m: float | None = None,
     maps: Sequence[SurfaceMap] = (),

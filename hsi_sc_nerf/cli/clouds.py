@@ -101,6 +101,8 @@ class TraitsCommand:
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
+    roi_file: Path | None = None
+    """Regions that were drawn on the object in the report's 3D view and saved there (regions.json)."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
     --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
@@ -116,6 +118,7 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
+        from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.measurement import measure_traits
         from hsi_sc_nerf.analysis.measurement_files import write_measurement
@@ -139,6 +142,7 @@ class TraitsCommand:
             angle_rad=self.angle_rad,
             smallest_region_cm2=self.smallest_region_cm2,
             regions={name: (x_m, y_m, z_m, radius_m) for name, x_m, y_m, z_m, radius_m in self.roi},
+            drawn_regions=read_drawn_regions(self.roi_file) if self.roi_file else (),
             indices=self.index,
             calibrations=self.calibration,
             components=self.components,

@@ -92,13 +92,13 @@ def thinned(cloud: SpectralCloud, max_points: int) -> SpectralCloud:
     return cloud.select(whole)
 
 
-def spacing_of(points: Float[np.ndarray, "n 3"]) -> float:
-    """Distance of neighbours on the surface: the square root of a point's area, median over the points."""
+def point_areas_m2(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """The surface that each point stands for: that within its eighth neighbour, over eight."""
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     if neighbours < 1:
-        return 0.0
+        return np.zeros(len(points))
     reach, _ = cKDTree(points).query(points, [neighbours + 1])
-    return float(np.sqrt(np.pi / neighbours * np.median(np.square(reach))))
+    return np.pi / neighbours * np.square(reach[:, 0])
 
 
 def _base64(array: np.ndarray) -> str:
@@ -127,18 +127,20 @@ def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra, indices: Seq
     order = np.argsort(cloud.wavelengths_nm)
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
+    areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
     scalars = []
     for index in find_indices(indices, cloud.wavelengths_nm):
         values = index_values(index, cloud.spectra, cloud.wavelengths_nm)
         drawn = index.drawn_range if index.has_range else usual_range(values)
-        scalars.append(_scalar(index.name, f"{index.expression}: {index.tells}", values, drawn))
+        scalars.append(_scalar(index.name, f"{index.expression}: {index.tells}", values, drawn) | {"index": True})
     scalars += [_scalar(name, "column of the cloud", values, None) for name, values in cloud.extra.items()]
     return {
         "count": len(cloud.points),
         "centre_m": centre.tolist(),
         "reach_m": reach_m,
-        "spacing": spacing_of(cloud.points) / reach_m,
+        "spacing": float(np.sqrt(np.median(areas_m2))) / reach_m,
+        "areas_cm2": _scalar("", "", 1e4 * areas_m2, None),
         "positions": _base64(np.rint((cloud.points - centre) / reach_m * _INT16).astype(np.int16)),
         "normals": _base64(np.rint(cloud.normals / lengths * 127.0).astype(np.int8)),
         "wavelengths_nm": cloud.wavelengths_nm[order].tolist(),

@@ -7,7 +7,7 @@ import pytest
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, quantise, spacing_of, thinned
+from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise, thinned
 
 
 def restored(spectra):
@@ -52,11 +52,13 @@ def test_equal_spectra_come_back():
 
 @pytest.mark.parametrize("count", [2000, 8000])
 @pytest.mark.parametrize("radius", [0.01, 0.2])
-def test_spacing_is_the_root_of_the_area_of_a_point(count, radius):
+def test_the_areas_of_points_add_up_to_the_surface(count, radius):
     """However large the surface, or the part of its box that it fills."""
     points = radius * ball(count).normals
-    assert spacing_of(points) == pytest.approx(radius * np.sqrt(4.0 * np.pi / count), rel=0.06)
-    assert spacing_of(points[:1]) == 0.0
+    assert point_areas_m2(points).sum() == pytest.approx(4.0 * np.pi * radius**2, rel=0.12)
+    at_random = points[np.random.default_rng(0).permutation(count)[: count // 2]]
+    assert point_areas_m2(at_random).sum() == pytest.approx(4.0 * np.pi * radius**2, rel=0.05)
+    assert point_areas_m2(points[:1]).tolist() == [0.0]
 
 
 def test_quantised_numbers_come_back_and_missing_ones_are_marked():

@@ -1,19 +1,7 @@
 // The controls beside the object: what is shown, how it is turned, which spectra were picked.
 
-const MOST_PICKED = 6;
-const SVG = "http://www.w3.org/2000/svg";
+const MOST_CURVES = 6;
 const TURN_PER_SECOND = 0.35;
-
-function element(name, attributes, text, namespace) {
-  const made = namespace ? document.createElementNS(namespace, name) : document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-}
-
-function seriesColour(index) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--s${index}`).trim();
-}
 
 function rgbOf(colour) {
   return [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16) / 255);
@@ -28,8 +16,9 @@ function download(blob, name) {
 function start(root, cloud) {
   const canvas = root.querySelector("canvas"), form = root.querySelector("form"), fields = form.elements;
   const legend = root.querySelector(".legend"), pickedBox = root.querySelector(".picked");
-  const missed = root.querySelector(".missed");
-  const renderer = new Renderer(canvas, cloud), picked = [];
+  const lasso = root.querySelector(".lasso"), scale = root.querySelector(".scale");
+  const told = root.querySelector(".told"), list = root.querySelector(".regions");
+  const renderer = new Renderer(canvas, cloud), picked = [], regions = [];
 
   function showBar(low, high, words) {
     const stops = Array.from({ length: 9 }, (_, i) => {
@@ -42,6 +31,15 @@ function start(root, cloud) {
     legend.replaceChildren(bar, ends);
   }
 
+  /** Colours of the points, with the regions in their own. */
+  function paint(rgb) {
+    for (const { points, series } of regions) {
+      const own = rgbOf(seriesColour(series)).map((part) => 255 * part);
+      for (const point of points) own.forEach((part, i) => { rgb[3 * point + i] = 0.4 * rgb[3 * point + i] + 0.6 * part; });
+    }
+    renderer.colour(rgb);
+  }
+
   function show() {
     const wavelength = `${cloud.wavelengths[Number(fields.band.value)].toFixed(1)} nm`;
     form.querySelector("output").textContent = wavelength;
@@ -51,69 +49,128 @@ function start(root, cloud) {
       const white = Math.max(...bands.map((values) => quantile(values, 0.99)));
       legend.replaceChildren(element("span", {}, `${chosen.nm.join(", ")} nm as red, green, blue: ${chosen.tells}; `
         + `full brightness is reflectance ${white.toPrecision(2)}`));
-      renderer.colour(cloud.composed(bands, white));
+      paint(cloud.composed(bands, white));
     } else if (kind === "band") {
       const band = Number(fields.band.value), values = cloud.band(band), high = quantile(values, 0.99);
       showBar(0, high, `reflectance at ${wavelength}`);
-      renderer.colour(cloud.mapped(values, 0, high));
+      paint(cloud.mapped(values, 0, high));
     } else {
       const { name, tells, drawn } = cloud.scalars[index];
       showBar(...drawn, `${name} (${tells})`);
-      renderer.colour(cloud.mapped(cloud.scalar(index), ...drawn));
+      paint(cloud.mapped(cloud.scalar(index), ...drawn));
     }
   }
 
   function drawSpectra() {
     renderer.marks = picked.map(({ point, series }) => ({ point, rgb: rgbOf(seriesColour(series)) }));
     renderer.draw();
-    if (!picked.length) { pickedBox.replaceChildren(); return; }
-    const [width, height, left, bottom, top] = [340, 210, 40, 34, 8];
-    const [first, last] = [cloud.wavelengths[0], cloud.wavelengths.at(-1)];
-    const highest = Math.max(0.05, ...picked.flatMap(({ spectrum }) => spectrum)) * 1.05;
-    const step = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1].find((size) => highest / size <= 6) ?? 2;
-    const x = (nm) => left + ((nm - first) / (last - first || 1)) * (width - left - 16);
-    const y = (value) => height - bottom - (value / highest) * (height - bottom - top);
-    const svg = element("svg", { class: "chart", role: "img", viewBox: `0 0 ${width} ${height}`,
-      "aria-label": "Reflectance over wavelength of the points that were clicked" }, undefined, SVG);
-    const add = (name, attributes, text) => svg.append(element(name, attributes, text, SVG));
-    for (let value = 0; value <= highest; value += step) {
-      add("path", { stroke: "var(--rule)", d: `M${left} ${y(value)}H${width - 16}` });
-      add("text", { x: left - 5, y: y(value) + 4, "text-anchor": "end" }, value.toFixed(2));
-    }
-    for (let nm = Math.ceil(first / 100) * 100; nm <= last; nm += last - first > 450 ? 200 : 100) {
-      add("text", { x: x(nm), y: height - 19, "text-anchor": "middle" }, String(nm));
-    }
-    add("text", { x: (left + width) / 2, y: height - 4, "text-anchor": "middle" }, "wavelength (nm)");
-    for (const { spectrum, series } of picked) {
-      const d = spectrum.map((v, i) => `${i ? "L" : "M"}${x(cloud.wavelengths[i]).toFixed(1)} ${y(v).toFixed(1)}`);
-      add("path", { class: "line", stroke: `var(--s${series})`, d: d.join("") });
-    }
-    const list = element("ul", {});
+    pickedBox.replaceChildren();
+    if (!picked.length && !regions.length) return;
+    const places = element("ul", {});
     for (const { point, series } of picked) {
       const [a, b, c] = cloud.millimetres(point).map((mm) => mm.toFixed(1));
       const item = element("li", {}, `x ${a}, y ${b}, z ${c} mm`);
-      item.prepend(element("span", { class: "dot", style: `background: ${seriesColour(series)}` }));
-      list.append(item);
+      item.prepend(dot(series));
+      places.append(item);
     }
-    pickedBox.replaceChildren(element("strong", {}, "Reflectance"), svg, list);
+    const words = regions.length ? "Reflectance, with the standard deviation within a region" : "Reflectance";
+    pickedBox.append(element("strong", {}, words), spectraChart(cloud.wavelengths, [...regions, ...picked]), places);
+  }
+
+  function dot(series) {
+    return element("span", { class: "dot", style: `background: ${seriesColour(series)}` });
+  }
+
+  /** A colour that no other curve has; the oldest picked point gives way. -1: all are taken by regions. */
+  function freeSeries() {
+    if (picked.length + regions.length >= MOST_CURVES && !picked.shift()) return -1;
+    const taken = new Set([...picked, ...regions].map(({ series }) => series));
+    return Array.from({ length: MOST_CURVES }, (_, i) => i).find((i) => !taken.has(i));
+  }
+
+  function say(words) {
+    told.textContent = words;
+    told.hidden = !words;
   }
 
   function pick(x, y) {
     const point = renderer.pick(x, y);
-    missed.hidden = point >= 0;
+    say(point >= 0 ? "" : "No point of the object is there.");
     if (point < 0) return;
-    if (picked.length === MOST_PICKED) picked.shift();
-    const taken = new Set(picked.map(({ series }) => series));
-    const series = Array.from({ length: MOST_PICKED }, (_, i) => i).find((i) => !taken.has(i));
+    const series = freeSeries();
+    if (series < 0) { say(`There are ${MOST_CURVES} regions; delete one to see the spectrum of a point.`); return; }
     picked.push({ point, series, spectrum: cloud.spectrum(point) });
     drawSpectra();
   }
 
+  function addRegion(name, points) {
+    const series = freeSeries();
+    if (series < 0) { say(`There are ${MOST_CURVES} regions, which is the most; delete one.`); return; }
+    regions.push({ name, points, series, ...measured(cloud, points) });
+    showRegions();
+  }
+
+  function showRegions() {
+    list.replaceChildren(...regions.map((region) => {
+      const item = element("li", {}), name = element("input", { value: region.name, "aria-label": "Name of the region" });
+      const away = element("button", { type: "button", "aria-label": `Delete ${region.name}` }, "Delete");
+      name.addEventListener("change", () => { region.name = name.value.trim() || region.name; showRegions(); });
+      away.addEventListener("click", () => { regions.splice(regions.indexOf(region), 1); showRegions(); });
+      const means = region.indices.map(({ name: index, mean_sd: [mean, sd] }) => (
+        `${index} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)}`));
+      const size = `${region.points.length} points, ${region.area_cm2.toPrecision(3)} cm²`;
+      item.append(dot(region.series), name, away, element("p", {}, [size, ...means].join("; ")));
+      return item;
+    }));
+    show();
+    drawSpectra();
+  }
+
+  /** What the line went round becomes a region, or is added to the last one, or taken from it. */
+  function closeLasso(line) {
+    const found = line.length > 2 ? pointsInside(renderer, line) : [], last = regions.at(-1);
+    say(found.length ? "" : "The line goes round no point of the object.");
+    if (!found.length) return;
+    if (fields.deed.value === "new" || !last) {
+      let number = regions.length + 1;
+      while (regions.some(({ name }) => name === `region ${number}`)) number++;
+      addRegion(`region ${number}`, found);
+      return;
+    }
+    const points = new Set(last.points);
+    for (const point of found) if (fields.deed.value === "add") points.add(point); else points.delete(point);
+    if (points.size) Object.assign(last, { points: [...points] }, measured(cloud, [...points]));
+    else regions.pop();
+    showRegions();
+  }
+
   function save() {
-    const names = picked.map(({ point }) => cloud.millimetres(point).map((mm) => mm.toFixed(1)).join(" "));
-    const rows = cloud.wavelengths.map((nm, i) => [nm, ...picked.map(({ spectrum }) => spectrum[i].toFixed(5))]);
-    const csv = [["wavelength_nm", ...names.map((name) => `reflectance at ${name} mm`)], ...rows];
+    const places = picked.map(({ point }) => cloud.millimetres(point).map((mm) => mm.toFixed(1)).join(" "));
+    const quoted = (name) => `"${name.replaceAll('"', '""')}"`;
+    const names = [
+      ...regions.flatMap(({ name }) => [quoted(`mean of ${name}`), quoted(`standard deviation in ${name}`)]),
+      ...places.map((place) => `reflectance at ${place} mm`),
+    ];
+    const columns = [...regions.flatMap(({ spectrum, sd }) => [spectrum, sd]), ...picked.map(({ spectrum }) => spectrum)];
+    const rows = cloud.wavelengths.map((nm, i) => [nm, ...columns.map((column) => column[i].toFixed(5))]);
+    const csv = [["wavelength_nm", ...names], ...rows];
     download(new Blob([csv.map((row) => row.join(",")).join("\n") + "\n"]), "spectra.csv");
+  }
+
+  async function load(file) {
+    try {
+      const found = regionsOf(cloud, await file.text());
+      say(found.length ? "" : "The file holds no region.");
+      for (const { name, points } of found) addRegion(name, points);
+    } catch (error) { say(`${file.name}: ${error.message}.`); }
+  }
+
+  /** A bar of a round length, as long as it is at the depth of the object's centre. */
+  function drawScale() {
+    const mm = renderer.pixels() / (cloud.reach * 1e3), longest = (0.3 * canvas.clientWidth) / mm;
+    const power = 10 ** Math.floor(Math.log10(longest)), length = [5, 2, 1].find((n) => n * power <= longest) * power;
+    scale.style.width = `${length * mm}px`;
+    scale.textContent = `${Number(length.toPrecision(1))} mm`;
   }
 
   function turn(right, up) {
@@ -150,16 +207,30 @@ function start(root, cloud) {
   fields.shading.addEventListener("change", () => { renderer.shading = fields.shading.checked ? 1 : 0; renderer.draw(); });
   fields.size.addEventListener("input", () => { renderer.size = Number(fields.size.value); renderer.draw(); });
   fields.clear.addEventListener("click", () => { picked.length = 0; drawSpectra(); });
-  fields.save.addEventListener("click", () => { if (picked.length) save(); });
+  fields.save.addEventListener("click", () => { if (picked.length || regions.length) save(); });
+  fields.saveRegions.addEventListener("click", () => {
+    if (regions.length) download(new Blob([regionFile(cloud, regions)]), "regions.json");
+    else say("There is no region yet; tick \"draw regions\" and go round one.");
+  });
+  fields.loadRegions.addEventListener("change", () => {
+    if (fields.loadRegions.files.length) load(fields.loadRegions.files[0]);
+    fields.loadRegions.value = "";
+  });
+  fields.theme.addEventListener("change", () => {
+    document.documentElement.dataset.theme = fields.theme.value;
+    showRegions();
+  });
   fields.picture.addEventListener("click", () => canvas.toBlob((blob) => download(blob, "object.png")));
 
   const pointers = new Map();
-  let travelled = 0;
+  let travelled = 0, line = null;
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
     travelled = pointers.size > 1 ? Infinity : 0;
     fields.turning.checked = false;
+    line = fields.drawing.checked && pointers.size === 1 ? [[event.offsetX, event.offsetY]] : null;
+    lasso.setAttribute("points", "");
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -168,7 +239,10 @@ function start(root, cloud) {
     const other = [...pointers].find(([id]) => id !== event.pointerId);
     pointers.set(event.pointerId, now);
     travelled += Math.hypot(dx, dy);
-    if (other) {
+    if (line) {
+      line.push(now);
+      lasso.setAttribute("points", line.join(" "));
+    } else if (other) {
       const apart = ([a, b]) => Math.max(1, Math.hypot(a - other[1][0], b - other[1][1]));
       zoom(apart(before) / apart(now));
     } else if (event.shiftKey) {
@@ -177,9 +251,16 @@ function start(root, cloud) {
     } else if (travelled > 3) turn(0.01 * dx, 0.01 * dy);
   });
   canvas.addEventListener("pointerup", (event) => {
-    if (pointers.delete(event.pointerId) && travelled <= 3) pick(event.offsetX, event.offsetY);
+    if (!pointers.delete(event.pointerId)) return;
+    if (travelled <= 3) pick(event.offsetX, event.offsetY);
+    else if (line) closeLasso(line);
+    stopLasso();
   });
-  canvas.addEventListener("pointercancel", (event) => pointers.delete(event.pointerId));
+  canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); stopLasso(); });
+  function stopLasso() {
+    line = null;
+    lasso.setAttribute("points", "");
+  }
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
     zoom(Math.exp(0.001 * event.deltaY));
@@ -195,8 +276,9 @@ function start(root, cloud) {
     fields.turning.checked = false;
     event.preventDefault();
   });
+  renderer.onDraw = drawScale;
   window.addEventListener("resize", () => renderer.draw());
-  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawSpectra);
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", showRegions);
 
   let last;
   function tick(time) {

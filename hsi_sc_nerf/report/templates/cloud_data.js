@@ -22,7 +22,9 @@ class Cloud {
     this.basis = decode(payload.basis, Float32Array);
     this.coefficients = decode(payload.coefficients, Int16Array);
     this.composites = payload.composites;
-    this.scalars = payload.scalars.map((scalar) => ({ ...scalar, counts: decode(scalar.data, Uint16Array) }));
+    const decoded = (scalar) => ({ ...scalar, counts: decode(scalar.data, Uint16Array) });
+    this.scalars = payload.scalars.map(decoded);
+    this.areas_cm2 = this.numbers(decoded(payload.areas_cm2));
     this.colours = decode(payload.colour_map, Uint8Array);
   }
 
@@ -38,19 +40,27 @@ class Cloud {
 
   /** Reflectance of a point in all bands. */
   spectrum(point) {
+    return this.wavelengths.map((_, band) => this.valueIn(band)(point));
+  }
+
+  /** Gives the reflectance of a point in a band. */
+  valueIn(band) {
     const bands = this.wavelengths.length;
-    return this.mean.map((mean, band) => {
-      let value = mean;
+    return (point) => {
+      let value = this.mean[band];
       for (let k = 0; k < this.rank; k++) {
         value += this.basis[k * bands + band] * this.coefficients[point * this.rank + k];
       }
       return value;
-    });
+    };
   }
 
   /** A number of each point, NaN where it has none. */
   scalar(index) {
-    const { counts, range: [low, high] } = this.scalars[index];
+    return this.numbers(this.scalars[index]);
+  }
+
+  numbers({ counts, range: [low, high] }) {
     return Float32Array.from(counts, (c) => (c === MISSING ? NaN : low + (c / (MISSING - 1)) * (high - low)));
   }
 

@@ -29,7 +29,7 @@ class Renderer {
     if (!gl) throw new Error("this browser has no WebGL");
     this.canvas = canvas; this.gl = gl; this.cloud = cloud;
     this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0];
-    this.size = 1; this.shading = 0; this.marks = [];
+    this.size = 1; this.shading = 0; this.marks = []; this.onDraw = () => {};
     const program = gl.createProgram();
     for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
       const shader = gl.createShader(type);
@@ -109,24 +109,39 @@ class Renderer {
       gl.drawArrays(gl.POINTS, mark.point, 1);
     }
     gl.enable(gl.DEPTH_TEST);
+    this.onDraw();
+  }
+
+  /** Points that face the camera: their places (CSS pixels from the upper left corner) and depths. */
+  project() {
+    const { matrix: m, eye } = this.camera(), { positions: p, normals: n, count } = this.cloud, seen = [];
+    const wide = this.canvas.clientWidth, high = this.canvas.clientHeight;
+    for (let point = 0; point < count; point++) {
+      const [a, b, c] = [p[3 * point] / 32767, p[3 * point + 1] / 32767, p[3 * point + 2] / 32767];
+      const depth = m[3] * a + m[7] * b + m[11] * c + m[15];
+      if (depth <= 0) continue;
+      const [u, v, w] = [n[3 * point], n[3 * point + 1], n[3 * point + 2]];
+      if ((eye[0] - a) * u + (eye[1] - b) * v + (eye[2] - c) * w < 0) continue;
+      const x = ((m[0] * a + m[4] * b + m[8] * c + m[12]) / depth / 2 + 0.5) * wide;
+      const y = (0.5 - (m[1] * a + m[5] * b + m[9] * c + m[13]) / depth / 2) * high;
+      seen.push({ point, x, y, depth });
+    }
+    return seen;
+  }
+
+  /** CSS pixels of a length of the cloud, 1 by default, at the depth of the object's centre. */
+  pixels(length = 1) {
+    return (length * this.canvas.clientHeight) / Math.tan(FIELD_OF_VIEW / 2) / 2 / this.distance;
+  }
+
+  spacingPx() {
+    return this.pixels(this.cloud.spacing);
   }
 
   /** The nearest point to the camera of those that a click (CSS pixels from the upper left corner) meets; -1: none. */
   pick(x, y) {
-    const { matrix: m, eye } = this.camera(), { positions: p, normals: n, count } = this.cloud;
-    const wide = this.canvas.clientWidth, high = this.canvas.clientHeight;
-    const reach = Math.max(3, (0.6 * this.size * this.spacing * high) / Math.tan(FIELD_OF_VIEW / 2) / 2 / this.distance);
-    let best = -1, depth = Infinity;
-    for (let i = 0; i < count; i++) {
-      const [a, b, c] = [p[3 * i] / 32767, p[3 * i + 1] / 32767, p[3 * i + 2] / 32767];
-      const w = m[3] * a + m[7] * b + m[11] * c + m[15];
-      if (w >= depth || w <= 0) continue;
-      const facing = (eye[0] - a) * n[3 * i] + (eye[1] - b) * n[3 * i + 1] + (eye[2] - c) * n[3 * i + 2];
-      if (facing < 0) continue;
-      const sx = ((m[0] * a + m[4] * b + m[8] * c + m[12]) / w / 2 + 0.5) * wide;
-      const sy = (0.5 - (m[1] * a + m[5] * b + m[9] * c + m[13]) / w / 2) * high;
-      if ((sx - x) ** 2 + (sy - y) ** 2 <= reach ** 2) { best = i; depth = w; }
-    }
-    return best;
+    const reach = Math.max(3, 0.6 * this.size * this.pixels(this.spacing));
+    const met = this.project().filter((one) => (one.x - x) ** 2 + (one.y - y) ** 2 <= reach ** 2);
+    return met.reduce((best, one) => (one.depth < best.depth ? one : best), { point: -1, depth: Infinity }).point;
   }
 }

@@ -1,0 +1,94 @@
+"""Regions that were drawn on the object in the report, as its page saves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import read_json
+
+KIND = "hsi-sc-nerf regions"
+_AGAIN = "save the regions again in the report's 3D view"
+_FAR_SPACINGS = 4.0
+"""A surface farther from all points than so many times their distance is not the one that they lie on."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnRegion:
+    """The surface that is nearer to a region's points than to any other.
+
+    Attributes:
+        name: of the region.
+        points_m: all points that it was drawn among (object frame).
+        chosen: those in the region.
+    """
+
+    name: str
+    points_m: Float[np.ndarray, "n 3"]
+    chosen: Bool[np.ndarray, "n"]
+
+    def of(self, surface: SpectralMesh) -> Bool[np.ndarray, "v"]:
+        """The seen vertices in the region.
+
+        Raises:
+            InputError: there are none, or the points lie on another object.
+        """
+        tree = cKDTree(self.points_m)
+        spacing_m = np.median(tree.query(self.points_m, k=[2])[0])
+        distance_m, nearest = tree.query(surface.mesh.vertices)
+        near = distance_m <= _FAR_SPACINGS * spacing_m
+        if not near[surface.seen].mean() > 0.5:
+            raise InputError(
+                f"region {self.name}: was drawn on another object, or in another position; {_AGAIN} of this cloud."
+            )
+        inside = surface.seen & near & self.chosen[nearest]
+        if not inside.any():
+            raise InputError(f"region {self.name}: holds no seen surface; draw it larger.")
+        return inside
+
+
+def read_drawn_regions(path: Path | str) -> list[DrawnRegion]:
+    """The regions in a file that the report's 3D view saved.
+
+    Raises:
+        InputError: it is no such file.
+
+    Example:
+        >>> stem, body = read_drawn_regions("regions.json")
+        >>> stem.name, stem.points_m.shape, stem.chosen.sum()
+        ('stem', (50000, 3), 412)
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; {_AGAIN}.")
+    content = read_json(path, _AGAIN)
+    try:
+        if content["kind"] != KIND:
+            raise ValueError(f"its kind is not {KIND}")
+        points_m = np.array(content["points_m"], dtype=float)
+        if points_m.ndim != 2 or points_m.shape[1] != 3 or len(points_m) < 2 or not np.isfinite(points_m).all():
+            raise ValueError("points_m is no list of places")
+        regions = [_region(points_m, one) for one in content["regions"]]
+    except (LookupError, OverflowError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: holds no regions ({error}); {_AGAIN}.") from error
+    if not regions:
+        raise InputError(f"{path}: holds no region; {_AGAIN}.")
+    return regions
+
+
+def _region(points_m: Float[np.ndarray, "n 3"], one: Any) -> DrawnRegion:
+    name, indices = one["name"], one["points"]
+    if not isinstance(name, str) or not name.strip() or not indices:
+        raise ValueError("a region has no name or no points")
+    if not all(type(index) is int and 0 <= index < len(points_m) for index in indices):
+        raise ValueError(f"region {name} has a point that is not there")
+    chosen = np.zeros(len(points_m), bool)
+    chosen[indices] = True
+    return DrawnRegion(name, points_m, chosen)

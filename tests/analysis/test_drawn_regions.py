@@ -1,0 +1,86 @@
+"""Regions that were drawn in the report: the surface nearest to their points, and files that are something else."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.drawn_regions import KIND, read_drawn_regions
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.analysis.traits import WHOLE, RegionOfInterest, analyse
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.simulate.mesh import cylinder
+
+NM = np.linspace(400.0, 1000.0, 31)
+GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
+
+
+def two_halves():
+    """A cylinder, 4 cm wide and high: green at y > 0, brown below."""
+    mesh = cylinder(0.04, 0.04, segments=128, spacing_m=0.001)
+    spectra = np.where(mesh.vertices[:, 1:2] > 0.0, GREEN, BROWN).astype(np.float32)
+    return SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
+
+
+def written(path, points_m, **chosen):
+    regions = [{"name": name, "points": np.flatnonzero(where).tolist()} for name, where in chosen.items()]
+    path.write_text(json.dumps({"kind": KIND, "points_m": points_m.tolist(), "regions": regions}))
+    return path
+
+
+def random_points(surface, count, shift_m=0.0):
+    rng = np.random.default_rng(0)
+    return rng.choice(surface.mesh.vertices, count, replace=False) + shift_m + rng.normal(0.0, 2e-5, (count, 3))
+
+
+def test_area_and_spectrum_of_a_drawn_half(tmp_path):
+    """The edge lies between points, so that an area is neither widened nor narrowed by their spacing."""
+    surface = two_halves()
+    points_m = random_points(surface, 2000)
+    file = written(tmp_path / "regions.json", points_m, brown=points_m[:, 1] < 0.0, top=points_m[:, 2] > 0.03)
+    brown, top = read_drawn_regions(file)
+    traits = analyse(surface, [brown, top, RegionOfInterest("ball", (0.02, 0.0, 0.02), 0.005)])
+    found = {region.name: region for region in traits.regions}
+    assert list(found) == [WHOLE, "brown", "top", "ball"]
+    assert found["brown"].area_m2 == pytest.approx(surface.mesh.area_m2() / 2.0, rel=0.01)
+    np.testing.assert_allclose(found["brown"].spectrum.mean, BROWN, rtol=0.03)
+
+
+def test_regions_of_another_object_and_unseen_ones_are_refused(tmp_path):
+    surface = two_halves()
+    file = written(tmp_path / "far.json", points_m := random_points(surface, 500, shift_m=0.05), a=points_m[:, 1] < 9)
+    with pytest.raises(InputError, match="drawn on another object"):
+        analyse(surface, read_drawn_regions(file))
+    file = written(tmp_path / "hidden.json", points_m := random_points(surface, 500), a=points_m[:, 1] < 0.0)
+    surface.seen[surface.mesh.vertices[:, 1] < 0.012] = False
+    with pytest.raises(InputError, match="holds no seen surface"):
+        analyse(surface, read_drawn_regions(file))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "regions"},
+        {"points_m": [[0.0, 0.0]]},
+        {"points_m": [[0.0, 0.0, 10**400]] * 3},
+        {"points_m": [[0.0, 0.0, float("nan")]] * 3},
+        {"points_m": None},
+        {"regions": []},
+        {"regions": [{"name": "a", "points": [3]}]},
+        {"regions": [{"name": "a", "points": [-1]}]},
+        {"regions": [{"name": "a", "points": [True]}]},
+        {"regions": [{"name": "a", "points": []}]},
+        {"regions": [{"name": " ", "points": [0]}]},
+        {"regions": [["a", [0]]]},
+    ],
+)
+def test_files_that_are_something_else_are_one_sentence(tmp_path, change):
+    valid = {"kind": KIND, "points_m": [[0.0, 0.0, 0.1]] * 3, "regions": [{"name": "a", "points": [0]}]}
+    file = tmp_path / "regions.json"
+    file.write_text(json.dumps(valid))
+    assert len(read_drawn_regions(file)) == 1
+    file.write_text(json.dumps(valid | change))
+    with pytest.raises(InputError, match=r"regions\.json: holds no region"):
+        read_drawn_regions(file)
+    with pytest.raises(InputError, match=r"no\.json: there is no such file"):
+        read_drawn_regions(tmp_path / "no.json")
