@@ -19,6 +19,7 @@ from hsi_sc_nerf.analysis.change_features import SurfaceSample, surface_gradient
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import robust_radius
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z
+from hsi_sc_nerf.robust_scatter import robust_std
 
 SCALE_RANGE = (0.8, 1.25)
 """Growth beyond this is another object, or other units."""
@@ -38,6 +39,7 @@ TUKEY = 4.685
 _OFF_EDGE = 1.5
 """Pairs further apart along the surface than this, in spacings, lie beyond the reference's edge."""
 _PARAMETERS = 7
+_LEAST_SCATTER = 1e-9
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def _system(
     points = transform(moving.points)
     centre = points.mean(axis=0)
     residual, slopes, paired = target.residuals(points, moving.features)
-    scale = _robust_sd(residual[paired] if paired.sum() > _PARAMETERS else residual)
+    scale = robust_std(residual[paired] if paired.sum() > _PARAMETERS else residual, axis=0, least=_LEAST_SCATTER)
     weight = np.square(np.clip(1.0 - np.square(residual / (TUKEY * scale)), 0.0, None)) * paired[:, None]
     # Off the surface, spectra mean nothing.
     weight[:, 1:] *= weight[:, :1]
@@ -188,7 +190,7 @@ def _system(
 
 def _scales(moving: SurfaceSample, target: _Target, transform: Similarity) -> Float[np.ndarray, "1+f"]:
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
-    return _robust_sd(residual[paired])
+    return robust_std(residual[paired], axis=0, least=_LEAST_SCATTER)
 
 
 def _loss(
@@ -197,7 +199,9 @@ def _loss(
     """Tukey's loss of each point, 1 for a lost one; without scales, in units of the whole reference's spread."""
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
     if scales is None:
-        spread = _robust_sd(target.sample.features - np.median(target.sample.features, axis=0))
+        spread = robust_std(
+            target.sample.features - np.median(target.sample.features, axis=0), axis=0, least=_LEAST_SCATTER
+        )
         scales = np.array([target.spacing_m, *spread])
     loss = 1.0 - np.clip(1.0 - np.square(residual / (TUKEY * scales)), 0.0, None) ** 3
     return np.where(paired, loss.mean(axis=1), 1.0)
@@ -241,7 +245,3 @@ def _blocks(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
 
 def _between_deg(one: Similarity, other: Similarity) -> float:
     return one.after(other.inverse()).turn_deg()
-
-
-def _robust_sd(residual: Float[np.ndarray, "n f"]) -> Float[np.ndarray, "f"]:
-    return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-9)

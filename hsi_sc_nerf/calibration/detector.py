@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Num
 from scipy import ndimage
 
 from hsi_sc_nerf.capture.envi import Cube
+from hsi_sc_nerf.robust_scatter import robust_std
 
 NEIGHBOURS = 11
 """Width of the median window along the line that an element is compared with."""
@@ -135,7 +136,7 @@ def elements_without_response(
         brightness = np.where(brightness < LEAST_BRIGHTNESS * around, around, brightness)
         brightness = np.maximum(brightness, LEAST_BRIGHTNESS)[:, None]
         expected = ndimage.median_filter(light / brightness, size=(NEIGHBOURS, 1), mode="mirror") * brightness
-        spread = np.hypot(1.4826 * np.median(np.abs(light - expected), axis=0), step / np.sqrt(12.0))
+        spread = np.hypot(robust_std(light - expected, axis=0), step / np.sqrt(12.0))
         # Even the least response must exceed the noise.
         conclusive = (expected > 0.0) & (LEAST_RESPONSE * expected >= CERTAINTY * spread)
         as_expected = (light > LEAST_RESPONSE * expected) & (light < LARGEST_RESPONSE * expected)

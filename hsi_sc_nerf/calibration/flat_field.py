@@ -10,6 +10,7 @@ from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS, WhiteRefere
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, largest_component
+from hsi_sc_nerf.robust_scatter import robust_std
 
 ORDER = 4
 """Total order of the surface's polynomial."""
@@ -120,7 +121,7 @@ def _robust_fit(terms: Float[np.ndarray, "n terms"], values: Float[np.ndarray, "
         root = np.sqrt(weights)
         coefficients = np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0]
         distance = np.abs(values - terms @ coefficients)
-        scale = max(1.4826 * float(np.median(distance)), 1e-6 * float(np.abs(values).max()))
+        scale = float(robust_std(distance, least=1e-6 * float(np.abs(values).max())))
         if step < 15:
             weights = 1.0 / np.maximum(distance, 0.1 * scale)
         else:

@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from hsi_sc_nerf.robust_scatter import robust_std
+
 MIN_PIXELS, MIN_FRACTION, MIN_SCATTERING_FRACTION = 64, 0.05, 0.15
 """Fewest static pixels, and their least fraction of all, without and with scatter: it leaves more room for chance."""
 MIN_SIGNAL = 10.0
@@ -158,7 +160,7 @@ def grey_deviation(
     for _ in range(ROUNDS):
         deviation, _ = chosen.relative_to(common)
         # The robust standard deviation, so that sensor noise is part of it.
-        scatter = 1.4826 * float(np.median(np.abs(deviation)))
+        scatter = float(robust_std(deviation))
         variance = np.maximum(chosen.grey_variance, scatter**2)
         common = common + _robust_mean(deviation, variance)[:, None]
     deviation, _ = chosen.relative_to(common)

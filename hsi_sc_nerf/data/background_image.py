@@ -19,6 +19,7 @@ from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader
 from hsi_sc_nerf.processing.chamber import median_of_smallest, turntable_silhouette
+from hsi_sc_nerf.robust_scatter import SIGMA_OF_MAD
 
 MAX_FRAMES = 12
 """Frames that are read, evenly spread over the session: enough for a median."""
@@ -32,8 +33,6 @@ SMOOTHING_CELLS = 5
 """Side of the Wiener filter's window."""
 _MEDIAN_VARIANCE = np.pi / 2.0
 """Variance of the median of many normal values, as a multiple of their mean's."""
-_SIGMA_OF_MAD = 1.4826
-"""Standard deviation of a normal distribution, as a multiple of its median absolute deviation."""
 # Multiples of these fill a square evenly (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
 # 2018).
 _QUASIRANDOM_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
@@ -120,7 +119,7 @@ def median_over_frames(
     with np.errstate(invalid="ignore"):
         # Infinite where not measured, nan where there is no median: both are sorted to the end.
         deviation = np.abs(values - median)
-    sigma = _SIGMA_OF_MAD * median_of_smallest(deviation, number) / REFLECTANCE_SCALE
+    sigma = SIGMA_OF_MAD * median_of_smallest(deviation, number) / REFLECTANCE_SCALE
     return median / REFLECTANCE_SCALE, _MEDIAN_VARIANCE * sigma**2 / np.maximum(number, 1)
 
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.geometry.camera import Similarity
+from hsi_sc_nerf.robust_scatter import SIGMA_OF_MAD
 
 if TYPE_CHECKING:
     import open3d
@@ -84,7 +85,7 @@ def refine(
     moved_m = drawn(cloud_m, MOVED_POINTS, seed)
     off_m = np.median(target.off_plane_m(transform(moved_m), target.radius_m / 10))
     spacing_m = np.median(target.tree.query(target.points[:: max(1, len(target.points) // 1000)], k=2)[0][:, 1])
-    within_m = min(target.radius_m / 10, float(3 * 1.4826 * off_m + 2 * spacing_m))
+    within_m = min(target.radius_m / 10, float(3 * SIGMA_OF_MAD * off_m + 2 * spacing_m))
     return Registration(_closest_points(moved_m, target, transform, within_m, with_scale), within_m)
 
 

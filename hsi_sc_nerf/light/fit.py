@@ -17,7 +17,7 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors, robust_std, scatter_beyond, tukey_weights
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
 from hsi_sc_nerf.light.standing_light import (
     DEGREE,
     TERMS,
@@ -29,6 +29,7 @@ from hsi_sc_nerf.light.standing_light import (
     units_on,
 )
 from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
+from hsi_sc_nerf.robust_scatter import robust_std
 
 MOST_LAMPS = 4
 CANDIDATES = 200
@@ -268,7 +269,7 @@ class _Fit:
     def _weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
         told = self.views.tells_light
-        self.scatter = robust_std(residual[told])
+        self.scatter = float(robust_std(residual[told], least=SMALLEST_SCATTER))
         beyond = scatter_beyond(residual[told], self._own_std[told])
         std = np.hypot(beyond, self._own_std)
         self.weights = np.where(told, tukey_weights(residual / std), 1.0)

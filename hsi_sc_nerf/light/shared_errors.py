@@ -11,6 +11,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
+from hsi_sc_nerf.robust_scatter import robust_std
+
 CORRELATED = 8.0
 """At best so many measurements count as one."""
 TUKEY = 4.685
@@ -63,11 +65,6 @@ class SharedErrors:
         sums = self._by_group @ (weighted * (residual[:, None] - columns * factor))
         spread = CORRELATED * square + (sums**2).sum(axis=0)
         return (factor * square) ** 2 / spread
-
-
-def robust_std(residual: Float[np.ndarray, "m"]) -> float:
-    """Standard deviation of normally distributed residuals about 0, by their median; `SMALLEST_SCATTER` at least."""
-    return max(1.4826 * float(np.median(np.abs(residual))), SMALLEST_SCATTER)
 
 
 def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, "m"]) -> float:

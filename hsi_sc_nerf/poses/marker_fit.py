@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.special import ndtr
 
 from hsi_sc_nerf.poses.marker_detection import marker_pattern
+from hsi_sc_nerf.robust_scatter import robust_std
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
@@ -118,7 +119,7 @@ def fit_marker(
         if not np.isfinite(corners).all() or np.abs(corners - corners_px).max() > largest_shift_px:
             return None
         raw = residual / root[:, 0]
-        sigma = 1.4826 * np.median(np.abs(raw)) + 1e-6
+        sigma = robust_std(raw) + 1e-6
         robust = np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(np.abs(raw), 1e-12))
         if np.abs(corners - previous).max() < _CONVERGED_PX:
             break

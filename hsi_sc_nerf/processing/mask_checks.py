@@ -11,6 +11,7 @@ from scipy.ndimage import binary_erosion
 from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.robust_scatter import robust_std
 
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
@@ -191,7 +192,7 @@ def _background(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a pixel that all masks hold has nothing to compare with
         typical = np.nanmedian(shown, axis=0)
-        scatter = 1.4826 * np.nanmedian(np.abs(shown - typical), axis=0)
+        scatter = robust_std(shown - typical, axis=0)
     alike = np.abs(brightness[:, lines, samples] - typical) <= BACKGROUND_SIGMAS * scatter
     background = np.zeros_like(masks)
     background[:, lines, samples] = alike & beyond[:, lines, samples]
