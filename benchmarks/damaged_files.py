@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from results_table import RESULTS, write_results
 from valid_files import write_valid_files
@@ -223,7 +224,11 @@ def _peak_mb() -> float:
 
 def kinds(folder: Path) -> list[Kind]:
     """Valid files of every kind under ``folder``, and how each is read."""
+    from hsi_sc_nerf.analysis.calibrations import read_calibration
+    from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
     from hsi_sc_nerf.analysis.library import read_library
+    from hsi_sc_nerf.batch.objects import read_object
+    from hsi_sc_nerf.batch.session_list import read_sessions
     from hsi_sc_nerf.calibration.white_source import read_panel
     from hsi_sc_nerf.capture.envi import CubeLines, open_cube
     from hsi_sc_nerf.capture.instrument import read_metadata
@@ -266,7 +271,8 @@ def kinds(folder: Path) -> list[Kind]:
 
     first = session / "sphere_000" / "capture" / "sphere_000.hdr"
     nm = open_cube(first).wavelengths_nm
-    note = FramePaths.of(data, "ball_0")
+    note, picture = FramePaths.of(data, "ball_0"), session / "truth" / "pixels" / "sphere_000.npz"
+    some = np.full((2, 30), 0.5), np.linspace(390.0, 1000.0, 30)
     return [
         Kind("ENVI header", first, lambda: every_line(first), 3.0),
         Kind("ENVI header, in a session", first, lambda: open_session(session), 1.0),
@@ -303,6 +309,13 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("inspection.json", data / "report" / "inspection.json", judged(inspection_section), 1.0),
         Kind("comparison.json", files["comparison"], lambda: comparison_section(*_json(files["comparison"])), 0.02),
         Kind("traits.json", files["traits"], lambda: traits_section(*_json(files["traits"])), 1.5),
+        Kind("truth of a picture (NPZ)", picture, lambda: load_truth(session).light("sphere_000"), 0.5),
+        Kind("regions drawn (JSON)", files["regions"], lambda: read_drawn_regions(files["regions"]), 1.5),
+        Kind(
+            "calibration (CSV)", files["calibration"], lambda: read_calibration(files["calibration"]).of(*some), 1.5
+        ),
+        Kind("sessions of a batch (CSV)", files["sessions"], lambda: read_sessions(files["sessions"]), 1.5),
+        Kind("record of a step (JSON)", files["record"], lambda: read_object(files["record"].parents[1]), 1.5),
     ]
 
 

@@ -11,6 +11,7 @@ import torch
 import trimesh
 import yaml
 
+from hsi_sc_nerf.analysis.drawn_regions import KIND
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
@@ -91,6 +92,10 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "path": "path.json",
         "comparison": "comparison.json",
         "traits": "traits.json",
+        "regions": "regions.json",
+        "calibration": "calibration.csv",
+        "sessions": "sessions.csv",
+        "record": "batch/objects/ball/steps/train.json",
     }
     files |= {name: folder / file for name, file in others.items()}
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
@@ -125,6 +130,12 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     write_json(files["path"], {"render_height": 20, "render_width": 30, "camera_path": [camera, camera], "fps": 24})
     write_json(files["comparison"], _COMPARISON)
     write_json(files["traits"], _TRAITS)
+    points_m = rng.random((20, 3)).round(3).tolist()
+    write_json(files["regions"], {"kind": KIND, "points_m": points_m, "regions": [{"name": "a", "points": [0, 1]}]})
+    files["calibration"].write_text(_CALIBRATION)
+    files["sessions"].write_text("object;session;day\nball;session;1\nball_2;session;2\n")
+    record = {"step": "train", "status": "done", "seconds": 1.5, "peak_memory_mib": 900.0, "sentence": ""}
+    write_json(files["record"], record)
     (folder / "run").mkdir()
     (folder / "run" / "config.yml").write_text(yaml.dump(hsi_sc_nerf.config))
     return files
@@ -197,6 +208,21 @@ materials:
 effects: [photon_noise, {lamp: {fraction: 0.3}}]
 seed: 3
 """
+_CALIBRATION = (
+    """# name: dry matter
+# unit: %
+# preprocessing: absorbance, savgol 3 1 1, snv
+# intercept: 14.2
+# error: 0.4
+# t2_limit: 9.5
+# q_limit: 0.1
+# score_variances: 2.5
+wavelength_nm,coefficient,mean,scale,weight_1,loading_1
+400,,0,1,0.5,0.5
+"""
+    + "".join(f"{nm},0.01,0.2,1,0.5,0.5\n" for nm in range(410, 500, 10))
+    + "500,,0,1,0.5,0.5\n"
+)
 
 
 def _calibration(bands: int) -> dict[str, Any]:

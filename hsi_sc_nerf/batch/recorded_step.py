@@ -24,6 +24,7 @@ from hsi_sc_nerf.files import make_folder, read_json, write_json
 
 _TOLD = ("Error: ", "hsi-sc-nerf: ")
 """What the sentence of a failure begins with, in our commands and in nerfstudio's."""
+_AGAIN = "delete it and start `hsi-sc-nerf batch` again"
 
 
 def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
@@ -73,7 +74,11 @@ def _write(one: PlannedObject, name: str, status: str, sentence: str, cost: Step
 
 
 def _status(one: PlannedObject, name: str) -> str:
-    return str(read_json(one.record(name), "delete it and start `hsi-sc-nerf batch` again")["status"])
+    record = one.record(name)
+    status = read_json(record, _AGAIN).get("status")
+    if status not in ("done", "failed", "skipped"):
+        raise InputError(f"{record}: does not say how the step ended; {_AGAIN}.")
+    return str(status)
 
 
 def _told(log: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,14 +76,15 @@ class Truth:
 
     def light(self, capture: str) -> Light:
         """Noise-free light on the sensor, rotated as the counts are; `Light.radiance` gives an image."""
-        with np.load(pixels_path(self.session_dir, capture)) as arrays:
-            factors = [name for name in arrays.files if name.startswith("illumination_")]
-            weights = arrays["light_weights" if "light_weights" in arrays.files else "material_weights"]
-            return Light(
-                weights=weights.astype(np.float32),
-                spectra=arrays["light_spectra"] if "light_spectra" in arrays.files else self.endmembers,
-                illumination=tuple(arrays[name] for name in sorted(factors)),
-            )
+        path = pixels_path(self.session_dir, capture)
+        arrays = _read_arrays(path)
+        factors = [name for name in arrays if name.startswith("illumination_")]
+        weights = _one_of(path, arrays, "light_weights" if "light_weights" in arrays else "material_weights")
+        return Light(
+            weights=weights.astype(np.float32),
+            spectra=arrays.get("light_spectra", self.endmembers),
+            illumination=tuple(arrays[name] for name in sorted(factors)),
+        )
 
     def detector_maps(self) -> dict[str, np.ndarray]:
         """Maps (samples, bands) of the detector by name: ``dark_offset`` (counts), ``dead`` and ``hot`` (boolean).
@@ -90,14 +92,11 @@ class Truth:
         Maps of effects that the scene does not name are missing.
         """
         path = detector_path(self.session_dir)
-        if not path.exists():
-            return {}
-        with np.load(path) as arrays:
-            return dict(arrays)
+        return _read_arrays(path) if path.exists() else {}
 
     def _pixels(self, capture: str, key: str) -> np.ndarray:
-        with np.load(pixels_path(self.session_dir, capture)) as arrays:
-            return arrays[key]
+        path = pixels_path(self.session_dir, capture)
+        return _one_of(path, _read_arrays(path, (key,)), key)
 
 
 def load_truth(session_dir: str | Path) -> Truth:
@@ -203,6 +202,25 @@ def detector_path(session_dir: Path) -> Path:
 def pixels_path(session_dir: Path, capture: str) -> Path:
     """Path of a frame's pixels."""
     return session_dir / "truth" / "pixels" / f"{capture}.npz"
+
+
+def _read_arrays(path: Path, only: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays in an NPZ file by name, all or some.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with np.load(path) as arrays:
+            return {name: arrays[name] for name in arrays.files if not only or name in only}
+    except Exception as error:  # what readers of damaged archives raise has no common class
+        raise InputError(f"{path}: cannot be read ({error}); simulate the session again.") from error
+
+
+def _one_of(path: Path, arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    if name not in arrays:
+        raise InputError(f"{path}: holds no {name}; simulate the session again.")
+    return arrays[name]
 
 
 def write_mesh(path: Path, part: Part) -> None:

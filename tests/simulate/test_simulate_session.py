@@ -241,6 +241,22 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
 
 
 @pytest.mark.slow
+def test_damaged_pixels_of_the_truth_are_one_sentence(tmp_path):
+    scene = override(load_scene("sphere"), frames=1, size_px=24, bands=6)
+    truth = load_truth(simulate_session(scene, tmp_path / "s", False))
+    path = tmp_path / "s" / "truth" / "pixels" / "sphere_000.npz"
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"not an archive", whole[:200] + bytes(100) + whole[300:]):
+        path.write_bytes(content)
+        for read in (truth.object_coverage, truth.light):
+            with pytest.raises(InputError, match=r"sphere_000\.npz: cannot be read"):
+                read("sphere_000")
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(InputError, match="holds no object"):
+        truth.object_coverage("sphere_000")
+
+
+@pytest.mark.slow
 def test_an_earlier_simulated_session_is_replaced(tmp_path):
     scene = override(load_scene("pear"), frames=2, size_px=16, bands=3)
     simulate_session(scene, tmp_path / "s", False)
