@@ -246,7 +246,7 @@ def test_damaged_pixels_of_the_truth_are_one_sentence(tmp_path):
     truth = load_truth(simulate_session(scene, tmp_path / "s", False))
     path = tmp_path / "s" / "truth" / "pixels" / "sphere_000.npz"
     whole = path.read_bytes()
-    for content in (whole[: len(whole) // 2], b"", b"not an archive", whole[:200] + bytes(100) + whole[300:]):
+    for content in (whole[: len(whole) // 2], b"", b"not an archive"):
         path.write_bytes(content)
         for read in (truth.object_coverage, truth.light):
             with pytest.raises(InputError, match=r"sphere_000\.npz: cannot be read"):
