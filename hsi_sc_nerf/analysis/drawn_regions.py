@@ -1,7 +1,9 @@
-"""Regions that were drawn on the object in the report, as its page saves them."""
+"""Regions that are drawn on the object in the report, as its page saves and opens them; proposals to begin with."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.analysis.organs import propose_organs
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.files import atomic_write, read_json
 
 KIND = "hsi-sc-nerf regions"
+PAGE_POINTS = 50_000
+"""Points of the cloud that a page shows, unless it is asked for others."""
 _AGAIN = "save the regions again in the report's 3D view"
 _FAR_SPACINGS = 4.0
 """A surface farther from all points than so many times their distance is not the one that they lie on."""
@@ -52,6 +58,52 @@ class DrawnRegion:
         if not inside.any():
             raise InputError(f"region {self.name}: holds no seen surface; draw it larger.")
         return inside
+
+
+def points_of_page(cloud: SpectralCloud, most: int = PAGE_POINTS) -> SpectralCloud:
+    """The points that a page shows: of those with a complete spectrum, at most ``most``, at random.
+
+    Raises:
+        InputError: no point has a whole spectrum.
+    """
+    whole = np.flatnonzero(np.isfinite(cloud.spectra).all(axis=1) & np.isfinite(cloud.points).all(axis=1))
+    if not len(whole):
+        raise InputError("the cloud has no point with a spectrum; export it again from the run.")
+    if len(whole) > most:
+        whole = np.sort(np.random.default_rng(0).choice(whole, most, replace=False))
+    return cloud.select(whole)
+
+
+def propose_regions(cloud: SpectralCloud) -> list[DrawnRegion]:
+    """Organs of an object (`propose_organs`) as regions on the points of its page, to be corrected there.
+
+    Raises:
+        InputError: no point has a whole spectrum.
+
+    Example:
+        >>> proposed = propose_regions(read_spectral_ply("point_cloud.ply"))
+        >>> write_drawn_regions("regions_proposed.json", proposed)
+        >>> [region.name for region in proposed]
+        ['body', 'stem']
+    """
+    page = points_of_page(cloud)
+    points_m = page.points.astype(float)
+    return [DrawnRegion(name, points_m, where) for name, where in propose_organs(points_m, page.spectra).items()]
+
+
+def write_drawn_regions(path: Path | str, regions: Sequence[DrawnRegion]) -> None:
+    """Write regions on the same points, as the report's page saves them.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    content = {
+        "kind": KIND,
+        "points_m": regions[0].points_m.round(6).tolist(),
+        "regions": [{"name": one.name, "points": np.flatnonzero(one.chosen).tolist()} for one in regions],
+    }
+    with atomic_write(Path(path)) as (temporary,):
+        temporary.write_text(json.dumps(content), encoding="utf-8")
 
 
 def read_drawn_regions(path: Path | str) -> list[DrawnRegion]:

@@ -103,6 +103,9 @@ class TraitsCommand:
     region."""
     roi_file: Path | None = None
     """Regions that were drawn on the object in the report's 3D view and saved there (regions.json)."""
+    propose_regions: bool = False
+    """Write regions_proposed.json as well: stem, calyx, husk and body, by shape and spectrum. Load it in the report's
+    3D view to correct it, and give it to --roi-file."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
     --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
@@ -118,7 +121,7 @@ class TraitsCommand:
         Raises:
             InputError: a file or a number cannot be used, or the results cannot be written.
         """
-        from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
+        from hsi_sc_nerf.analysis.drawn_regions import propose_regions, read_drawn_regions, write_drawn_regions
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.measurement import measure_traits
         from hsi_sc_nerf.analysis.measurement_files import write_measurement
@@ -132,8 +135,9 @@ class TraitsCommand:
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
             library = library.only(self.classes)
+        cloud = read_spectral_ply(self.cloud)
         measured = measure_traits(
-            read_spectral_ply(self.cloud),
+            cloud,
             None if self.data is None else open_packed(self.data),
             mesh=self.mesh,
             splits=self.splits,
@@ -150,4 +154,12 @@ class TraitsCommand:
         console = Console(stderr=True)
         with console.status("tables and pictures"):
             write_measurement(self.output_dir, measured, self.cloud.name)
+        if self.propose_regions:
+            with console.status("organs"):
+                proposed = propose_regions(cloud)
+                write_drawn_regions(path := self.output_dir / "regions_proposed.json", proposed)
+            found = ", ".join(one.name for one in proposed)
+            if len(proposed) == 1:
+                found += " alone, for neither end of the object differs from the rest in shape or spectrum"
+            console.print(f"Proposed regions, to correct in the report: {found}: {escape(str(path))}", soft_wrap=True)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)

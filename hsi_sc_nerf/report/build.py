@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra, thinned
+from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra
 from hsi_sc_nerf.report.dataset_sections import (
     calibration_section,
     effects_section,
@@ -47,7 +48,6 @@ from hsi_sc_nerf.terminal import progress_bar
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
 
-CLOUD_POINTS = 50_000
 _OBLIQUE_FRACTION = 0.1
 
 
@@ -67,7 +67,7 @@ class ReportSources:
     comparison: Path | None = None
     traits: Path | None = None
     views: int | None = None
-    points: int = CLOUD_POINTS
+    points: int = PAGE_POINTS
 
 
 def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
@@ -120,7 +120,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
 
 def object_section(cloud: SpectralCloud, points: int, indices: Sequence[str] = ()) -> Section:
     """The cloud in 3D, thinned to ``points``, with the indices that its traits were measured with."""
-    shown = thinned(cloud, points)
+    shown = points_of_page(cloud, points)
     spectra = compress_spectra(shown.spectra)
     caption = (
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int16, UInt16
 from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
@@ -78,20 +77,6 @@ def quantise(values: Float[np.ndarray, "n"]) -> tuple[UInt16[np.ndarray, "n"], f
     return np.where(finite, np.rint(fractions * (_MISSING - 1)), _MISSING).astype(np.uint16), low, high
 
 
-def thinned(cloud: SpectralCloud, max_points: int) -> SpectralCloud:
-    """A random subset of at most ``max_points`` of the points with a complete spectrum.
-
-    Raises:
-        InputError: no point has a whole spectrum.
-    """
-    whole = np.flatnonzero(np.isfinite(cloud.spectra).all(axis=1) & np.isfinite(cloud.points).all(axis=1))
-    if not len(whole):
-        raise InputError("the cloud has no point with a spectrum; export it again from the run.")
-    if len(whole) > max_points:
-        whole = np.sort(np.random.default_rng(0).choice(whole, max_points, replace=False))
-    return cloud.select(whole)
-
-
 def point_areas_m2(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """The surface that each point stands for: that within its eighth neighbour, over eight."""
     neighbours = min(_NEIGHBOURS, len(points) - 1)
@@ -117,7 +102,7 @@ def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra, indices: Seq
     """Data of the page's viewer (``templates/cloud_data.js``), for JSON.
 
     Args:
-        cloud: the points to show (`thinned`).
+        cloud: the points to show (`points_of_page`).
         spectra: of the same points.
         indices: to offer, as `find_indices` reads them.
 

@@ -1,11 +1,18 @@
-"""Regions that were drawn in the report: the surface nearest to their points, and files that are something else."""
+"""Regions drawn in the report: the surface nearest to their points, their files, and proposals to begin with."""
 
 import json
 
 import numpy as np
 import pytest
+from random_cloud import random_cloud
 
-from hsi_sc_nerf.analysis.drawn_regions import KIND, read_drawn_regions
+from hsi_sc_nerf.analysis.drawn_regions import (
+    KIND,
+    points_of_page,
+    propose_regions,
+    read_drawn_regions,
+    write_drawn_regions,
+)
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import WHOLE, RegionOfInterest, analyse
 from hsi_sc_nerf.errors import InputError
@@ -84,3 +91,29 @@ def test_files_that_are_something_else_are_one_sentence(tmp_path, change):
         read_drawn_regions(file)
     with pytest.raises(InputError, match=r"no\.json: there is no such file"):
         read_drawn_regions(tmp_path / "no.json")
+
+
+def test_the_page_has_whole_points_with_what_belongs_to_them():
+    cloud = random_cloud(500)
+    cloud.spectra[::2, 3] = np.nan
+    cloud.extra["height"] = cloud.points[:, 2].copy()
+    page = points_of_page(cloud, 100)
+    assert len(page) == len(np.unique(page.points, axis=0)) == 100
+    assert np.isfinite(page.spectra).all()
+    np.testing.assert_array_equal(page.extra["height"], page.points[:, 2])
+    assert len(points_of_page(cloud)) == 250
+    cloud.spectra[:, 1] = np.nan
+    for needs_points in (points_of_page, propose_regions):
+        with pytest.raises(InputError, match="no point with a spectrum"):
+            needs_points(cloud)
+
+
+def test_written_regions_are_those_that_are_read(tmp_path):
+    surface = two_halves()
+    points_m = random_points(surface, 400)
+    file = written(tmp_path / "regions.json", points_m, brown=points_m[:, 1] < 0.0, top=points_m[:, 2] > 0.03)
+    write_drawn_regions(tmp_path / "again.json", read_drawn_regions(file))
+    for one, again in zip(read_drawn_regions(file), read_drawn_regions(tmp_path / "again.json"), strict=True):
+        assert one.name == again.name
+        np.testing.assert_array_equal(one.chosen, again.chosen)
+        np.testing.assert_allclose(one.points_m, again.points_m, atol=1e-6)

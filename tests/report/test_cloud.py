@@ -5,9 +5,8 @@ import base64
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
-from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise, thinned
+from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise
 
 
 def restored(spectra):
@@ -67,20 +66,6 @@ def test_quantised_numbers_come_back_and_missing_ones_are_marked():
     assert (low, high) == (-1.0, 3.0)
     np.testing.assert_allclose(low + counts[:3] / 65534 * (high - low), values[:3], atol=1e-4)
     assert counts[3:].tolist() == [65535, 65535]
-
-
-def test_thinning_keeps_whole_points_with_what_belongs_to_them():
-    cloud = ball()
-    cloud.spectra[::2, 3] = np.nan
-    cloud.extra["height"] = cloud.points[:, 2].copy()
-    thin = thinned(cloud, 100)
-    assert len(thin.points) == len(np.unique(thin.points, axis=0)) == 100
-    assert np.isfinite(thin.spectra).all()
-    np.testing.assert_array_equal(thin.extra["height"], thin.points[:, 2])
-    assert len(thinned(cloud, 10_000).points) == 250
-    cloud.spectra[:] = np.nan
-    with pytest.raises(InputError, match="no point with a spectrum"):
-        thinned(cloud, 100)
 
 
 def test_the_payload_holds_the_cloud_with_its_bands_in_order():

@@ -1,0 +1,79 @@
+"""Organs of objects whose parts are known in closed form, and none on what has none."""
+
+import numpy as np
+import pytest
+from known_fruit import BROWN, GREEN, NM, RADIUS_M, SKIN, ball, fruit, noisy, rod
+
+from hsi_sc_nerf.analysis.organs import propose_organs
+
+
+def overlap(found, true):
+    return (found & true).sum() / (found | true).sum()
+
+
+@pytest.mark.parametrize("cap_at", [-1.0, 1.0])
+def test_a_ball_with_a_cap_and_a_rod_has_body_stem_and_calyx(cap_at):
+    """Also where the rod stands on the cap. Each point has one organ."""
+    points_m, spectra, true = fruit(cap_at=cap_at)
+    found = propose_organs(points_m, spectra)
+    assert list(found) == ["body", "stem", "calyx"]
+    assert all(overlap(found[name], true[name]) > 0.93 for name in true)
+    assert (np.sum(list(found.values()), axis=0) == 1).all()
+
+
+def test_a_stem_of_the_colour_of_the_body_is_told_by_its_shape():
+    points_m, spectra, true = fruit(stem=SKIN, cap=SKIN)
+    found = propose_organs(points_m, spectra)
+    assert list(found) == ["body", "stem"]
+    assert overlap(found["stem"], true["stem"]) > 0.85
+
+
+def test_the_answer_does_not_depend_on_size_turn_or_light():
+    points_m, spectra, _ = fruit()
+    found = propose_organs(points_m, spectra)
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    again = propose_organs(7.0 * points_m @ turn.T + [0.1, -0.2, 0.3], 0.5 * spectra)
+    assert list(found) == list(again)
+    assert all(overlap(found[name], again[name]) > 0.99 for name in found)
+
+
+def test_an_ear_has_kernels_and_a_husk():
+    rng = np.random.default_rng(0)
+    points_m = rod(0.16, 0.02, 20_000, rng)
+    husk = points_m[:, 2] < 0.025
+    kernels = np.where(rng.uniform(size=(20_000, 1)) < 0.5, SKIN, BROWN)
+    found = propose_organs(points_m, noisy(np.where(husk[:, None], GREEN, kernels), rng))
+    assert list(found) == ["kernels", "husk"]
+    assert overlap(found["husk"], husk) > 0.95
+
+
+def test_a_large_part_has_no_name_of_its_own():
+    rng = np.random.default_rng(0)
+    points_m = ball(10_000, rng)
+    upper = points_m[:, 2] > 0.4 * RADIUS_M
+    found = propose_organs(points_m, noisy(np.where(upper[:, None], GREEN, SKIN), rng))
+    assert list(found) == ["body", "part 1"]
+    assert overlap(found["part 1"], upper) > 0.95
+
+
+@pytest.mark.parametrize("shape", ["ball", "rod"])
+@pytest.mark.parametrize("coloured", ["evenly", "without noise", "fading", "one side", "rim"])
+def test_no_organ_is_invented(shape, coloured):
+    """Not of noise, of colour that fades from pole to pole, of a blush, nor of the mixed pixels where it stands."""
+    rng = np.random.default_rng(1)
+    points_m = ball(8000, rng) if shape == "ball" else rod(0.16, 0.02, 8000, rng)
+    height = (points_m[:, 2] - points_m[:, 2].min()) / np.ptp(points_m[:, 2])
+    part = {"fading": height, "one side": points_m[:, 0] > 0.01, "rim": height < 0.03}.get(coloured, 0.0 * height)
+    spectra = SKIN + part[:, None] * (GREEN - SKIN)
+    found = propose_organs(points_m, spectra if coloured == "without noise" else noisy(spectra, rng))
+    assert list(found) == ["body"]
+
+
+@pytest.mark.parametrize("count", [1, 8, 63, 64, 100])
+def test_few_or_equal_points_are_a_body(count):
+    points_m = ball(count, np.random.default_rng(0))
+    for places in (points_m, 0.0 * points_m):
+        for spectra in (np.tile(SKIN, (count, 1)), np.zeros((count, len(NM)))):
+            found = propose_organs(places, spectra)
+            assert list(found) == ["body"]
+            assert found["body"].all()
