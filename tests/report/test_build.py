@@ -276,8 +276,8 @@ def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, report
         # Neighbours of an even lattice are not those of points at random, for which test_cloud.py is narrower.
         assert area_cm2 == pytest.approx(true_cm2, rel=0.2)
         assert "NDVI" in line
-        page.fill(".regions input", "a, south")
-        page.locator(".regions input").press("Tab")
+        page.fill(".regions input:not([type])", "a, south")
+        page.locator(".regions input:not([type])").press("Tab")
         page.select_option("select[name=deed]", "add")
         go_round(page, 0.5, 0.3, 0.06)
         assert "nan" not in page.locator(".regions p").inner_text().lower()
@@ -312,6 +312,81 @@ def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, report
     assert found["a, south"].area_m2 * 1e4 == pytest.approx(true_cm2, rel=0.1)
     np.testing.assert_allclose(found["a, south"].spectrum.mean, np.linspace(0.2, 0.4, 12), atol=2e-3)
     np.testing.assert_allclose(found[north.name].spectrum.mean, np.linspace(0.4, 0.8, 12), atol=4e-3)
+
+
+def brush_over(page, *places):
+    """Draw along a line, at fractions of the drawing's size."""
+    canvas = page.locator("#cloud canvas")
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    for step, (x, y) in enumerate(places):
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"], steps=5)
+        if step == 0:
+            page.mouse.down()
+    page.mouse.up()
+
+
+def region_mm(page, path):
+    """Places of the points of each region, as the page saves them, millimetres."""
+    with page.expect_download() as download:
+        page.click("button[name=saveRegions]")
+    download.value.save_as(path)
+    return {region.name: 1e3 * region.points_m[region.chosen] for region in read_drawn_regions(path)}
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_brush_paints_what_is_seen_below_it_by_pointer_and_by_keys(browser, report, tmp_path):
+    """As wide as it says and on the front only; more strokes add, shift takes away, points move between regions."""
+    file = tmp_path / "regions.json"
+    with opened(browser, report, viewport={"width": 700, "height": 900}) as page:
+        canvas = page.locator("#cloud canvas")
+        page.check("input[name=drawing]")
+        page.select_option("select[name=tool]", "brush")
+        page.locator("input[name=brush]").fill("60")
+        # Pixels a millimetre at the ball's front, which is nearer to the camera, 4.1 away, by its radius.
+        scale = canvas.bounding_box()["height"] / (2.0 * np.tan(0.3) * 3.1 * 30.0)
+        brush_over(page, (0.5, 0.5))
+        (dab,) = region_mm(page, file).values()
+        camera = np.array([np.cos(0.25), 0.0, np.sin(0.25)])
+        aside = np.linalg.norm(dab - (dab @ camera)[:, None] * camera, axis=1)
+        assert (dab @ camera > 0.0).all()
+        assert aside.max() == pytest.approx(60.0 / scale, rel=0.1)
+        assert len(dab) == pytest.approx(4000 * (aside.max() / 60.0) ** 2, rel=0.25)
+
+        brush_over(page, (0.35, 0.5), (0.65, 0.5))
+        (stroke,) = region_mm(page, file).values()
+        assert np.ptp(stroke[:, 1]) > 1.8 * np.ptp(dab[:, 1])
+        assert np.ptp(stroke[:, 2]) < 1.2 * np.ptp(dab[:, 2])
+        page.keyboard.down("Shift")
+        brush_over(page, (0.5, 0.5))
+        page.keyboard.up("Shift")
+        (cut,) = region_mm(page, file).values()
+        assert len(cut) == len(stroke) - len(dab)
+
+        page.select_option("select[name=deed]", "new")
+        brush_over(page, (0.5, 0.5))
+        page.locator(".regions input[type=radio]").first.check()
+        page.select_option("select[name=deed]", "move")
+        brush_over(page, (0.52, 0.5))
+        first, second = region_mm(page, file).values()
+        assert len(first) > len(cut)
+        assert len(second) < len(dab)
+        assert len(np.unique(np.concatenate([first, second]), axis=0)) == len(first) + len(second)
+
+        for _ in range(2):
+            page.locator(".regions button").first.click()
+        canvas.focus()
+        for _ in range(8):
+            page.keyboard.press("]")
+        assert page.locator("input[name=brush]").input_value() == "76"
+        assert page.locator(".tip").get_attribute("r") == "76"
+        page.keyboard.press("Enter")
+        (by_key,) = region_mm(page, file).values()
+        assert len(by_key) > len(dab)
+        canvas.focus()
+        page.keyboard.press("Shift+Enter")
+        assert page.locator(".regions li").count() == 0
 
 
 @pytest.mark.slow

@@ -16,9 +16,11 @@ function download(blob, name) {
 function start(root, cloud) {
   const canvas = root.querySelector("canvas"), form = root.querySelector("form"), fields = form.elements;
   const legend = root.querySelector(".legend"), pickedBox = root.querySelector(".picked");
-  const lasso = root.querySelector(".lasso"), scale = root.querySelector(".scale");
+  const lasso = root.querySelector(".lasso"), stroke = root.querySelector(".stroke"), tip = root.querySelector(".tip");
+  const scale = root.querySelector(".scale");
   const told = root.querySelector(".told"), list = root.querySelector(".regions");
   const renderer = new Renderer(canvas, cloud), picked = [], regions = [];
+  let current = null;
 
   function showBar(low, high, words) {
     const stops = Array.from({ length: 9 }, (_, i) => {
@@ -106,42 +108,63 @@ function start(root, cloud) {
   function addRegion(name, points) {
     const series = freeSeries();
     if (series < 0) { say(`There are ${MOST_CURVES} regions, which is the most; delete one.`); return; }
-    regions.push({ name, points, series, ...measured(cloud, points) });
+    regions.push(current = { name, points, series, ...measured(cloud, points) });
     showRegions();
   }
 
   function showRegions() {
+    if (!regions.includes(current)) current = regions.at(-1);
     list.replaceChildren(...regions.map((region) => {
-      const item = element("li", {}), name = element("input", { value: region.name, "aria-label": "Name of the region" });
+      const item = element("li", {}), chosen = element("input", { type: "radio", name: "current",
+        "aria-label": `Change ${region.name}` });
+      chosen.checked = region === current;
+      chosen.addEventListener("change", () => { current = region; });
+      const name = element("input", { value: region.name, "aria-label": "Name of the region" });
       const away = element("button", { type: "button", "aria-label": `Delete ${region.name}` }, "Delete");
       name.addEventListener("change", () => { region.name = name.value.trim() || region.name; showRegions(); });
       away.addEventListener("click", () => { regions.splice(regions.indexOf(region), 1); showRegions(); });
       const means = region.indices.map(({ name: index, mean_sd: [mean, sd] }) => (
         `${index} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)}`));
       const size = `${region.points.length} points, ${region.area_cm2.toPrecision(3)} cm²`;
-      item.append(dot(region.series), name, away, element("p", {}, [size, ...means].join("; ")));
+      item.append(chosen, dot(region.series), name, away, element("p", {}, [size, ...means].join("; ")));
       return item;
     }));
     show();
     drawSpectra();
   }
 
-  /** What the line went round becomes a region, or is added to the last one, or taken from it. */
-  function closeLasso(line) {
-    const found = line.length > 2 ? pointsInside(renderer, line) : [], last = regions.at(-1);
-    say(found.length ? "" : "The line goes round no point of the object.");
-    if (!found.length) return;
-    if (fields.deed.value === "new" || !last) {
+  const withBrush = () => fields.drawing.checked && fields.tool.value === "brush";
+
+  /** What was drawn becomes a region, or is added or moved to the chosen one, or taken from it. */
+  function closeLine(line, taking) {
+    const brush = withBrush(), radius = Number(fields.brush.value), deed = taking ? "take" : fields.deed.value;
+    const found = new Set(pointsWhere(renderer, (place) => (
+      brush ? distanceFrom(place, line) <= radius : inside(place, line))));
+    say(found.size ? "" : `The line goes ${brush ? "over" : "round"} no point of the object.`);
+    if (!found.size) return;
+    if (deed === "take" && !current) { say("There is no region to take from."); return; }
+    if (deed === "new" || !current) {
       let number = regions.length + 1;
       while (regions.some(({ name }) => name === `region ${number}`)) number++;
-      addRegion(`region ${number}`, found);
+      addRegion(`region ${number}`, [...found]);
+      if (brush) fields.deed.value = "add";
       return;
     }
-    const points = new Set(last.points);
-    for (const point of found) if (fields.deed.value === "add") points.add(point); else points.delete(point);
-    if (points.size) Object.assign(last, { points: [...points] }, measured(cloud, [...points]));
-    else regions.pop();
+    for (const region of deed === "move" ? [...regions] : [current]) {
+      const before = region.points.length, points = region.points.filter((point) => !found.has(point));
+      if (region === current && deed !== "take") points.push(...found);
+      if (!points.length) regions.splice(regions.indexOf(region), 1);
+      else if (region === current || points.length < before) Object.assign(region, { points }, measured(cloud, points));
+    }
     showRegions();
+  }
+
+  /** The brush's outline, where the pointer is or, for keys, in the middle. */
+  function showBrush(place) {
+    const [cx, cy] = place ?? [canvas.clientWidth / 2, canvas.clientHeight / 2], r = Number(fields.brush.value);
+    const shown = withBrush() && (place || canvas.matches(":focus-visible"));
+    for (const [name, value] of Object.entries({ cx, cy, r: shown ? r : 0 })) tip.setAttribute(name, value);
+    stroke.setAttribute("stroke-width", 2 * r);
   }
 
   function save() {
@@ -210,7 +233,7 @@ function start(root, cloud) {
   fields.save.addEventListener("click", () => { if (picked.length || regions.length) save(); });
   fields.saveRegions.addEventListener("click", () => {
     if (regions.length) download(new Blob([regionFile(cloud, regions)]), "regions.json");
-    else say("There is no region yet; tick \"draw regions\" and go round one.");
+    else say("There is no region yet; tick \"draw regions\" and draw one.");
   });
   fields.loadRegions.addEventListener("change", () => {
     if (fields.loadRegions.files.length) load(fields.loadRegions.files[0]);
@@ -230,18 +253,19 @@ function start(root, cloud) {
     travelled = pointers.size > 1 ? Infinity : 0;
     fields.turning.checked = false;
     line = fields.drawing.checked && pointers.size === 1 ? [[event.offsetX, event.offsetY]] : null;
-    lasso.setAttribute("points", "");
+    showLine();
   });
   canvas.addEventListener("pointermove", (event) => {
-    const before = pointers.get(event.pointerId);
+    const before = pointers.get(event.pointerId), now = [event.offsetX, event.offsetY];
+    showBrush(now);
     if (!before) return;
-    const now = [event.offsetX, event.offsetY], [dx, dy] = [now[0] - before[0], now[1] - before[1]];
+    const [dx, dy] = [now[0] - before[0], now[1] - before[1]];
     const other = [...pointers].find(([id]) => id !== event.pointerId);
     pointers.set(event.pointerId, now);
     travelled += Math.hypot(dx, dy);
     if (line) {
       line.push(now);
-      lasso.setAttribute("points", line.join(" "));
+      showLine();
     } else if (other) {
       const apart = ([a, b]) => Math.max(1, Math.hypot(a - other[1][0], b - other[1][1]));
       zoom(apart(before) / apart(now));
@@ -252,14 +276,22 @@ function start(root, cloud) {
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!pointers.delete(event.pointerId)) return;
-    if (travelled <= 3) pick(event.offsetX, event.offsetY);
-    else if (line) closeLasso(line);
-    stopLasso();
+    if (line && (travelled > 3 || withBrush())) closeLine(line, event.shiftKey);
+    else if (travelled <= 3) pick(event.offsetX, event.offsetY);
+    stopLine();
   });
-  canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); stopLasso(); });
-  function stopLasso() {
+  canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); stopLine(); });
+  canvas.addEventListener("pointerleave", () => showBrush());
+  canvas.addEventListener("focus", () => showBrush());
+  canvas.addEventListener("blur", () => showBrush());
+  for (const field of [fields.drawing, fields.tool, fields.brush]) field.addEventListener("input", () => showBrush());
+  function showLine() {
+    lasso.setAttribute("points", line && !withBrush() ? line.join(" ") : "");
+    stroke.setAttribute("points", line && withBrush() ? [line[0], ...line].join(" ") : "");
+  }
+  function stopLine() {
     line = null;
-    lasso.setAttribute("points", "");
+    showLine();
   }
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -271,8 +303,13 @@ function start(root, cloud) {
     if (by && event.shiftKey) move(by[0], by[1]);
     else if (by) turn(...by);
     else if ("+-".includes(event.key)) zoom(event.key === "+" ? 0.9 : 1.1);
-    else if (event.key === "Enter" || event.key === " ") pick(canvas.clientWidth / 2, canvas.clientHeight / 2);
-    else return;
+    else if ("[]".includes(event.key)) {
+      fields.brush.value = Number(fields.brush.value) + (event.key === "]" ? 2 : -2);
+      showBrush();
+    } else if (event.key === "Enter" || event.key === " ") {
+      const middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+      if (withBrush()) closeLine([middle], event.shiftKey); else pick(...middle);
+    } else return;
     fields.turning.checked = false;
     event.preventDefault();
   });

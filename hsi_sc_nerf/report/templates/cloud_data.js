@@ -40,19 +40,25 @@ class Cloud {
 
   /** Reflectance of a point in all bands. */
   spectrum(point) {
-    return this.wavelengths.map((_, band) => this.valueIn(band)(point));
+    return this.meanAndSd([point]).spectrum;
   }
 
-  /** Gives the reflectance of a point in a band. */
-  valueIn(band) {
-    const bands = this.wavelengths.length;
-    return (point) => {
-      let value = this.mean[band];
-      for (let k = 0; k < this.rank; k++) {
-        value += this.basis[k * bands + band] * this.coefficients[point * this.rank + k];
-      }
-      return value;
-    };
+  /** Mean and standard deviation of the points' reflectance in all bands, from those of their coefficients. */
+  meanAndSd(points) {
+    const { rank, coefficients, basis } = this, bands = this.wavelengths.length, count = points.length;
+    const ranks = Array.from({ length: rank }, (_, k) => k);
+    const means = ranks.map((k) => points.reduce((sum, point) => sum + coefficients[point * rank + k], 0) / count);
+    const shared = ranks.map((k) => ranks.map((l) => (l > k ? 0 : points.reduce((sum, point) => sum
+      + (coefficients[point * rank + k] - means[k]) * (coefficients[point * rank + l] - means[l]), 0) / count)));
+    const spectrum = [], sd = [];
+    for (let band = 0; band < bands; band++) {
+      const weights = ranks.map((k) => basis[k * bands + band]);
+      spectrum.push(this.mean[band] + weights.reduce((sum, weight, k) => sum + weight * means[k], 0));
+      const variance = weights.reduce((sum, weight, k) => sum + weight * weights.slice(0, k + 1).reduce(
+        (part, other, l) => part + (l < k ? 2 : 1) * other * shared[k][l], 0), 0);
+      sd.push(Math.sqrt(Math.max(0, variance)));
+    }
+    return { spectrum, sd };
   }
 
   /** A number of each point, NaN where it has none. */

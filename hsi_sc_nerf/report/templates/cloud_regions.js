@@ -13,13 +13,22 @@ function inside([x, y], line) {
   return within;
 }
 
-/** The points that a line on the canvas (CSS pixels) goes round: those that the camera sees, and none behind them. */
-function pointsInside(renderer, line) {
+/** Distance of a place from a line, which may be a single place. */
+function distanceFrom([x, y], line) {
+  return Math.min(...line.map(([x1, y1], i) => {
+    const [x0, y0] = line[Math.max(0, i - 1)], [dx, dy] = [x1 - x0, y1 - y0];
+    const along = Math.min(1, Math.max(0, ((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy || 1)));
+    return Math.hypot(x - x0 - along * dx, y - y0 - along * dy);
+  }));
+}
+
+/** The points whose places on the canvas (CSS pixels) are chosen: those that the camera sees, and none behind them. */
+function pointsWhere(renderer, chosen) {
   const seen = renderer.project(), cell = Math.max(4, 2 * renderer.spacingPx()), nearest = new Map();
   const cellOf = ({ x, y }) => `${Math.floor(x / cell)} ${Math.floor(y / cell)}`;
   for (const one of seen) nearest.set(cellOf(one), Math.min(nearest.get(cellOf(one)) ?? Infinity, one.depth));
   const front = seen.filter((one) => one.depth <= nearest.get(cellOf(one)) + FRONT_DEPTH);
-  return front.filter(({ x, y }) => inside([x, y], line)).map(({ point }) => point);
+  return front.filter(({ x, y }) => chosen([x, y])).map(({ point }) => point);
 }
 
 function meanAndSd(values) {
@@ -29,12 +38,10 @@ function meanAndSd(values) {
 
 /** Area (cm²), mean spectrum with its standard deviation, and the mean of each index, of points of the cloud. */
 function measured(cloud, points) {
-  const bands = cloud.wavelengths.map((_, band) => meanAndSd(Array.from(points, cloud.valueIn(band))));
   const indices = cloud.scalars.map((scalar, i) => ({ ...scalar, i })).filter(({ index }) => index);
   return {
     area_cm2: points.reduce((area, point) => area + cloud.areas_cm2[point], 0),
-    spectrum: bands.map(([mean]) => mean),
-    sd: bands.map(([, sd]) => sd),
+    ...cloud.meanAndSd(points),
     indices: indices.map(({ name, i }) => {
       const values = cloud.scalar(i);
       return { name, mean_sd: meanAndSd(Array.from(points, (point) => values[point])) };
