@@ -26,12 +26,12 @@ _LARGEST = 0.5
 _MOST_PARTS = 2
 """At one end: a stem, and what it stands on."""
 _LEAST_HEIGHT = 0.05
-"""Least height of a part at the lower end over the object's: pixels at the rim are mixed with what it stands on."""
+"""Least height of a part at the lower end over the object's: the rim's pixels are mixed with what it stands on."""
 _RADII = 60
 _GAP, _RING = 1.1, 1.6
 """The rings beside an edge lie between these multiples of its radius; between the rings spectra are mixed."""
 _LEAST_SEPARATION = 6.0
-"""Standard deviations. What is no organ reaches 5 (skin that fades), organs of trained clouds 9 to 19."""
+"""Standard deviations. What is no organ reaches 5 (skin that fades), organs of trained clouds 9 to 21."""
 _LEAST_ANGLE_RAD = paper.CLASSIFICATION_ANGLE_RAD / 2.0
 _ANGLE_NOISE_RAD = 0.01
 """Added to the deviations, so that spectra without noise are not divided by nothing."""
@@ -71,7 +71,7 @@ def propose_organs(
         >>> {name: int(where.sum()) for name, where in propose_organs(cloud.points, cloud.spectra).items()}
         {'body': 49342, 'stem': 658}
     """
-    rest, named = np.ones(len(points_m), bool), {}
+    rest, named = np.ones(len(points_m), bool), dict[str, Bool[np.ndarray, "n"]]()
     if len(points_m) < MIN_SPECTRA:
         return {BODY: rest}
     near = cKDTree(points_m).query(points_m, NEIGHBOURS + 1)[1]
@@ -79,16 +79,13 @@ def propose_organs(
     shapes = unit_spectra(spectra[near].mean(axis=1, dtype=float))
     features = shapes @ find_subspace(shapes[:: max(1, len(shapes) // _SAMPLE)]).basis
     for upper in (True, False):
-        free = rest
         for _ in range(_MOST_PARTS):
-            if (found := _part_at_end(upper, points_m, features, near, free)) is None:
+            if (found := _part_at_end(upper, points_m, features, near, rest)) is None:
                 break
             name, part = found
             number = sum(other.startswith("part") for other in named) + 1
             named[f"part {number}" if name is None or name in named else name] = part
             rest = rest & ~part
-            # Spectra beside a part are mixed with its own: they are the body's, and no part themselves.
-            free = free & ~part[near].any(axis=1)
     return {KERNELS if HUSK in named else BODY: rest} | named
 
 
@@ -97,38 +94,41 @@ def _part_at_end(
     points_m: Float[np.ndarray, "n 3"],
     features: Float[np.ndarray, "n k"],
     near: Int[np.ndarray, "n near"],
-    free: Bool[np.ndarray, "n"],
+    rest: Bool[np.ndarray, "n"],
 ) -> tuple[str | None, Bool[np.ndarray, "n"]] | None:
     """A slim tip, or else what has spectra of its own at an end."""
-    distances = list(_distances(upper, points_m, free))
-    slim_m = _slim_length(distances[0], points_m, free) if upper else 0.0
+    distances = list(_distances(upper, points_m, rest))
+    slim_m = _slim_length(distances[0], points_m, rest) if upper else 0.0
     if slim_m:
-        edge = _sharpest_edge(distances[0], features, free, (slim_m / _GAP, slim_m * _GAP))
-        tip = _beside(edge, features, free) if edge.separation >= _LEAST_SEPARATION else distances[0] < slim_m
-        part = _largest_piece(free & tip, near)
+        edge = _sharpest_edge(distances[0], features, rest, (slim_m / _GAP, slim_m * _GAP))
+        tip = _beside(edge, features, rest) if edge.separation >= _LEAST_SEPARATION else distances[0] < slim_m
+        part = _largest_piece(rest & tip, near)
         if part.sum() >= _LEAST_POINTS and (edge.separation >= _LEAST_SEPARATION or _is_slender(points_m[part])):
             return STEM, part
-    edge = max((_sharpest_edge(one, features, free) for one in distances), key=lambda one: one.separation)
-    part = _largest_piece(_beside(edge, features, free), near)
+    edge = max((_sharpest_edge(one, features, rest) for one in distances), key=lambda one: one.separation)
+    part = _largest_piece(_beside(edge, features, rest), near)
     if edge.separation < _LEAST_SEPARATION or not _LEAST_POINTS <= part.sum() <= _LARGEST * len(part):
         return None
     if not upper and np.ptp(points_m[part, 2]) < _LEAST_HEIGHT * np.ptp(points_m[:, 2]):
         return None
     size = np.ptp(points_m, axis=0)
-    is_calyx = part.mean() <= _CALYX
-    return HUSK if size[2] >= _LONG * size[:2].max() else CALYX if is_calyx else None, part
+    if _is_slender(points_m[part]):
+        return STEM, part
+    if size[2] >= _LONG * size[:2].max():
+        return HUSK, part
+    return CALYX if part.mean() <= _CALYX else None, part
 
 
 def _distances(
-    upper: bool, points_m: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, "n"]
+    upper: bool, points_m: Float[np.ndarray, "n 3"], rest: Bool[np.ndarray, "n"]
 ) -> Iterator[Float[np.ndarray, "n"]]:
     """From the tip of an end, from where the axis meets it, and along the axis."""
-    height, of_free = points_m[:, 2] * (1.0 if upper else -1.0), np.flatnonzero(free)
-    some = max(8, len(of_free) // 500)
-    highest = of_free[np.argsort(-height[of_free])[:some]]
-    low, high = np.quantile(points_m[of_free, :2], [0.01, 0.99], axis=0)
+    height, of_rest = points_m[:, 2] * (1.0 if upper else -1.0), np.flatnonzero(rest)
+    some = max(8, len(of_rest) // 500)
+    highest = of_rest[np.argsort(-height[of_rest])[:some]]
+    low, high = np.quantile(points_m[of_rest, :2], [0.01, 0.99], axis=0)
     aside = np.linalg.norm(points_m[:, :2] - (low + high) / 2.0, axis=1)
-    half = of_free[height[of_free] > (height[of_free].min() + height[of_free].max()) / 2.0]
+    half = of_rest[height[of_rest] > (height[of_rest].min() + height[of_rest].max()) / 2.0]
     for end in (highest, half[np.argsort(aside[half])[:some]] if len(half) else highest):
         yield np.linalg.norm(points_m - points_m[end].mean(axis=0), axis=1)
     yield height[highest].max() - height
@@ -148,14 +148,14 @@ class _Edge:
 def _sharpest_edge(
     distance: Float[np.ndarray, "n"],
     features: Float[np.ndarray, "n k"],
-    free: Bool[np.ndarray, "n"],
+    rest: Bool[np.ndarray, "n"],
     between: tuple[float, float] = (0.0, np.inf),
 ) -> _Edge:
     """The edge with the largest separation; 0 where no two rings differ by an angle that tells materials apart."""
     best = _Edge(distance, 0.0, 0.0, np.zeros(features.shape[1]), 0.0)
-    for radius, cuts, sums in _rings(distance, features, free):
+    for radius, cuts, sums in _rings(distance, features, rest):
         inner, outer = (sums.moments(*cut)[0] for cut in (cuts[:2], cuts[2:]))
-        within = (sums.moments(0, cuts[1])[1] + sums.moments(cuts[2], free.sum())[1]) / 2.0
+        within = (sums.moments(0, cuts[1])[1] + sums.moments(cuts[2], rest.sum())[1]) / 2.0
         direction = np.linalg.solve(within + _ANGLE_NOISE_RAD**2 / len(within) * np.eye(len(within)), inner - outer)
         separation = float(np.sqrt((inner - outer) @ direction))
         good = between[0] <= radius <= between[1] and np.linalg.norm(inner - outer) >= _LEAST_ANGLE_RAD
@@ -164,28 +164,28 @@ def _sharpest_edge(
     return best
 
 
-def _beside(edge: _Edge, features: Float[np.ndarray, "n k"], free: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+def _beside(edge: _Edge, features: Float[np.ndarray, "n k"], rest: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Points on the end's side of an edge by their spectra, not far from it."""
-    return free & (features @ edge.direction > edge.level) & (edge.distance < _REACH * edge.radius)
+    return rest & (features @ edge.direction > edge.level) & (edge.distance < _REACH * edge.radius)
 
 
 def _slim_length(
-    distance: Float[np.ndarray, "n"], points_m: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, "n"]
+    distance: Float[np.ndarray, "n"], points_m: Float[np.ndarray, "n 3"], rest: Bool[np.ndarray, "n"]
 ) -> float:
     """Length of a slim tip that stands on something wide; 0 where there is none."""
     widens, length = _WIDENS, 0.0
-    for radius, cuts, sums in _rings(distance, points_m - points_m.mean(axis=0), free):
+    for radius, cuts, sums in _rings(distance, points_m - points_m.mean(axis=0), rest):
         inner, outer = (np.sqrt(np.trace(sums.moments(*cut)[1])) for cut in (cuts[:2], cuts[2:]))
-        if max(inner, distance[free].min()) < _SLIM * radius and outer > widens * inner:
+        if max(inner, distance[rest].min()) < _SLIM * radius and outer > widens * inner:
             widens, length = outer / inner, radius / _GAP
     return length
 
 
 def _rings(
-    distance: Float[np.ndarray, "n"], values: Float[np.ndarray, "n k"], free: Bool[np.ndarray, "n"]
+    distance: Float[np.ndarray, "n"], values: Float[np.ndarray, "n k"], rest: Bool[np.ndarray, "n"]
 ) -> Iterator[tuple[float, Int[np.ndarray, "4"], _RunningSums]]:
     """Radii, where the rings on both sides of each begin and end, and sums of the values, in order of distance."""
-    rows = np.flatnonzero(free)
+    rows = np.flatnonzero(rest)
     rows = rows[np.argsort(distance[rows])]
     ordered, sums = distance[rows], _RunningSums(values[rows])
     nearest, farthest = ordered[min(_LEAST_POINTS, len(rows) - 1)], np.quantile(ordered, _LARGEST)

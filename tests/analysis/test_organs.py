@@ -6,6 +6,8 @@ from known_fruit import BROWN, GREEN, NM, RADIUS_M, SKIN, ball, fruit, noisy, ro
 
 from hsi_sc_nerf.analysis.organs import propose_organs
 
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 
 def overlap(found, true):
     return (found & true).sum() / (found | true).sum()
@@ -19,6 +21,25 @@ def test_a_ball_with_a_cap_and_a_rod_has_body_stem_and_calyx(cap_at):
     assert list(found) == ["body", "stem", "calyx"]
     assert all(overlap(found[name], true[name]) > 0.93 for name in true)
     assert (np.sum(list(found.values()), axis=0) == 1).all()
+
+
+def test_a_stem_in_a_hollow_that_no_camera_sees_is_found_across_the_gap():
+    points_m, spectra, true = fruit(cap=SKIN)
+    hollow = ~true["stem"] & (points_m[:, 2] > 0.0) & (np.hypot(points_m[:, 0], points_m[:, 1]) < 0.022)
+    found = propose_organs(points_m[~hollow], spectra[~hollow])
+    assert list(found) == ["body", "stem"]
+    assert overlap(found["stem"], true["stem"][~hollow]) > 0.93
+
+
+def test_neither_a_spot_beside_a_stem_nor_a_long_stripe_from_a_calyx_belongs_to_it():
+    points_m, spectra, true = fruit()
+    spot = (np.linalg.norm(points_m - [0.011, 0.0, 0.0279], axis=1) < 0.004) & ~true["stem"]
+    stripe = (np.abs(points_m[:, 0]) < 0.003) & (points_m[:, 1] > 0.0) & ~true["stem"] & ~true["calyx"]
+    for where, colour in ((spot, BROWN), (stripe, GREEN)):
+        spectra[where] = noisy(np.tile(colour, (where.sum(), 1)), np.random.default_rng(0))
+    found = propose_organs(points_m, spectra)
+    assert not found["stem"][spot].any()
+    assert overlap(found["calyx"], true["calyx"]) > 0.85
 
 
 def test_a_stem_of_the_colour_of_the_body_is_told_by_its_shape():
@@ -35,6 +56,13 @@ def test_the_answer_does_not_depend_on_size_turn_or_light():
     again = propose_organs(7.0 * points_m @ turn.T + [0.1, -0.2, 0.3], 0.5 * spectra)
     assert list(found) == list(again)
     assert all(overlap(found[name], again[name]) > 0.99 for name in found)
+
+
+def test_a_fruit_that_hangs_upside_down_has_the_same_organs():
+    points_m, spectra, true = fruit()
+    found = propose_organs(points_m * [1.0, -1.0, -1.0], spectra)
+    assert set(found) == {"body", "stem", "calyx"}
+    assert all(overlap(found[name], true[name]) > 0.93 for name in true)
 
 
 def test_an_ear_has_kernels_and_a_husk():
@@ -57,14 +85,16 @@ def test_a_large_part_has_no_name_of_its_own():
 
 
 @pytest.mark.parametrize("shape", ["ball", "rod"])
-@pytest.mark.parametrize("coloured", ["evenly", "without noise", "fading", "one side", "rim"])
+@pytest.mark.parametrize("coloured", ["evenly", "without noise", "fading", "one side", "rim", "in shadow"])
 def test_no_organ_is_invented(shape, coloured):
-    """Not of noise, of colour that fades from pole to pole, of a blush, nor of the mixed pixels where it stands."""
+    """Not of noise, of colour that fades, of a blush, of shade, nor of the mixed pixels where it stands."""
     rng = np.random.default_rng(1)
     points_m = ball(8000, rng) if shape == "ball" else rod(0.16, 0.02, 8000, rng)
     height = (points_m[:, 2] - points_m[:, 2].min()) / np.ptp(points_m[:, 2])
     part = {"fading": height, "one side": points_m[:, 0] > 0.01, "rim": height < 0.03}.get(coloured, 0.0 * height)
     spectra = SKIN + part[:, None] * (GREEN - SKIN)
+    if coloured == "in shadow":
+        spectra = spectra * np.where(height < 0.2, 0.3, 1.0)[:, None]
     found = propose_organs(points_m, spectra if coloured == "without noise" else noisy(spectra, rng))
     assert list(found) == ["body"]
 
