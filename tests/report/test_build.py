@@ -13,14 +13,14 @@ import pytest
 from headless_browser import needs_browser, quiet_page
 from PIL import Image
 
-from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
+from hsi_sc_nerf.analysis.drawn_regions import propose_regions, read_drawn_regions, write_drawn_regions
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.measurement import measure_traits
 from hsi_sc_nerf.analysis.report import trait_content
 from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -265,8 +265,8 @@ def go_round(page, x, y, radius):
 
 @pytest.mark.slow
 @needs_browser
-def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, report, tmp_path):
-    """What is behind stays out; the file opens again, and `traits` finds the same spectrum on the whole cloud."""
+def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, run, report, tmp_path):
+    """What is behind stays out; the file opens again, as proposals do; `traits` finds the same on the whole cloud."""
     with opened(browser, report, viewport={"width": 700, "height": 900}) as page:
         page.check("input[name=drawing]")
         go_round(page, 0.5, 0.7, 0.06)
@@ -300,6 +300,11 @@ def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, report
         assert page.locator(".picked .spread").count() == 0
         page.set_input_files("input[name=loadRegions]", tmp_path / "regions.json")
         page.locator(".regions li").nth(1).wait_for()
+        write_drawn_regions(tmp_path / "proposed.json", propose_regions(read_spectral_ply(run / "point_cloud.ply")))
+        page.set_input_files("input[name=loadRegions]", tmp_path / "proposed.json")
+        page.locator(".regions li").nth(2).wait_for()
+        assert page.locator(".regions p").last.inner_text().startswith("4000 points, 11")
+        assert page.locator(".regions input[type=radio]").last.is_checked()
         (tmp_path / "other.json").write_text("{")
         page.set_input_files("input[name=loadRegions]", tmp_path / "other.json")
         page.wait_for_selector(".told:not([hidden])")
