@@ -20,6 +20,8 @@ _API = {
     "read_calibration": "analysis.calibrations",
     "read_library": "analysis.library",
     "read_drawn_regions": "analysis.drawn_regions",
+    "write_drawn_regions": "analysis.drawn_regions",
+    "propose_regions": "analysis.drawn_regions",
     "write_library": "analysis.library",
     "traits": "analysis.measurement:measure_traits",
     "write_traits": "analysis.measurement_files:write_measurement",
