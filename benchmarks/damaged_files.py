@@ -27,10 +27,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
+from file_kinds import Kind, kinds
 from results_table import RESULTS, write_results
-from valid_files import write_valid_files
 
 from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError
 
@@ -54,23 +53,6 @@ HOSTILE_VALUES: tuple[Any, ...] = (
     *("", "a", "1", "nan", "../a", "/etc/passwd", "a\0b", "a\n|b<c>", "\ud800", "a" * 5000),
     *([], {}, [[]], [None], [0], [1, [2]], [[1, 2], [3]], {"a": 1}, [{}], [1e308] * 4, ["x"] * 5, {"": None}),
 )
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of file.
-
-    Attributes:
-        name: in the table.
-        path: a valid file, which is damaged.
-        read: reads it as a command does.
-        share: of all inputs, relative to others: slow readers get fewer.
-    """
-
-    name: str
-    path: Path
-    read: Callable[[], object]
-    share: float = 1.0
 
 
 @dataclass
@@ -220,109 +202,6 @@ def _libraries_are_silent() -> Iterator[None]:
 
 def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-
-
-def kinds(folder: Path) -> list[Kind]:
-    """Valid files of every kind under ``folder``, and how each is read."""
-    from hsi_sc_nerf.analysis.calibrations import read_calibration
-    from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
-    from hsi_sc_nerf.analysis.library import read_library
-    from hsi_sc_nerf.batch.objects import read_object
-    from hsi_sc_nerf.batch.session_list import read_sessions
-    from hsi_sc_nerf.calibration.white_source import read_panel
-    from hsi_sc_nerf.capture.envi import CubeLines, open_cube
-    from hsi_sc_nerf.capture.instrument import read_metadata
-    from hsi_sc_nerf.capture.session import open_session
-    from hsi_sc_nerf.capture.session_info import read_band_centres
-    from hsi_sc_nerf.evaluation.comparison import read_surface
-    from hsi_sc_nerf.export.cloud import read_spectral_ply
-    from hsi_sc_nerf.export.sample_points import read_points
-    from hsi_sc_nerf.models.checkpoints import read_checkpoint
-    from hsi_sc_nerf.models.run_settings import read_config
-    from hsi_sc_nerf.packed.dataset import open_packed
-    from hsi_sc_nerf.processing.frames import FramePaths, read_cache
-    from hsi_sc_nerf.rendering.views import views_of_path
-    from hsi_sc_nerf.report.dataset_sections import calibration_section, inspection_section, poses_section
-    from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
-    from hsi_sc_nerf.settings_file import read_yaml
-    from hsi_sc_nerf.simulate.own_mesh import load as load_mesh
-    from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
-    from hsi_sc_nerf.simulate.truth import load_truth
-
-    files = write_valid_files(folder)
-    session, data, run = folder / "session", folder / "data", folder / "run"
-
-    def every_line(header: Path) -> None:
-        with CubeLines(open_cube(header)) as lines:
-            for line in range(lines.shape[0]):
-                lines[line]
-
-    def frame_of(use: Callable[[Any], object]) -> Callable[[], object]:
-        return lambda: use(open_packed(data).frames[0])
-
-    def every_point(path: Path) -> None:
-        read_points(path)
-        read_surface(path)
-        read_spectral_ply(path)
-
-    def judged(section: Callable[[Any], object]) -> Callable[[], object]:
-        dataset = open_packed(data)
-        return lambda: section(dataset)
-
-    first = session / "sphere_000" / "capture" / "sphere_000.hdr"
-    nm = open_cube(first).wavelengths_nm
-    note, picture = FramePaths.of(data, "ball_0"), session / "truth" / "pixels" / "sphere_000.npz"
-    some = np.full((2, 30), 0.5), np.linspace(390.0, 1000.0, 30)
-    return [
-        Kind("ENVI header", first, lambda: every_line(first), 3.0),
-        Kind("ENVI header, in a session", first, lambda: open_session(session), 1.0),
-        Kind("ENVI cube", first.with_suffix(".raw"), lambda: every_line(first)),
-        Kind("session.json", session / "session.json", lambda: open_session(session), 1.5),
-        Kind("metadata (XML)", files["xml"], lambda: read_metadata(files["xml"]), 3.0),
-        Kind("band centres (CSV)", files["bands"], lambda: read_band_centres(files["bands"]), 1.5),
-        Kind("panel (CSV)", files["panel"], lambda: read_panel(files["panel"], nm), 1.5),
-        Kind("truth.json", session / "truth" / "truth.json", lambda: load_truth(session)),
-        Kind("transforms.json", data / "transforms.json", frame_of(lambda frame: frame.cube()), 3.0),
-        Kind("picture (PNG)", data / "images" / "ball_0.png", frame_of(lambda frame: frame.pseudo_rgb())),
-        Kind("mask (PNG)", data / "masks" / "ball_0.png", frame_of(lambda frame: frame.mask())),
-        Kind("note of a resume", note.cache, lambda: read_cache(note, "made"), 2.0),
-        Kind("bins of a resume", note.bins, lambda: read_cache(note, "made"), 0.5),
-        Kind("point cloud (binary PLY)", files["binary"], lambda: every_point(files["binary"]), 3.0),
-        Kind("point cloud (ASCII PLY)", files["ascii"], lambda: every_point(files["ascii"]), 2.0),
-        *(Kind(f"mesh ({s.upper()})", files[s], lambda s=s: read_surface(files[s]), 0.5) for s in ("obj", "stl")),
-        *(
-            Kind(
-                f"own mesh ({s.upper()})", files[s], lambda s=s: load_mesh(OwnMesh("mesh", files[s], ("skin",))), 0.3
-            )
-            for s in ("ply", "glb")
-        ),
-        Kind("spectral library (header)", files["library"], lambda: read_library(files["library"]), 2.0),
-        Kind("spectral library (data)", files["sli"], lambda: read_library(files["library"]), 0.5),
-        Kind("spectral library (CSV)", files["csv"], lambda: read_library(files["csv"]).at(nm), 1.5),
-        Kind("scene (YAML)", files["scene"], lambda: load_scene(files["scene"]), 0.7),
-        Kind("effects (YAML)", files["effects"], lambda: read_yaml(files["effects"].read_text("latin-1"), "e"), 0.5),
-        Kind("config.yml", run / "config.yml", lambda: read_config(run / "config.yml"), 0.05),
-        Kind("checkpoint", files["checkpoint"], lambda: read_checkpoint(files["checkpoint"]), 0.5),
-        Kind("camera path (JSON)", files["path"], lambda: views_of_path(files["path"]), 1.5),
-        Kind("calibration.json", data / "calibration.json", judged(calibration_section), 0.02),
-        Kind("poses.json", data / "poses.json", judged(poses_section), 0.02),
-        Kind("inspection.json", data / "report" / "inspection.json", judged(inspection_section), 1.0),
-        Kind("comparison.json", files["comparison"], lambda: comparison_section(*_json(files["comparison"])), 0.02),
-        Kind("traits.json", files["traits"], lambda: traits_section(*_json(files["traits"])), 1.5),
-        Kind("truth of a picture (NPZ)", picture, lambda: load_truth(session).light("sphere_000"), 0.5),
-        Kind("regions drawn (JSON)", files["regions"], lambda: read_drawn_regions(files["regions"]), 1.5),
-        Kind(
-            "calibration (CSV)", files["calibration"], lambda: read_calibration(files["calibration"]).of(*some), 1.5
-        ),
-        Kind("sessions of a batch (CSV)", files["sessions"], lambda: read_sessions(files["sessions"]), 1.5),
-        Kind("record of a step (JSON)", files["record"], lambda: read_object(files["record"].parents[1]), 1.5),
-    ]
-
-
-def _json(path: Path) -> tuple[dict[str, Any] | None, Path]:
-    from hsi_sc_nerf.report.page import read_known
-
-    return read_known(path), path
 
 
 def main(

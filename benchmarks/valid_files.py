@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ import trimesh
 import yaml
 
 from hsi_sc_nerf.analysis.drawn_regions import KIND
+from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, write_plan
+from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
+from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
@@ -22,6 +26,7 @@ from hsi_sc_nerf.models.checkpoints import CHECKPOINT_KEYS, write_checkpoint
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, write_transforms
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame
+from hsi_sc_nerf.simulate.effects.detector import DarkPattern
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth
@@ -30,7 +35,7 @@ from hsi_sc_nerf.simulate.truth import load_truth
 def write_valid_files(folder: Path) -> dict[str, Path]:
     """A simulated session, a small dataset and everything else; paths of what lies beside them by short names."""
     folder.mkdir()
-    scene = override(load_scene("sphere"), frames=3, size_px=24, bands=8)
+    scene = replace(override(load_scene("sphere"), frames=3, size_px=24, bands=8), effects=(DarkPattern(),))
     session = simulate_session(scene, folder / "session", progress=False)
     raw, truth = open_cube(session / "sphere_000" / "capture" / "sphere_000.hdr"), load_truth(session)
     bands, data = raw.shape[2], folder / "data"
@@ -92,10 +97,12 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "path": "path.json",
         "comparison": "comparison.json",
         "traits": "traits.json",
-        "regions": "regions.json",
+        "season": "season",
         "calibration": "calibration.csv",
-        "sessions": "sessions.csv",
-        "record": "batch/objects/ball/steps/train.json",
+        "onnx": "model.onnx",
+        "regions": "regions.json",
+        "npy": "pixels.npy",
+        "spectrum": "spectrum.csv",
     }
     files |= {name: folder / file for name, file in others.items()}
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
@@ -130,17 +137,43 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     write_json(files["path"], {"render_height": 20, "render_width": 30, "camera_path": [camera, camera], "fps": 24})
     write_json(files["comparison"], _COMPARISON)
     write_json(files["traits"], _TRAITS)
-    points_m = rng.random((20, 3)).round(3).tolist()
-    write_json(files["regions"], {"kind": KIND, "points_m": points_m, "regions": [{"name": "a", "points": [0, 1]}]})
-    files["calibration"].write_text(_CALIBRATION)
-    files["sessions"].write_text("object;session;day\nball;session;1\nball_2;session;2\n")
-    record = {"step": "train", "status": "done", "seconds": 1.5, "peak_memory_mib": 900.0, "sentence": ""}
-    write_json(files["record"], record)
+    _write_season(files["season"], session)
+    rows = [f"{nm},0.1,0.5,0.2,0.3,0.3,1" for nm in range(400, 1001, 20)]
+    files["calibration"].write_text("\n".join([*_CALIBRATION_HEAD, *rows, ""]))
+    shutil.copy(Path(__file__).parents[1] / "tests" / "analysis" / "calibrations_onnx" / "pls.onnx", files["onnx"])
+    table = ["# name: sugar", "# unit: %", "# model: model.onnx", "wavelength_nm", *map(str, range(500, 560, 10))]
+    files["onnx"].with_name("model.csv").write_text("\n".join(table))
+    points_m = rng.normal(0.0, 0.02, (30, 3)).tolist()
+    region = {"name": "stem", "points": [0, 3, 4]}
+    write_json(files["regions"], {"kind": KIND, "points_m": points_m, "regions": [region, region | {"name": "b"}]})
+    np.save(files["npy"], truth.material_weights(truth.captures[0]).astype(np.float16))
+    files["spectrum"].write_text(
+        "\n".join(["wavelength_nm,reflectance", *(f"{nm},0.5" for nm in range(390, 1030, 20))])
+    )
     (folder / "run").mkdir()
     (folder / "run" / "config.yml").write_text(yaml.dump(hsi_sc_nerf.config))
     return files
 
 
+def _write_season(out: Path, session: Path) -> None:
+    """A batch of two objects, one of which is done."""
+    out.mkdir()
+    rows = [{OBJECT: name, SESSION: str(session), "day": "3"} for name in ("pear", "maize")]
+    write_plan(out, rows, SessionSettings())
+    pear = out / OBJECTS_NAME / "pear"
+    record = {"status": "done", "seconds": 3.5, "peak_memory_mib": 800.0, "sentence": ""}
+    for step in STEPS:
+        write_json(pear / "steps" / f"{step}.json", {"step": step} | record)
+    write_json(pear / "traits" / "traits.json", _TRAITS)
+    write_json(pear / "eval.json", {"results": dict.fromkeys(("psnr", "ssim", "sam", "rmse"), 0.5)})
+    write_json(pear / "inspection.json", {"session": "/a/b", "findings": [_FINDING, _FINDING]})
+
+
+_CALIBRATION_HEAD = (
+    *("# name: sugar", "# unit: %", "# preprocessing: absorbance, snv, savgol 5 2 1", "# intercept: 12.5"),
+    *("# error: 0.4", "# t2_limit: 9.5", "# q_limit: 0.02", "# score_variances: 1.5"),
+    "wavelength_nm,coefficient,mean,scale,weight_1,loading_1,reference",
+)
 _FINDING = {"name": "white", "level": "amber", "sentence": "The white is old; take it again.", "values": {"a": 1.0}}
 _POSES = {
     "method": "markers",
@@ -208,21 +241,6 @@ materials:
 effects: [photon_noise, {lamp: {fraction: 0.3}}]
 seed: 3
 """
-_CALIBRATION = (
-    """# name: dry matter
-# unit: %
-# preprocessing: absorbance, savgol 3 1 1, snv
-# intercept: 14.2
-# error: 0.4
-# t2_limit: 9.5
-# q_limit: 0.1
-# score_variances: 2.5
-wavelength_nm,coefficient,mean,scale,weight_1,loading_1
-400,,0,1,0.5,0.5
-"""
-    + "".join(f"{nm},0.01,0.2,1,0.5,0.5\n" for nm in range(410, 500, 10))
-    + "500,,0,1,0.5,0.5\n"
-)
 
 
 def _calibration(bands: int) -> dict[str, Any]:

@@ -80,6 +80,7 @@ def read_plan(out: Path) -> dict[str, PlannedObject]:
     known: Mapping[str, Any] = read_json(out / SETTINGS_NAME, _AGAIN)
     try:
         settings = SessionSettings(**known)
+        _check_types(settings)
     except TypeError as error:
         raise InputError(f"{out / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
     root = out.resolve() / OBJECTS_NAME
@@ -108,6 +109,13 @@ def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
             if status == "failed" and (retry or not step.was_tried(one.folder)):
                 found.append(one.record(name))
     return found
+
+
+def _check_types(settings: SessionSettings) -> None:
+    texts = (settings.process, settings.train, settings.material, settings.traits)
+    numbers = (settings.num_points, 1 if settings.max_num_iterations is None else settings.max_num_iterations)
+    if not all(type(text) is str for text in texts) or not all(type(number) is int for number in numbers):
+        raise TypeError("a setting has the type of another")
 
 
 def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:

@@ -58,9 +58,12 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
         if not row[SESSION]:
             raise InputError(f"{where}: names no session; write its folder in the column '{SESSION}'.")
         folder = path.parent / row[SESSION]
-        if not (may_be_gone or folder.is_dir()):
+        try:
+            there, row[SESSION] = folder.is_dir(), str(folder.resolve())
+        except (OSError, ValueError) as error:  # a name that is too long, or that no system takes
+            raise InputError(f"{where}: {shown(row[SESSION])} is no path ({error}); mend it.") from error
+        if not (may_be_gone or there):
             raise InputError(f"{where}: there is no folder {folder}; mend the path or leave out the line.")
-        row[SESSION] = str(folder.resolve())
     return [row for _, row in rows]
 
 

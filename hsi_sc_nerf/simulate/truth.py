@@ -64,7 +64,7 @@ class Truth:
 
     def material_weights(self, capture: str) -> Float[np.ndarray, "lines samples materials"]:
         """Fraction of each material in each pixel, summing to 1."""
-        return self._pixels(capture, "material_weights").astype(np.float32)
+        return self._pixels(capture, "material_weights", (len(self.materials),)).astype(np.float32)
 
     def object_coverage(self, capture: str) -> Float[np.ndarray, "lines samples"]:
         """Fraction of each pixel that the object covers, in [0, 1]."""
@@ -94,9 +94,13 @@ class Truth:
         path = detector_path(self.session_dir)
         return _read_arrays(path) if path.exists() else {}
 
-    def _pixels(self, capture: str, key: str) -> np.ndarray:
+    def _pixels(self, capture: str, key: str, each: tuple[int, ...] = ()) -> np.ndarray:
+        """An image whose pixels have the shape ``each``."""
         path = pixels_path(self.session_dir, capture)
-        return _one_of(path, _read_arrays(path, (key,)), key)
+        image = _one_of(path, _read_arrays(path, (key,)), key)
+        if image.shape[2:] != each or image.ndim < 2:
+            raise InputError(f"{path}: its {key} is no image of the session; simulate the session again.")
+        return image
 
 
 def load_truth(session_dir: str | Path) -> Truth:
@@ -118,6 +122,8 @@ def load_truth(session_dir: str | Path) -> Truth:
     try:
         with (session_dir / "truth" / "endmembers.csv").open(encoding="utf-8", newline="") as file:
             table = np.array(list(csv.reader(file))[1:], float)
+        if table.shape != (len(values["wavelengths_nm"]), 1 + len(values["materials"])):
+            raise ValueError("endmembers.csv is not of its bands and materials")
         return Truth(
             session_dir=session_dir,
             object=values["object"],
@@ -212,7 +218,12 @@ def _read_arrays(path: Path, only: Collection[str] = ()) -> dict[str, np.ndarray
     """
     try:
         with np.load(path) as arrays:
-            return {name: arrays[name] for name in arrays.files if not only or name in only}
+            found = {name: arrays[name] for name in arrays.files if not only or name in only}
+        for name, array in found.items():
+            # Of a member that is no array, NumPy gives the bytes.
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+                raise ValueError(f"{name} is no array of numbers")
+        return found
     except Exception as error:  # what readers of damaged archives raise has no common class
         raise InputError(f"{path}: cannot be read ({error}); simulate the session again.") from error
 

@@ -80,3 +80,11 @@ def test_a_folder_of_sessions_is_a_list(table, tmp_path):
         read_sessions(tmp_path / "notes")
     with pytest.raises(InputError, match="cannot be read"):
         read_sessions(tmp_path / "nowhere.csv")
+
+
+@pytest.mark.parametrize("may_be_gone", [False, True])
+def test_a_path_that_is_too_long_is_refused(tmp_path, may_be_gone):
+    path = tmp_path / "list.csv"
+    path.write_text(f"object,session\none,{'a' * 5000}\n")
+    with pytest.raises(InputError, match=r"line 2: .* is no path"):
+        read_sessions(path, may_be_gone)

@@ -1,6 +1,7 @@
 """Sessions: pictures agree with their truth, counts with the materials, folders with the layout."""
 
 import json
+import shutil
 
 import numpy as np
 import open3d as o3d
@@ -279,4 +280,24 @@ def test_a_run_without_space_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_folder_without_truth_is_named(tmp_path):
     with pytest.raises(InputError, match="has no truth"):
+        load_truth(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [np.bytes_(b"text"), np.zeros((4, 4)), np.zeros(3), np.zeros((4, 4, 1))],
+    ids=["text", "2d", "1d", "one"],
+)
+def test_truth_of_pixels_that_are_no_weights_is_refused(small_session, tmp_path, content):
+    shutil.copytree(small_session / "truth", tmp_path / "truth")
+    np.savez(tmp_path / "truth" / "pixels" / "apple_000.npz", material_weights=content)
+    with pytest.raises(InputError, match="simulate the session again"):
+        load_truth(tmp_path).reflectance("apple_000")
+
+
+def test_truth_without_a_material_s_spectrum_is_refused(small_session, tmp_path):
+    shutil.copytree(small_session / "truth", tmp_path / "truth")
+    table = tmp_path / "truth" / "endmembers.csv"
+    table.write_text("".join(f"{line.rsplit(',', 1)[0]}\n" for line in table.read_text().splitlines()))
+    with pytest.raises(InputError, match="not of its bands and materials"):
         load_truth(tmp_path)
