@@ -16,34 +16,40 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 import tyro
+from accuracy_front import DEFAULT, TITLES, draw_front, table_rows
 from beyond_the_paper import NOISE, SHADING, noise_free_metrics
-from matplotlib import rc_context
+from jaxtyping import Float
 from paper_tables import PaperTable
 from results_table import read_results, write_results
+from traits_accuracy import spots_on
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
+from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.size import size_of
+from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
+from hsi_sc_nerf.analysis.traits import classified, region_spectrum
 from hsi_sc_nerf.benchmark.configurations import own_configuration, split_words
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
 from hsi_sc_nerf.evaluation.comparison import CompareConfig
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
-from hsi_sc_nerf.export.cloud import read_spectral_ply
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
 from hsi_sc_nerf.models.trained_run import open_run
-from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
-from hsi_sc_nerf.simulate.true_surface import true_reference
+from hsi_sc_nerf.simulate.scene import load_scene
+from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 Part = Literal["budgets", "settings", "presets", "views", "pictures"]
@@ -52,9 +58,6 @@ STEPS_A_TURN = 10
 SETTLING_TURNS = 12
 """Turns that are not timed: by then the occupancy grid has emptied most of the hull."""
 TIMED_TURNS = 8
-CAPTURE_SECONDS = 120
-"""Of a view at the instrument: a SPECIM IQ takes about two minutes."""
-DEFAULT = "default"
 _RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
 _MODEL = "--pipeline.model"
 
@@ -65,8 +68,13 @@ SETTINGS: dict[str, str] = {
     "8 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 8",
     "32 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 32",
     "every band a channel": f"{_MODEL}.head direct",
+    **{f"basis of {size}": f"{_MODEL}.basis-size {size}" for size in (4, 8, 16, 32)},
+    "the paper's hash grid": f"{_MODEL}.match-resolution False",
     "first stage a quarter": "--full-frame.fraction 0.25 --masked.fraction 0.75",
     "no angular loss": f"{_MODEL}.angular-loss-mult 0",
+    "the paper's losses": f"{_MODEL}.angular-loss cosine {_MODEL}.angular-loss-mult 0.25",
+    "predicted normals": f"{_MODEL}.predict-normals True",
+    "pose refinement": f"{_MODEL}.effects pose_refinement",
     "all three effects": f"{_MODEL}.effects view_dependence,still_chamber,pose_refinement",
     "no effects": f"{_MODEL}.effects none",
 }
@@ -80,20 +88,8 @@ PICTURES: dict[str, dict[str, int]] = {
     "102 bands": {"bands": 102},
 }
 
-TITLES = (
-    *("part", "", "training, s", "steps", "memory, MiB", "SAM, rad", "RMSE", "without the noise: SAM"),
-    *(" RMSE", "F at 2 mm, %", "F at 0.5 mm, %", "area, %", "volume, %", "beside the default", "front"),
-)
-_SHOWN = {  # figure: digits after the point; the last six are against the truth
-    "sam": 4,
-    "rmse": 4,
-    "clean_sam": 4,
-    "clean_rmse": 4,
-    "f_2_mm": 1,
-    "f_half_mm": 1,
-    "area_percent": 2,
-    "volume_percent": 2,
-}
+BRUISE_M = 0.02
+"""Diameter of the bruise on the fruit of the part "views", whose area is measured as a trait."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +110,15 @@ class AccuracyAndTime(PaperTable):
     """Evaluate this many of the held-out views."""
     parts: tuple[Part, ...] = ("budgets", "settings", "presets", "views", "pictures")
     """What is measured; none: only draw."""
+    names: tuple[str, ...] = ()
+    """Rows of the parts that are measured; all where none is named."""
     measure_again: bool = False
     """Measure the seconds of a step anew."""
+    default_step_seconds: float | None = None
+    """Seconds of a step with the default settings, as measured in an earlier run; those of the other settings are
+    taken by their ratio to it, so that rows of several runs can be compared."""
+    bruised: tyro.conf.Suppress[bool] = False
+    """Whether the fruit has a bruise: that of the part "views"."""
     picture: Path | None = None
     """PNG file to draw the table to."""
 
@@ -128,8 +131,13 @@ class AccuracyAndTime(PaperTable):
         elif self.measure_again:
             write_json(kept, read_json(kept, "delete it") | {"last": step_seconds(data, self.common, SETTINGS)})
         seconds = read_json(kept, "delete it to measure again")
+        if self.default_step_seconds is not None:
+            seconds = {
+                when: {name: self.default_step_seconds * one / found[DEFAULT] for name, one in found.items()}
+                for when, found in seconds.items()
+            }
         for part in self.parts:
-            rows = self._rows(part, seconds["first"])
+            rows = [row for row in self._rows(part, seconds["first"]) if not self.names or row[0] in self.names]
             found: dict[str, list[dict[str, float]]] = {name: [] for name, *_ in rows}
             for seed in self.seeds:
                 for name, command, words in rows:
@@ -156,16 +164,21 @@ class AccuracyAndTime(PaperTable):
         changes: Mapping[str, Mapping[str, int]] = {
             "budgets": {f"{budget} s": {"iterations": round(budget / seconds[DEFAULT])} for budget in BUDGETS_S},
             "presets": {name: {"iterations": preset[ITERATIONS]} for name, preset in PRESETS["cpu"].items()},
-            "views": {f"{frames} views": {"frames": frames, "iterations": usual} for frames in VIEWS},
+            "views": {
+                f"{frames} views": {"frames": frames, "iterations": usual, "bruised": True} for frames in VIEWS
+            },
             "pictures": {name: {**change, "iterations": usual} for name, change in PICTURES.items()},
         }[part]
         return [(name, replace(self, **change), "") for name, change in changes.items()]  # type: ignore[arg-type]
 
     def _sessions(self) -> tuple[Path, Path]:
         """Dataset of the noisy session; folder of all that belongs to it."""
-        folder = self.output_dir / f"{self.size}-{self.bands}-{self.frames}"
-        self.simulated(self.scene, folder / "noise-free", SHADING)
-        return self.simulated(self.scene, folder / "session", (*NOISE, *SHADING)), folder
+        folder = self.output_dir / f"{self.size}-{self.bands}-{self.frames}{'-bruised' * self.bruised}"
+        scene = load_scene(self.scene)
+        if self.bruised:
+            scene = replace(scene, object=replace(scene.object, bruise_diameter_m=BRUISE_M))
+        self.simulated(scene, folder / "noise-free", SHADING)
+        return self.simulated(scene, folder / "session", (*NOISE, *SHADING)), folder
 
     def judged(self, name: str, words: str, seed: int) -> dict[str, float]:
         """Figures of one run."""
@@ -210,10 +223,10 @@ def step_seconds(data: Path, common: str, settings: Mapping[str, str]) -> dict[s
 def surface_figures(config: Path, session: Path) -> dict[str, float]:
     """F-scores of what a camera sees, percent, and errors of area and volume of the closed cloud, percent."""
     truth = load_truth(session)
-    true_mesh = truth.mesh()
     with TemporaryDirectory() as temporary:
-        options = CloudOptions(num_points=CLOUD_POINTS, bands=("650",))
-        cloud = read_spectral_ply(export_cloud(open_run(config), Path(temporary), options))
+        cloud = read_spectral_ply(
+            export_cloud(open_run(config), Path(temporary), CloudOptions(num_points=CLOUD_POINTS))
+        )
     reference = true_reference(session, CompareConfig(whole_reference=False))
     assert reference.seen is not None
     surface = Surface(cloud.points)
@@ -222,129 +235,39 @@ def surface_figures(config: Path, session: Path) -> dict[str, float]:
         surface.distances_m(reference.surface.points_m[reference.seen]),
     )
     f_scores = [score_at(*distances_m, threshold_m).f_score for threshold_m in (0.002, 0.0005)]
-    mesh = closed_mesh(cloud.points, cloud.normals, MeshConfig(base_height_m=float(true_mesh.vertices[:, 2].min())))
-    found, true = size_of(mesh), size_of(true_mesh)
-    return {
-        "f_2_mm": f_scores[0],
-        "f_half_mm": f_scores[1],
-        "area_percent": 100.0 * (found.area_m2 / true.area_m2 - 1.0),
-        "volume_percent": 100.0 * (found.volume_l / true.volume_l - 1.0),
+    figures = dict(zip(("f_2_mm", "f_half_mm"), f_scores, strict=True))
+    return figures | trait_errors(cloud, TrueSurface.of(truth), truth.camera_to_world[:, :3, 3])
+
+
+def trait_errors(cloud: SpectralCloud, true: TrueSurface, eyes_m: Float[np.ndarray, "frames 3"]) -> dict[str, float]:
+    """Errors of what a laboratory reports, percent: area and volume, spectra of spots, area of a bruise.
+
+    Spots are 10 mm wide; the figure is the median over them of the relative root mean square error. The bruise is
+    told by mixture, and is absent from the figures of a fruit without one.
+    """
+    stands_at_m = float(true.mesh.vertices[:, 2].min())
+    config = MeshConfig(base_height_m=stands_at_m)
+    mesh = closed_mesh(cloud.points, cloud.normals, config)
+    surface = with_spectra(mesh, cloud, config.smoothing_radius_m, MAX_INCIDENCE_DEG)
+    ideal = true.spectral_mesh(eyes_m)
+    found, expected = size_of(mesh), size_of(true.mesh)
+    spots = [
+        relative_rms(*(region_spectrum(one, spot.of(one)).mean for one in (surface, ideal)))
+        for spot in spots_on(ideal)
+    ]
+    errors = {
+        "area_percent": 100.0 * (found.area_m2 / expected.area_m2 - 1.0),
+        "volume_percent": 100.0 * (found.volume_l / expected.volume_l - 1.0),
+        "spots_percent": 100.0 * float(np.median(spots)),
     }
-
-
-def table_rows(part: str, found: Mapping[str, Sequence[Mapping[str, float]]]) -> list[list[str]]:
-    """A row of the table for each name: means and ranges over the seeds."""
-    front = pareto_front(
-        {
-            name: (_mean(runs, "seconds"), _mean(runs, "memory_mib"), _mean(runs, "clean_sam"))
-            for name, runs in found.items()
-        }
-    )
-    rows = []
-    for name, runs in found.items():
-        cells = [f"{_mean(runs, figure):.0f}" for figure in ("seconds", "steps", "memory_mib")]
-        cells += [mean_and_range([run[figure] for run in runs], digits) for figure, digits in _SHOWN.items()]
-        beside = "" if DEFAULT not in found else difference(runs, found[DEFAULT])
-        rows.append([part, name, *cells, beside, "yes" if name in front else ""])
-    return rows
-
-
-def _mean(runs: Sequence[Mapping[str, float]], figure: str) -> float:
-    return float(np.mean([run[figure] for run in runs]))
-
-
-def mean_and_range(values: Sequence[float], digits: int) -> str:
-    """The mean, and the least and the largest of more than one."""
-    mean = f"{np.mean(values):.{digits}f}"
-    return mean if len(values) == 1 else f"{mean} ({min(values):.{digits}f} to {max(values):.{digits}f})"
-
-
-def difference(runs: Sequence[Mapping[str, float]], default: Sequence[Mapping[str, float]]) -> str:
-    """Change of the error against noise-free views, where the ranges of the seeds do not overlap.
-
-    Example:
-        >>> difference([{"clean_sam": 0.02, "clean_rmse": 0.01}], [{"clean_sam": 0.01, "clean_rmse": 0.01}])
-        'SAM +100 %'
-    """
-    told = []
-    for figure, title in (("clean_sam", "SAM"), ("clean_rmse", "RMSE")):
-        mine, others = ([run[figure] for run in one] for one in (runs, default))
-        if min(mine) > max(others) or max(mine) < min(others):
-            told.append(f"{title} {100.0 * (np.mean(mine) / np.mean(others) - 1.0):+.0f} %")
-    return ", ".join(told) or "none"
-
-
-@rc_context(STYLE)
-def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
-    """Error over seconds of training, and surface and spectra over minutes at the instrument.
-
-    Args:
-        path: of the PNG file.
-        rows: of the CSV file.
-    """
-    figure = new_figure(11.0, 4.2)
-    by_time, by_views = figure.subplots(1, 2)
-    column = {title: TITLES.index(title) for title in TITLES}
-
-    def ranges(part: str, title: str) -> np.ndarray:
-        """Mean, least and largest, a row of the part."""
-        return np.array([parse_range(row[column[title]]) for row in rows if row[0] == part])
-
-    def curve(axes: Any, at: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
-        spread = np.abs(values[:, 1:] - values[:, :1]).T
-        axes.errorbar(at, values[:, 0], spread, color=colour, marker="o", markersize=4, capsize=2, label=label)
-
-    seconds = ranges("budgets", "training, s")[:, 0]
-    curve(by_time, seconds, ranges("budgets", "without the noise: SAM"), COLOURS[0], "SAM (rad), default")
-    curve(by_time, seconds, ranges("budgets", " RMSE"), COLOURS[1], "RMSE, default")
-    for title, colour in (("without the noise: SAM", COLOURS[0]), (" RMSE", COLOURS[1])):
-        others = ranges("settings", title)[1:, 0]
-        at = ranges("settings", "training, s")[1:, 0]
-        by_time.plot(at, others, "x", color=colour, markersize=4, label=f"{title.split()[-1]}, one setting changed")
-    by_time.set(xscale="log", yscale="log", xlabel="training (s of one core)", ylabel="error without the noise")
-    by_time.set_xticks(seconds, [f"{second:.0f}" for second in seconds])
-    errors_drawn = (0.01, 0.02, 0.03, 0.04)
-    by_time.set_yticks(errors_drawn, [f"{error:g}" for error in errors_drawn])
-    by_time.minorticks_off()
-    by_time.legend(fontsize=7)
-
-    minutes = np.array([int(row[1].split()[0]) for row in rows if row[0] == "views"]) * CAPTURE_SECONDS / 60.0
-    curve(by_views, minutes, ranges("views", "F at 0.5 mm, %"), COLOURS[2], "F-score at 0.5 mm (%)")
-    by_views.set(xscale="log", xlabel="capture (min, two minutes a view)", ylabel="F-score (%)", xticks=minutes)
-    by_views.set_xticks(minutes, [f"{minute:.0f}" for minute in minutes])
-    by_views.minorticks_off()
-    errors = by_views.twinx()
-    errors.grid(visible=False)
-    curve(errors, minutes, np.abs(ranges("views", "volume, %")), COLOURS[3], "error of the volume (%)")
-    curve(errors, minutes, 100.0 * ranges("views", " RMSE"), COLOURS[1], "RMSE without the noise (% reflectance)")
-    errors.set(ylabel="error (%)", ylim=(0.0, None))
-    by_views.legend(*map(list.__add__, by_views.get_legend_handles_labels(), errors.get_legend_handles_labels()))
-    save_figure(figure, path)
-
-
-def parse_range(cell: str) -> tuple[float, float, float]:
-    """Mean, least and largest of `mean_and_range`.
-
-    Example:
-        >>> parse_range("1.5 (1.0 to 2.0)"), parse_range("3")
-        ((1.5, 1.0, 2.0), (3.0, 3.0, 3.0))
-    """
-    numbers = [float(number) for number in re.findall(r"[-+]?[0-9.]+", cell)]
-    return (numbers[0], numbers[0], numbers[0]) if len(numbers) == 1 else (numbers[0], numbers[1], numbers[2])
-
-
-def pareto_front(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
-    """Names whose costs no other name has all at most, and one less.
-
-    Example:
-        >>> sorted(pareto_front({"a": (1.0, 3.0), "b": (2.0, 2.0), "c": (2.0, 3.0)}))
-        ['a', 'b']
-    """
-
-    def dominates(other: tuple[float, ...], mine: tuple[float, ...]) -> bool:
-        return all(o <= m for o, m in zip(other, mine, strict=True)) and other != mine
-
-    return {name for name, mine in costs.items() if not any(dominates(other, mine) for other in costs.values())}
+    bruise = true.materials.index("bruise")
+    bruised_m2 = float(ideal.areas_m2[ideal.seen & (true.weights[:, bruise] > 0.5)].sum())
+    if bruised_m2 > 0.0:
+        library = SpectralLibrary(true.materials, true.wavelengths_nm, true.endmembers)
+        classes = classified(surface, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0)
+        found_m2 = classes.mixture_areas_m2[classes.names.index("bruise")]
+        errors["bruise_percent"] = 100.0 * (found_m2 / bruised_m2 - 1.0)
+    return errors
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.scene import EFFECTS, load_scene, override
+from hsi_sc_nerf.simulate.scene import EFFECTS, Scene, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
 METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "psnr": ("PSNR, dB", 1)}
@@ -51,11 +51,15 @@ class PaperTable:
     """Folder of the CSV file."""
 
     def simulated(
-        self, name: str, session: Path, effects: Sequence[str] = (), poses: Callable[..., TurntablePoses] = find_poses
+        self,
+        scene: str | Scene,
+        session: Path,
+        effects: Sequence[str] = (),
+        poses: Callable[..., TurntablePoses] = find_poses,
     ) -> Path:
         """Dataset, ``SESSION-data``, of a scene with more effects than its own, simulated if it is missing."""
         if not session.exists():
-            own = load_scene(name)
+            own = load_scene(scene) if isinstance(scene, str) else scene
             scene = override(own, frames=self.frames, size_px=self.size, bands=self.bands, effects=effects)
             # Effects act in a fixed order.
             both = sorted((*own.effects, *scene.effects), key=lambda effect: list(EFFECTS).index(effect.name))

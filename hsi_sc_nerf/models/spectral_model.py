@@ -17,7 +17,6 @@ from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFar
 from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
-from nerfstudio.utils import colormaps
 from torch import Tensor, nn
 from torch.nn import Parameter
 
@@ -27,10 +26,8 @@ from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import (
     metrics_of_regions,
-    spectral_angle_map,
     spectral_angle_mapper,
     spectral_rmse,
-    squared_error_map,
 )
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
@@ -43,9 +40,9 @@ from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupan
 from hsi_sc_nerf.models.optimizers import with_network_group
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
 from hsi_sc_nerf.models.proposals import build_proposals
+from hsi_sc_nerf.models.view_images import view_images
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.plotting import ANGLE_DRAWN_RAD, ERROR_DRAWN
 from hsi_sc_nerf.processing.spectral_subspace import SpectralSubspace, training_subspace
 
 METRIC_STRIDE = 8
@@ -60,6 +57,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     head: Literal["direct", "basis"] = "basis"
     """Output of the field at a sample. direct: the reflectance in every band. basis: a few coefficients in a basis of
     spectra that is found in the training pixels; they are decoded to all bands once a pixel."""
+    basis_size: int | None = None
+    """Spectra in the basis of the head "basis". None: as many as stand out of the noise, at most 16."""
     effects: str = "auto"
     """What is simulated, joined by commas: view_dependence (a point's spectrum depends on the viewing direction, by
     gloss or by lamps before which the object turns), still_chamber (the background is a picture of the chamber, taken
@@ -113,6 +112,8 @@ class SpectralModelConfig(NerfactoModelConfig):
                     "an occupancy grid needs a box; take --pipeline.model.num-proposal-iterations 2 with "
                     "--pipeline.model.disable-scene-contraction False."
                 )
+            if self.basis_size is not None and self.basis_size < 1:
+                raise InputError("--pipeline.model.basis-size must be at least 1.")
             if self.head == "basis" and self.background == "last-sample":
                 raise InputError(
                     "--pipeline.model.background last-sample needs a value in every band at each sample; take "
@@ -152,7 +153,7 @@ class SpectralModel(NerfactoModel):
         from_checkpoint: bool = metadata.get(FROM_CHECKPOINT, False)
         subspace, self.decoder = None, nn.Identity()
         if config.head == "basis":
-            subspace = training_subspace(dataset, metadata["frames"])
+            subspace = training_subspace(dataset, metadata["frames"], config.basis_size)
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
         self.field = self._build_field(dataset, contraction, subspace)
@@ -342,17 +343,8 @@ class SpectralModel(NerfactoModel):
     def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""
         truth, valid = self._measured(batch)
-        rendered = outputs["spectral"].to(self.device)
-        mask = batch["mask"].to(self.device)[..., 0].bool()
-        metrics = metrics_of_regions(rendered, truth, {"": mask, "full_": None}, valid)
-
-        angle = spectral_angle_map(rendered, truth, valid).nan_to_num()[..., None] / ANGLE_DRAWN_RAD[1]
-        error = squared_error_map(rendered, truth, valid).nan_to_num().sqrt()[..., None] / ERROR_DRAWN[1]
-        images = {
-            "img": torch.cat([truth[..., self.rgb_bands], rendered[..., self.rgb_bands]], dim=1).clamp(0.0, 1.0),
-            "spectral_angle": colormaps.apply_colormap(angle.clamp(0.0, 1.0)),
-            "error": colormaps.apply_colormap(error.float().clamp(0.0, 1.0)),
-            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
-            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
-        }
-        return metrics, images
+        outputs = {name: image.to(self.device) for name, image in outputs.items()}
+        metrics = metrics_of_regions(
+            outputs["spectral"], truth, {"": batch["mask"][..., 0].bool(), "full_": None}, valid
+        )
+        return metrics, view_images(outputs, truth, valid, self.rgb_bands)

@@ -140,6 +140,7 @@ class StagedTrainer(Trainer):
         self._trained_step, self._steps_since_update = -1, 0
         self._guard, self._risen_loss = NonFiniteGuard(), RisenLossGuard()
         self._captured: CapturedSteps | None = None
+        self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
         try:
             if path := self._checkpoint_to_load():
                 self._model_config.effects = resumed_effects(self._model_config.effects, path)
@@ -150,8 +151,7 @@ class StagedTrainer(Trainer):
             end_stopped_run(self.config.get_checkpoint_dir())
         # Evaluation and export build what was trained, whatever becomes of the dataset.
         self._model_config.effects = effects_setting(self._model.effects)
-        self.config.save_config()
-        config = self.config
+        (config := self.config).save_config()
         plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
         plain = plain and config.capture_steps and not config.gradient_accumulation_steps
         if self.pipeline.device.type == "cuda" and plain:

@@ -56,15 +56,18 @@ class SpectralSubspace:
         return self.mean_spectrum @ self.basis / np.sqrt(len(self.basis))
 
 
-def training_subspace(dataset: PackedDataset, frames: Sequence[PackedFrame]) -> SpectralSubspace:
+def training_subspace(
+    dataset: PackedDataset, frames: Sequence[PackedFrame], rank: int | None = None
+) -> SpectralSubspace:
     """The subspace of training pixels, half of which lie on the object.
 
     Args:
         dataset: its uncertainty is the noise; where it has none, the noise is estimated from the spectra.
         frames: training frames.
+        rank: size of the basis; None for as many directions as stand out of the noise.
 
     Raises:
-        InputError: too few pixels are free of flagged values.
+        InputError: too few pixels are free of flagged values, or there are fewer bands than ``rank``.
 
     Example:
         >>> dataset = open_packed("apple_01-data")
@@ -73,13 +76,14 @@ def training_subspace(dataset: PackedDataset, frames: Sequence[PackedFrame]) -> 
     """
     spectra, valid = sample_training_spectra(frames)
     noise = None if dataset.uncertainty is None else pixel_noise(dataset.uncertainty, spectra)
-    return find_subspace(spectra, noise, valid)
+    return find_subspace(spectra, noise, valid, rank)
 
 
 def find_subspace(
     spectra: Float[np.ndarray, "n bands"],
     noise: Float[np.ndarray, "*n bands"] | None = None,
     valid: Bool[np.ndarray, "n bands"] | None = None,
+    rank: int | None = None,
 ) -> SpectralSubspace:
     """The subspace of spectra above their noise.
 
@@ -90,9 +94,10 @@ def find_subspace(
         spectra: reflectance.
         noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
         valid: which values are measurements; spectra with any other are left out. All if not given.
+        rank: number of directions, from the strongest on; None for those that count, at most `MAX_RANK`.
 
     Raises:
-        InputError: too few spectra have all bands.
+        InputError: too few spectra have all bands, or there are fewer bands than ``rank``.
         ValueError: the noise is not above 0.
     """
     complete = np.ones(len(spectra), bool) if valid is None else valid.all(axis=1)
@@ -112,8 +117,14 @@ def find_subspace(
     noise_scale = band_noise * np.sqrt(np.mean((deviation / band_noise) ** 2, axis=1, keepdims=True))
     # The triangle of a QR decomposition has the singular values and directions of the whole.
     _, singular, directions = np.linalg.svd(np.linalg.qr(sample / noise_scale, mode="r"))
-    above_noise = int((singular > _largest_noise_value(deviation / noise_scale)).sum())
-    rank = max(1, min(above_noise, MAX_RANK))
+    if rank is None:
+        above_noise = int((singular > _largest_noise_value(deviation / noise_scale)).sum())
+        rank = max(1, min(above_noise, MAX_RANK))
+    elif rank > len(singular):
+        raise InputError(
+            f"the dataset has {len(singular)} bands, too few for a basis of {rank} spectra; take a smaller "
+            "--pipeline.model.basis-size."
+        )
 
     span, _ = np.linalg.qr((directions[:rank] * band_noise).T)
     _, _, rotation = np.linalg.svd(sample @ span, full_matrices=False)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from nerfstudio.utils import profiler
 from scipy.ndimage import distance_transform_edt
-from small_trainer import trainer
+from small_trainer import STEPS, trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
@@ -219,3 +219,11 @@ def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_data
     assert later["step"] > state["step"]
     with pytest.raises(SystemExit, match=r"hsi-sc-nerf: [^\n]*--max-num-iterations"):
         trainer(tiny_dataset, tmp_path / "other", load_dir=made.checkpoint_dir)
+
+
+def test_single_steps_run_without_the_loop_of_nerfstudio(tiny_dataset, tmp_path):
+    made = trainer(tiny_dataset, tmp_path)
+    for step in range(STEPS):
+        assert not made.stop_training
+        made.train_iteration(step)
+    assert made.stop_training

@@ -57,6 +57,22 @@ def test_the_rank_is_found_in_noise(rank, known):
     assert projection_error(true, subspace) < 0.15 * np.sqrt(np.mean(deviation**2))
 
 
+@pytest.mark.parametrize("rank", [1, 4, 9, BANDS])
+def test_the_rank_can_be_given(rank):
+    _, spectra, deviation = noisy(1500, 4)
+    subspace = find_subspace(spectra, deviation, rank=rank)
+    assert subspace.basis.shape == (BANDS, rank)
+    np.testing.assert_allclose(subspace.basis.T @ subspace.basis, np.eye(rank), atol=1e-12)
+    shared = find_subspace(spectra, deviation).basis[:, : min(rank, 4)]
+    assert projection_error(shared.T, subspace) < 0.02  # the strongest directions come first
+
+
+def test_a_rank_above_the_number_of_bands_is_refused():
+    _, spectra, deviation = noisy(1500, 3)
+    with pytest.raises(InputError, match="--pipeline.model.basis-size"):
+        find_subspace(spectra, deviation, rank=BANDS + 1)
+
+
 def test_noise_alone_has_no_rank():
     deviation = uneven_noise(np.full((400, BANDS), 0.3))
     noise = deviation * np.random.default_rng(3).standard_normal(deviation.shape)
