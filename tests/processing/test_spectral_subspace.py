@@ -69,7 +69,7 @@ def test_the_rank_can_be_given(rank):
 
 def test_a_rank_above_the_number_of_bands_is_refused():
     _, spectra, deviation = noisy(1500, 3)
-    with pytest.raises(InputError, match="--pipeline.model.basis-size"):
+    with pytest.raises(InputError, match="basis-size"):
         find_subspace(spectra, deviation, rank=BANDS + 1)
 
 
