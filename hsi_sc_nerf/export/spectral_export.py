@@ -30,6 +30,7 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
+from hsi_sc_nerf.surface.outline_opacity import outline_opacity
 from hsi_sc_nerf.surface.regions import (
     EVERYWHERE,
     Region,
@@ -88,7 +89,10 @@ def render_cloud(run: TrainedRun, options: CloudOptions, name: str = "") -> Clou
     renders = render_depth_maps(run.model, dataset.cameras, masks, batch)
     box_m = run.dataset.scene_box_m if options.keep_turntable else run.dataset.object_box_m
     region = _region(run, renders, options, painted_masks)
-    surface = sample_surface_points(run.model, renders, options.num_points, batch, run.to_scene(box_m), region)
+    at_outline = outline_opacity(run, batch)
+    surface = sample_surface_points(
+        run.model, renders, options.num_points, batch, run.to_scene(box_m), region, at_outline
+    )
     if len(surface) < options.num_points:
         CONSOLE.print(f"[yellow]Only {len(surface):,} points were found: the region holds hardly any surface.")
     if options.remove_outliers:

@@ -23,6 +23,7 @@ from hsi_sc_nerf.light.views import TurningElements, Views
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
+from hsi_sc_nerf.surface.outline_opacity import outline_opacity
 from hsi_sc_nerf.surface.surface_points import SurfaceMesh, surface_mesh
 
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
@@ -99,7 +100,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     sampler, dataset = run.manager.train_pixel_sampler, run.dataset
     cameras, batch = run.manager.train_dataset.cameras, run.model.config.eval_num_rays_per_chunk
     renders = render_depth_maps(run.model, cameras, sampler.masks, batch)
-    mesh = surface_mesh(run.model, renders, run.to_scene(dataset.object_box_m), batch)
+    mesh = surface_mesh(run.model, renders, run.to_scene(dataset.object_box_m), batch, outline_opacity(run, batch))
     if mesh is not None:
         mesh = seen_part(mesh, renders)
     if mesh is None or not len(mesh.triangles):

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from hsi_sc_nerf.surface.surface_depth import opacity_crossing_depth
 
-TOUCHING_OPACITY = 0.5
-"""Opacity that a ray collects which touches the surface: the object covers half of its pixel."""
 REACH = 0.055
 """A touching ray is followed this far to both sides (about 6 mm). On a sphere of 35 mm it is in the soft density for
 5 mm to both sides; further away it meets other parts of the object."""
@@ -45,8 +43,9 @@ def move_to_silhouettes(
     density_fn: Callable[[Float[Tensor, "*n 3"]], Float[Tensor, "*n 1"]],
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
+    touching_opacity: float = 0.5,
 ) -> Float[Tensor, "n 3"]:
-    """Points near the surface, moved along their normals to where a touching ray collects half an opacity.
+    """Points near the surface, moved along their normals to where a touching ray collects its opacity.
 
     Into the object, the density near its surface grows exponentially, and so does the optical depth of a touching
     ray: steps of Newton's method in its logarithm are nearly exact. Nothing touches a hollow. The surface there is
@@ -56,6 +55,7 @@ def move_to_silhouettes(
         density_fn: density of the model at points, per scene unit.
         points: within a millimetre or two of the surface, scene units.
         normals: outward unit vectors.
+        touching_opacity: opacity that a ray collects which touches the surface, in (0, 1).
 
     Example:
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
@@ -67,7 +67,7 @@ def move_to_silhouettes(
         touched &= touches
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
         folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*FOLDING)
-        inwards = folding * (-math.log1p(-TOUCHING_OPACITY) / depth).log()
+        inwards = folding * (-math.log1p(-touching_opacity) / depth).log()
         moved = moved - inwards.clamp(-max_step, max_step)[:, None] * normals
     if touched.all():
         return moved
@@ -79,7 +79,7 @@ def move_to_silhouettes(
     if touched.any():
         at_surface = ((points - moved) * normals).sum(dim=-1, keepdim=True)
         collected = collected.gather(1, torch.searchsorted(depths, at_surface).clamp_max(SEARCH_STEPS))
-        opacity = min(float(-torch.expm1(-collected[touched].median())), TOUCHING_OPACITY)
+        opacity = min(float(-torch.expm1(-collected[touched].median())), touching_opacity)
     in_hollow = opacity_crossing_depth(depths.expand(len(points), -1), densities, opacity)
     return torch.where(touched[:, None], moved, points - in_hollow[:, None] * normals)
 

@@ -90,6 +90,7 @@ def sample_surface_points(
     rays_per_batch: int,
     box: Float[np.ndarray, "2 3"],
     region: Region = EVERYWHERE,
+    touching_opacity: float = 0.5,
 ) -> SurfacePoints:
     """Points spread evenly over the surface that at least one training frame sees.
 
@@ -100,11 +101,12 @@ def sample_surface_points(
         rays_per_batch: rays searched at a time.
         box: minimum and maximum of the object, which exclude the container.
         region: the points to keep.
+        touching_opacity: as in `move_to_silhouettes`.
 
     Raises:
         InputError: the model holds no object, or the region holds none of it.
     """
-    mesh = surface_mesh(model, renders, box, rays_per_batch)
+    mesh = surface_mesh(model, renders, box, rays_per_batch, touching_opacity)
     if mesh is None:
         raise InputError(
             f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
@@ -173,7 +175,11 @@ def _seen(renders: DepthRenders, mesh: SurfaceMesh, candidates: Float[np.ndarray
 
 @torch.no_grad()
 def surface_mesh(
-    model: SpectralModel, renders: DepthRenders, box: Float[np.ndarray, "2 3"], points_per_batch: int
+    model: SpectralModel,
+    renders: DepthRenders,
+    box: Float[np.ndarray, "2 3"],
+    points_per_batch: int,
+    touching_opacity: float = 0.5,
 ) -> SurfaceMesh | None:
     """The fused mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it.
 
@@ -182,6 +188,7 @@ def surface_mesh(
         renders: depth maps of its training cameras.
         box: minimum and maximum of the mesh, scene units.
         points_per_batch: vertices moved at a time.
+        touching_opacity: as in `move_to_silhouettes`.
 
     Returns:
         The mesh; None if the frames show no surface in the box.
@@ -201,7 +208,7 @@ def surface_mesh(
         for start in range(0, len(vertices), points_per_batch):
             rows = slice(start, start + points_per_batch)
             before, outward = (torch.from_numpy(a[rows]).float().to(model.device) for a in (mesh.vertices, normals))
-            after = move_to_silhouettes(density_fn, before, outward)
+            after = move_to_silhouettes(density_fn, before, outward, touching_opacity)
             inwards = after[:, None] - outward[:, None] * torch.arange(0.0, OPAQUE_WITHIN, _STEP).to(after)[:, None]
             opacity = 1.0 - torch.exp(-density_fn(inwards)[..., 0].sum(dim=1) * _STEP)
             vertices[rows] = after.cpu().numpy()

@@ -36,6 +36,14 @@ def test_a_ball_is_found_whatever_its_radius(radius):
     torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), radius), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("opacity", [0.3, 0.6, 0.8])
+def test_touching_rays_collect_the_opacity_that_is_given(opacity):
+    points, normals = around(0.1)
+    density = touching_density(0.1) * math.log1p(-opacity) / math.log(0.5)
+    moved = move_to_silhouettes(soft(lambda p: p.norm(dim=-1) - 0.1, density), points, normals, opacity)
+    torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), 0.1), atol=1e-3, rtol=0)
+
+
 def test_the_opacity_from_the_front_would_depend_on_the_radius():
     """Why there is no such threshold: it would be three times as large on the small ball as on the large one."""
     assert touching_density(0.03) / touching_density(0.25) == pytest.approx(2.9, abs=0.1)

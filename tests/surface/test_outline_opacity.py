@@ -1,0 +1,91 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.surface.outline_opacity import (
+    HALF,
+    PLAUSIBLE_OPACITY,
+    half_coverage_opacity,
+    outline_pixels,
+    pixel_coverage,
+)
+
+SIDE, BANDS, RADIUS_PX = 64, 12, 20.0
+CENTRES_PX = ((32.0, 32.0), (30.3, 33.6), (33.1, 30.4), (31.7, 32.2), (32.4, 29.9))
+FRUIT, WALL = np.linspace(0.1, 0.5, BANDS), np.full(BANDS, 0.9)
+
+
+def coverage_of_a_disc(centre_px, supersampling=16):
+    ticks = (np.arange(SIDE * supersampling) + 0.5) / supersampling
+    inside = np.hypot(ticks[:, None] - centre_px[0], ticks[None] - centre_px[1]) < RADIUS_PX
+    return inside.reshape(SIDE, supersampling, SIDE, supersampling).mean(axis=(1, 3))
+
+
+COVERAGE = np.stack([coverage_of_a_disc(centre) for centre in CENTRES_PX])
+
+
+def sampler(fruit=FRUIT, flagged=()):
+    """Reads pictures of a disc that is as bright as its coverage, darker at the top than at the bottom."""
+    light = np.linspace(0.7, 1.0, SIDE)[:, None, None]
+    spectra = (COVERAGE[..., None] * fruit + (1.0 - COVERAGE[..., None]) * WALL) * light
+
+    def at(pixels):
+        batch = {"spectral": spectra[tuple(pixels.T)].astype(np.float32)}
+        if flagged:
+            batch["valid"] = np.ones(batch["spectral"].shape, bool)
+            batch["valid"][:, list(flagged)] = False
+            batch["spectral"][:, list(flagged)] = 0.0
+        return batch
+
+    return SimpleNamespace(masks=COVERAGE >= 0.5, at=at)
+
+
+def everywhere(frame):
+    return np.ones((SIDE, SIDE), bool)
+
+
+@pytest.mark.parametrize("flagged", [(), (3, 7)])
+def test_coverage_is_that_of_the_area(flagged):
+    pixels = outline_pixels(COVERAGE >= 0.5, everywhere)
+    assert len(pixels[0]) > 1000
+    found = pixel_coverage(sampler(flagged=flagged), *pixels)
+    np.testing.assert_allclose(found, COVERAGE[tuple(pixels[0].T)], atol=0.06)
+    assert abs(np.mean(found - COVERAGE[tuple(pixels[0].T)])) < 0.01
+
+
+def test_pixels_beside_the_outline_are_pure_and_before_the_chamber():
+    upper = everywhere(0)
+    upper[32:] = False
+    on, inside, outside = outline_pixels(COVERAGE >= 0.5, lambda frame: upper)
+    assert (COVERAGE[tuple(inside.T)] == 1.0).all()
+    assert (COVERAGE[tuple(outside.T)] == 0.0).all()
+    assert (on[:, 1] < 32).all()
+    assert (outside[:, 1] < 32).all()
+    assert set(on[:, 0]) == set(range(len(CENTRES_PX)))
+
+
+@pytest.mark.parametrize("masks", [np.zeros((2, 8, 8), bool), np.ones((1, 8, 8), bool)])
+def test_masks_without_an_outline_give_no_pixels(masks):
+    assert [len(part) for part in outline_pixels(masks, lambda frame: np.ones((8, 8), bool))] == [0, 0, 0]
+
+
+def test_an_object_like_the_wall_tells_no_coverage():
+    pixels = outline_pixels(COVERAGE >= 0.5, everywhere)
+    assert np.isnan(pixel_coverage(sampler(fruit=WALL - 0.01), *pixels)).all()
+
+
+@pytest.mark.parametrize("power", [0.5, 0.74, 1.0])
+def test_the_opacity_at_half_a_coverage_is_measured(power):
+    found = half_coverage_opacity(sampler(), everywhere, lambda pixels: COVERAGE[tuple(pixels.T)] ** power)
+    assert found == pytest.approx(0.5**power, abs=0.03)
+
+
+def test_half_is_taken_where_nothing_tells_the_coverage():
+    found = half_coverage_opacity(sampler(fruit=WALL), everywhere, lambda pixels: np.ones(len(pixels)))
+    assert found == HALF
+
+
+def test_an_implausible_opacity_is_bounded():
+    found = half_coverage_opacity(sampler(), everywhere, lambda pixels: np.ones(len(pixels)))
+    assert found == PLAUSIBLE_OPACITY[1]
