@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.packed.pixels import PixelReader
+from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 
 RADIUS = 0.5
 SCALE = 10.0
@@ -117,13 +117,19 @@ def known_run(folder) -> SimpleNamespace:
         cube = np.where(masks[-1][..., None], true_spectra(points), 0.1)
         frames.append(packed_frame(folder, f"ball_{index:03d}"))
         write_packed_cube(frames[-1].cube_path, pack(cube), WAVELENGTHS_NM)
-    sampler = SimpleNamespace(reader=PixelReader([frame.cube() for frame in frames]), masks=np.stack(masks))
+    reader = PixelReader([frame.cube() for frame in frames])
+    sampler = PixelSampler(reader, np.stack(masks), 1, seed=0, has_flagged=False)
     half_m = RADIUS / SCALE + 0.005
     box_m = CENTRE_M + np.array([[-half_m] * 3, [half_m] * 3])
     return SimpleNamespace(
         model=BallModel(),
         dataset=SimpleNamespace(
-            object_box_m=box_m, scene_box_m=box_m + np.array([[-0.03], [0.03]]), flagged_values=0
+            object_box_m=box_m,
+            scene_box_m=box_m + np.array([[-0.03], [0.03]]),
+            flagged_values=0,
+            intrinsics=LENS,
+            distortion=np.zeros(4),
+            container=None,
         ),
         manager=SimpleNamespace(
             train_pixel_sampler=sampler, train_dataset=SimpleNamespace(cameras=ball_cameras(), frames=frames)
