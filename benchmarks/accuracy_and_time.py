@@ -260,8 +260,8 @@ def trait_errors(cloud: SpectralCloud, true: TrueSurface, eyes_m: Float[np.ndarr
         "volume_percent": 100.0 * (found.volume_l / expected.volume_l - 1.0),
         "spots_percent": 100.0 * float(np.median(spots)),
     }
-    bruise = true.materials.index("bruise")
-    bruised_m2 = float(ideal.areas_m2[ideal.seen & (true.weights[:, bruise] > 0.5)].sum())
+    is_bruise = np.array(true.materials) == "bruise"
+    bruised_m2 = float(ideal.areas_m2[ideal.seen & (true.weights[:, is_bruise].sum(axis=1) > 0.5)].sum())
     if bruised_m2 > 0.0:
         library = SpectralLibrary(true.materials, true.wavelengths_nm, true.endmembers)
         classes = classified(surface, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0)

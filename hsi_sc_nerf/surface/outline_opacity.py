@@ -4,6 +4,9 @@ A pixel on the outline shows the object in a part of its area, its coverage. The
 is: it lies between the chamber's spectrum beside the outline and the object's inside of it. A trained model may
 render the same spectrum by more of a paler object, because nothing but the pixel's spectrum is taught there. So half
 a coverage is not half an opacity in general, and the surface is looked for at the opacity that is measured.
+
+Gloss makes the rim of an object resemble the chamber, which is mirrored there, and no coverage can be told. It shows
+in the rim's whole pixels as well, so that it is noticed.
 """
 
 from __future__ import annotations
@@ -25,11 +28,17 @@ HALF = 0.5
 PLAUSIBLE_OPACITY = (0.3, 0.8)
 MEASURED_COVERAGE = (0.4, 0.6)
 FEWEST_PIXELS = 50
-MOST_PIXELS = 10_000
+MOST_PIXELS, MOST_FRAMES = 10_000, 24
 LEAST_CONTRAST = 0.05
 """Root mean square over the bands between object and chamber, reflectance: less tells no coverage."""
-OUTLINE_PX, BESIDE_PX = 1.5, 2.5
-"""Pixels this near to the mask's edge may be covered in part. The pure spectra are taken this far from them."""
+OUTLINE_PX = (-1.5, 1.5)
+"""Depths inside the mask at which pixels may be covered in part."""
+RIM_PX = (1.5, 2.5)
+"""Depths of the first pixels that are covered wholly."""
+PURE_PX, DEEP_PX = 2.5, 5.0
+"""Spectra of the object and the chamber are taken this far from the outline; those that the rim is compared with."""
+RIM_CHANGE = 0.01
+"""Largest median change of the rim's coverage that is taken for none: matte fruit have 0.001, a glossy one 0.02."""
 _SMOOTHING_PX = 1.0
 
 
@@ -70,56 +79,69 @@ def half_coverage_opacity(
     before_chamber: Callable[[int], Bool[np.ndarray, "lines samples"]],
     opacity_of: Callable[[Int[np.ndarray, "n 3"]], Float[np.ndarray, "n"]],
 ) -> float:
-    """Median opacity of the pixels that the object covers by `MEASURED_COVERAGE`; `HALF` if there are too few.
+    """Median opacity of the pixels that the object covers by `MEASURED_COVERAGE`.
+
+    `HALF` if there are too few such pixels, or if the rim's whole pixels already seem to be covered by less (gloss).
 
     Args:
         sampler: has the masks and reads the spectra.
         before_chamber: pixels of a frame, given by its index, that show the object or the chamber.
         opacity_of: the model's opacity at pixels (frame, line, sample).
     """
-    pixels = outline_pixels(sampler.masks, before_chamber)
-    every = max(1, -(-len(pixels[0]) // MOST_PIXELS))
-    on, inside, outside = (part[::every] for part in pixels)
-    coverage = pixel_coverage(sampler, on, inside, outside)
+    on, coverage = _covered(sampler, outline_pixels(sampler.masks, before_chamber, OUTLINE_PX, PURE_PX))
+    _, of_rim = _covered(sampler, outline_pixels(sampler.masks, before_chamber, RIM_PX, DEEP_PX))
     low, high = MEASURED_COVERAGE
     half = on[(coverage > low) & (coverage < high)]
-    if len(half) < FEWEST_PIXELS:
+    if min(len(half), len(of_rim)) < FEWEST_PIXELS or abs(np.median(of_rim) - 1.0) > RIM_CHANGE:
         return HALF
     return float(np.clip(np.median(opacity_of(half)), *PLAUSIBLE_OPACITY))
+
+
+def _covered(
+    sampler: PixelSampler, pixels: tuple[Int[np.ndarray, "n 3"], ...]
+) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Some of the pixels of `outline_pixels`, and their coverage where it can be told."""
+    on, inside, outside = (part[:: max(1, -(-len(part) // MOST_PIXELS))] for part in pixels)
+    coverage = pixel_coverage(sampler, on, inside, outside)
+    told = np.isfinite(coverage)
+    return on[told], coverage[told]
 
 
 def outline_pixels(
     masks: Bool[np.ndarray, "frames lines samples"],
     before_chamber: Callable[[int], Bool[np.ndarray, "lines samples"]],
+    depths_px: tuple[float, float],
+    inside_px: float,
 ) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"]]:
-    """Pixels on the outlines, and for each one inside and one outside of it, across the outline.
+    """Pixels near the outlines of some frames, and for each one inside and one outside of it, across the outline.
 
     Args:
         masks: the object in each frame.
         before_chamber: pixels of a frame, given by its index, that show the object or the chamber.
+        depths_px: least and largest depth of the pixels inside the mask; negative outside of it.
+        inside_px: depth of the pixels inside. Those outside are `PURE_PX` beside the mask.
 
     Returns:
-        Pixels (frame, line, sample): on the outline, on the object beside it, and on the chamber beside it.
+        Pixels (frame, line, sample): near the outline, on the object beside it, and on the chamber beside it.
     """
-    found: list[tuple[np.ndarray, ...]] = []
-    for frame, mask in enumerate(masks):
+    found = [(np.zeros((0, 3), int),) * 3]
+    for frame in range(0, len(masks), -(-len(masks) // MOST_FRAMES)):
+        mask = masks[frame]
         if not mask.any() or mask.all():
             continue
-        # Distance from the mask's edge, positive inside; there is no pixel at 0.
+        # There is no pixel at depth 0.
         depth_px = ndimage.distance_transform_edt(mask) - ndimage.distance_transform_edt(~mask)
         chamber = before_chamber(frame)
-        on = np.argwhere((np.abs(depth_px) <= OUTLINE_PX) & chamber)
+        on = np.argwhere((depth_px >= depths_px[0]) & (depth_px <= depths_px[1]) & chamber)
         inwards = np.stack(np.gradient(ndimage.gaussian_filter(depth_px, _SMOOTHING_PX)), axis=-1)[tuple(on.T)]
         inwards /= np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-9)
-        inside, outside = (np.rint(on + sign * BESIDE_PX * inwards).astype(int) for sign in (1.0, -1.0))
+        of_on = depth_px[tuple(on.T)][:, None]
+        inside, outside = (np.rint(on + (to_px - of_on) * inwards).astype(int) for to_px in (inside_px, -PURE_PX))
         within = [((places >= 0) & (places < mask.shape)).all(axis=1) for places in (inside, outside)]
         on, inside, outside = (places[within[0] & within[1]] for places in (on, inside, outside))
-        pure = (depth_px[tuple(inside.T)] >= OUTLINE_PX) & (depth_px[tuple(outside.T)] <= -OUTLINE_PX)
+        pure = (depth_px[tuple(inside.T)] >= inside_px - 1.0) & (depth_px[tuple(outside.T)] <= 1.0 - PURE_PX)
         pure &= chamber[tuple(outside.T)]
         found.append(tuple(np.insert(places[pure], 0, frame, axis=1) for places in (on, inside, outside)))
-    if not found:
-        empty = np.zeros((0, 3), int)
-        return empty, empty, empty
     on, inside, outside = (np.concatenate(part) for part in zip(*found, strict=True))
     return on, inside, outside
 

@@ -5,7 +5,9 @@ import pytest
 
 from hsi_sc_nerf.surface.outline_opacity import (
     HALF,
+    OUTLINE_PX,
     PLAUSIBLE_OPACITY,
+    PURE_PX,
     half_coverage_opacity,
     outline_pixels,
     pixel_coverage,
@@ -25,10 +27,14 @@ def coverage_of_a_disc(centre_px, supersampling=16):
 COVERAGE = np.stack([coverage_of_a_disc(centre) for centre in CENTRES_PX])
 
 
-def sampler(fruit=FRUIT, flagged=()):
-    """Reads pictures of a disc that is as bright as its coverage, darker at the top than at the bottom."""
+def sampler(fruit=FRUIT, flagged=(), gloss=0.0):
+    """Reads pictures of a disc, darker at the top than at the bottom, whose rim mirrors the wall."""
     light = np.linspace(0.7, 1.0, SIDE)[:, None, None]
-    spectra = (COVERAGE[..., None] * fruit + (1.0 - COVERAGE[..., None]) * WALL) * light
+    pixels = np.indices((SIDE, SIDE)) + 0.5
+    from_centre = np.stack([np.hypot(*(pixels - np.array(centre)[:, None, None])) for centre in CENTRES_PX])
+    mirrored = gloss * (np.minimum(from_centre / RADIUS_PX, 1.0) ** 8)[..., None]
+    rim = (1.0 - mirrored) * fruit + mirrored * WALL
+    spectra = (COVERAGE[..., None] * rim + (1.0 - COVERAGE[..., None]) * WALL) * light
 
     def at(pixels):
         batch = {"spectral": spectra[tuple(pixels.T)].astype(np.float32)}
@@ -47,7 +53,7 @@ def everywhere(frame):
 
 @pytest.mark.parametrize("flagged", [(), (3, 7)])
 def test_coverage_is_that_of_the_area(flagged):
-    pixels = outline_pixels(COVERAGE >= 0.5, everywhere)
+    pixels = outline_pixels(COVERAGE >= 0.5, everywhere, OUTLINE_PX, PURE_PX)
     assert len(pixels[0]) > 1000
     found = pixel_coverage(sampler(flagged=flagged), *pixels)
     np.testing.assert_allclose(found, COVERAGE[tuple(pixels[0].T)], atol=0.06)
@@ -57,7 +63,7 @@ def test_coverage_is_that_of_the_area(flagged):
 def test_pixels_beside_the_outline_are_pure_and_before_the_chamber():
     upper = everywhere(0)
     upper[32:] = False
-    on, inside, outside = outline_pixels(COVERAGE >= 0.5, lambda frame: upper)
+    on, inside, outside = outline_pixels(COVERAGE >= 0.5, lambda frame: upper, OUTLINE_PX, PURE_PX)
     assert (COVERAGE[tuple(inside.T)] == 1.0).all()
     assert (COVERAGE[tuple(outside.T)] == 0.0).all()
     assert (on[:, 1] < 32).all()
@@ -67,11 +73,15 @@ def test_pixels_beside_the_outline_are_pure_and_before_the_chamber():
 
 @pytest.mark.parametrize("masks", [np.zeros((2, 8, 8), bool), np.ones((1, 8, 8), bool)])
 def test_masks_without_an_outline_give_no_pixels(masks):
-    assert [len(part) for part in outline_pixels(masks, lambda frame: np.ones((8, 8), bool))] == [0, 0, 0]
+    assert [len(part) for part in outline_pixels(masks, lambda frame: ~masks[0] | True, OUTLINE_PX, PURE_PX)] == [
+        0,
+        0,
+        0,
+    ]
 
 
 def test_an_object_like_the_wall_tells_no_coverage():
-    pixels = outline_pixels(COVERAGE >= 0.5, everywhere)
+    pixels = outline_pixels(COVERAGE >= 0.5, everywhere, OUTLINE_PX, PURE_PX)
     assert np.isnan(pixel_coverage(sampler(fruit=WALL - 0.01), *pixels)).all()
 
 
@@ -84,6 +94,14 @@ def test_the_opacity_at_half_a_coverage_is_measured(power):
 def test_half_is_taken_where_nothing_tells_the_coverage():
     found = half_coverage_opacity(sampler(fruit=WALL), everywhere, lambda pixels: np.ones(len(pixels)))
     assert found == HALF
+
+
+def test_half_is_taken_where_the_rim_mirrors_the_chamber():
+    for gloss, expected in ((0.0, 0.5**0.5), (0.3, HALF)):
+        found = half_coverage_opacity(
+            sampler(gloss=gloss), everywhere, lambda pixels: COVERAGE[tuple(pixels.T)] ** 0.5
+        )
+        assert found == pytest.approx(expected, abs=0.03)
 
 
 def test_an_implausible_opacity_is_bounded():
