@@ -6,7 +6,7 @@ render the same spectrum by more of a paler object, because nothing but the pixe
 a coverage is not half an opacity in general, and the surface is looked for at the opacity that is measured.
 
 Gloss makes the rim of an object resemble the chamber, which is mirrored there, and no coverage can be told. It shows
-in the rim's whole pixels as well, so that it is noticed.
+in the rim's whole pixels as well, which are brighter than those further inside.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ RIM_PX = (1.5, 2.5)
 """Depths of the first pixels that are covered wholly."""
 PURE_PX, DEEP_PX = 2.5, 5.0
 """Spectra of the object and the chamber are taken this far from the outline; those that the rim is compared with."""
-RIM_CHANGE = 0.01
-"""Largest median change of the rim's coverage that is taken for none: matte fruit have 0.001, a glossy one 0.02."""
+GLOSSY_RIM = 1.025
+"""Median brightness of the rim, relative to deep pixels, above which it is taken for glossy
+(docs/validation/surface.md). Gloss just below it hides 0.04 of the coverage."""
 _SMOOTHING_PX = 1.0
 
 
@@ -81,30 +82,34 @@ def half_coverage_opacity(
 ) -> float:
     """Median opacity of the pixels that the object covers by `MEASURED_COVERAGE`.
 
-    `HALF` if there are too few such pixels, or if the rim's whole pixels already seem to be covered by less (gloss).
+    `HALF` if there are too few such pixels, or if the rim is glossy.
 
     Args:
         sampler: has the masks and reads the spectra.
         before_chamber: pixels of a frame, given by its index, that show the object or the chamber.
         opacity_of: the model's opacity at pixels (frame, line, sample).
     """
-    on, coverage = _covered(sampler, outline_pixels(sampler.masks, before_chamber, OUTLINE_PX, PURE_PX))
-    _, of_rim = _covered(sampler, outline_pixels(sampler.masks, before_chamber, RIM_PX, DEEP_PX))
+    pixels = _some(outline_pixels(sampler.masks, before_chamber, OUTLINE_PX, PURE_PX))
+    coverage = pixel_coverage(sampler, *pixels)
     low, high = MEASURED_COVERAGE
-    half = on[(coverage > low) & (coverage < high)]
-    if min(len(half), len(of_rim)) < FEWEST_PIXELS or abs(np.median(of_rim) - 1.0) > RIM_CHANGE:
+    half = pixels[0][(coverage > low) & (coverage < high)]
+    if len(half) < FEWEST_PIXELS:
+        return HALF
+    rim, deep, _ = _some(outline_pixels(sampler.masks, before_chamber, RIM_PX, DEEP_PX))
+    if len(rim) < FEWEST_PIXELS or rim_brightness(sampler, rim, deep) > GLOSSY_RIM:
         return HALF
     return float(np.clip(np.median(opacity_of(half)), *PLAUSIBLE_OPACITY))
 
 
-def _covered(
-    sampler: PixelSampler, pixels: tuple[Int[np.ndarray, "n 3"], ...]
-) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Some of the pixels of `outline_pixels`, and their coverage where it can be told."""
-    on, inside, outside = (part[:: max(1, -(-len(part) // MOST_PIXELS))] for part in pixels)
-    coverage = pixel_coverage(sampler, on, inside, outside)
-    told = np.isfinite(coverage)
-    return on[told], coverage[told]
+def _some(pixels: tuple[Int[np.ndarray, "n 3"], ...]) -> list[Int[np.ndarray, "m 3"]]:
+    """At most `MOST_PIXELS` of them, evenly."""
+    return [part[:: max(1, -(-len(part) // MOST_PIXELS))] for part in pixels]
+
+
+def rim_brightness(sampler: PixelSampler, rim: Int[np.ndarray, "n 3"], deep: Int[np.ndarray, "n 3"]) -> float:
+    """Median brightness of pixels of the rim relative to pixels further inside, one for each."""
+    at_rim, inside = (sampler.at(pixels)["spectral"].mean(axis=1) for pixels in (rim, deep))
+    return float(np.median(at_rim / np.maximum(inside, 1e-6)))
 
 
 def outline_pixels(

@@ -104,6 +104,11 @@ def test_half_is_taken_where_the_rim_mirrors_the_chamber():
         assert found == pytest.approx(expected, abs=0.03)
 
 
+def test_a_rim_in_the_shade_is_not_taken_for_glossy():
+    found = half_coverage_opacity(sampler(gloss=-0.05), everywhere, lambda pixels: COVERAGE[tuple(pixels.T)] ** 0.5)
+    assert found == pytest.approx(0.5**0.5, abs=0.04)
+
+
 def test_an_implausible_opacity_is_bounded():
     found = half_coverage_opacity(sampler(), everywhere, lambda pixels: np.ones(len(pixels)))
     assert found == PLAUSIBLE_OPACITY[1]
