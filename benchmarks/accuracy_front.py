@@ -92,40 +92,50 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
     figure = new_figure(11.0, 4.2)
     by_time, by_views = figure.subplots(1, 2)
     column = {title: TITLES.index(title) for title in TITLES}
+    by_seconds = sorted(rows, key=lambda row: parse_range(row[column["training, s"]])[0])
 
-    def ranges(part: str, title: str) -> np.ndarray:
-        """Mean, least and largest, a row of the part."""
-        return np.array([parse_range(row[column[title]]) for row in rows if row[0] == part])
+    def ranges(title: str, *parts: str) -> np.ndarray:
+        """Mean, least and largest, a row of the parts, by training time."""
+        return np.array([parse_range(row[column[title]]) for row in by_seconds if row[0] in parts])
 
     def curve(axes: Any, at: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
         spread = np.abs(values[:, 1:] - values[:, :1]).T
         axes.errorbar(at, values[:, 0], spread, color=colour, marker="o", markersize=4, capsize=2, label=label)
 
-    seconds = ranges("budgets", "training, s")[:, 0]
-    curve(by_time, seconds, ranges("budgets", "without the noise: SAM"), COLOURS[0], "SAM (rad), default")
-    curve(by_time, seconds, ranges("budgets", " RMSE"), COLOURS[1], "RMSE, default")
+    runs = ("budgets", "presets")
+    seconds = ranges("training, s", *runs)[:, 0]
+    curve(by_time, seconds, ranges("without the noise: SAM", *runs), COLOURS[0], "SAM (rad), default")
+    curve(by_time, seconds, ranges(" RMSE", *runs), COLOURS[1], "RMSE, default")
     for title, colour in (("without the noise: SAM", COLOURS[0]), (" RMSE", COLOURS[1])):
-        others = ranges("settings", title)[1:, 0]
-        at = ranges("settings", "training, s")[1:, 0]
+        at, others = (ranges(name, "settings")[:, 0] for name in ("training, s", title))
         by_time.plot(at, others, "x", color=colour, markersize=4, label=f"{title.split()[-1]}, one setting changed")
     by_time.set(xscale="log", yscale="log", xlabel="training (s of one core)", ylabel="error without the noise")
-    by_time.set_xticks(seconds, [f"{second:.0f}" for second in seconds])
+    ticks = [second for second in seconds if second not in ranges("training, s", "presets")[:1, 0]]
+    by_time.set_xticks(ticks, [f"{second:.0f}" for second in ticks])
+    for name, second, error in zip(
+        [row[1] for row in by_seconds if row[0] == "presets"],
+        ranges("training, s", "presets")[:, 0],
+        ranges("without the noise: SAM", "presets")[:, 0],
+        strict=True,
+    ):
+        by_time.annotate(name, (second, error), (0, 9), textcoords="offset points", ha="center", fontsize=8)
     errors_drawn = (0.01, 0.02, 0.03, 0.04)
     by_time.set_yticks(errors_drawn, [f"{error:g}" for error in errors_drawn])
     by_time.minorticks_off()
     by_time.legend(fontsize=7)
 
-    minutes = np.array([int(row[1].split()[0]) for row in rows if row[0] == "views"]) * CAPTURE_SECONDS / 60.0
-    curve(by_views, minutes, ranges("views", "F at 0.5 mm, %"), COLOURS[2], "F-score at 0.5 mm (%)")
+    minutes = np.array([int(row[1].split()[0]) for row in by_seconds if row[0] == "views"]) * CAPTURE_SECONDS / 60.0
+    curve(by_views, minutes, ranges("F at 0.5 mm, %", "views"), COLOURS[2], "F-score at 0.5 mm (%)")
     by_views.set(xscale="log", xlabel="capture (min, two minutes a view)", ylabel="F-score (%)", xticks=minutes)
     by_views.set_xticks(minutes, [f"{minute:.0f}" for minute in minutes])
     by_views.minorticks_off()
     errors = by_views.twinx()
     errors.grid(visible=False)
-    curve(errors, minutes, np.abs(ranges("views", "volume, %")), COLOURS[3], "error of the volume (%)")
-    curve(errors, minutes, 100.0 * ranges("views", " RMSE"), COLOURS[1], "RMSE without the noise (% reflectance)")
+    curve(errors, minutes, np.abs(ranges("volume, %", "views")), COLOURS[3], "error of the volume (%)")
+    curve(errors, minutes, 100.0 * ranges(" RMSE", "views"), COLOURS[1], "RMSE without the noise (% reflectance)")
     errors.set(ylabel="error (%)", ylim=(0.0, None))
-    by_views.legend(*map(list.__add__, by_views.get_legend_handles_labels(), errors.get_legend_handles_labels()))
+    drawn = map(list.__add__, by_views.get_legend_handles_labels(), errors.get_legend_handles_labels())
+    by_views.legend(*drawn, fontsize=7, loc="upper right", bbox_to_anchor=(1.0, 0.86))
     save_figure(figure, path)
 
 
