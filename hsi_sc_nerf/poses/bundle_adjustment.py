@@ -1,28 +1,32 @@
 """Bundle adjustment of a turntable and its landmarks (markers, points): Levenberg-Marquardt with a robust loss.
 
 Only what a turntable has is adjusted: one camera, one axis, one angle per frame, the landmarks, and if they are free
-radial lens distortion and small motions of a wobbling table. The landmarks are eliminated (``normal_equations``):
-B. Triggs et al., "Bundle adjustment - a modern synthesis" (2000), section 4.3. SciPy's ``least_squares`` has no such
+radial lens distortion and small motions of a wobbling table. The Schur complement eliminates the landmarks: B. Triggs
+et al., "Bundle adjustment - a modern synthesis" (2000), sections 4.3 and 6.1. SciPy's ``least_squares`` has no such
 elimination; thousands of points would take it minutes.
 
-Symbols: n sightings with g residuals of r numbers each, l landmarks of d parameters, p other parameters.
+Symbols: n sightings with g residuals of r numbers each, l landmarks of d parameters, p other parameters, m parameters
+and N residual numbers in all.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array, vstack
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.normal_equations import LandmarkEquations, NormalEquations
 from hsi_sc_nerf.poses.residuals import PointResiduals, Residuals
-from hsi_sc_nerf.poses.turntable import Jacobian, Turntable
+from hsi_sc_nerf.poses.turntable import Turntable
 
 _MOST_STEPS = 100
 _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
@@ -54,61 +58,55 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Columns of camera, radial terms, angles, motions and hidden errors; behind these p come the landmarks."""
+    """Columns of the Jacobian: camera, radial terms, angles, motions and hidden errors; then the landmarks'."""
 
-    motion_size: int
-    """p, the number of parameters without the landmarks'."""
     camera: Int[np.ndarray, "c"]
     """Log focal length, rotation (3), log distance."""
     radial: Int[np.ndarray, "r"]
     angle: Int[np.ndarray, "f"]
-    """Held angles have the column p, which is dropped."""
+    """Held angles have the column -1, which is dropped."""
     motion: Int[np.ndarray, "f 5"]
     hidden: tuple[Int[np.ndarray, "k"], ...]
+    motion_size: int
+    """p, the number of parameters without the landmarks'."""
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
     """Of each kind of residuals, and so are the hidden errors."""
-
-    @property
-    def size(self) -> int:
-        """Number of all parameters."""
-        return self.motion_size + sum(columns.size for columns in self.landmarks)
+    size: int
+    """m, the number of all parameters."""
 
     @staticmethod
-    def of(free: FreeParameters, frames: int, residuals: Sequence[Residuals]) -> ParameterLayout:
-        """The columns for a number of frames, and the landmarks and hidden errors of the residuals."""
-        camera = (4 + free.distance) * free.camera
-        radial = camera + free.radial_terms
+    def of(free: FreeParameters, residuals: Sequence[Residuals]) -> ParameterLayout:
+        """The columns for the residuals' frames, landmarks and hidden errors."""
+        end, frames = 0, residuals[0].frames
+
+        def take(*shape: int) -> Int[np.ndarray, "*shape"]:
+            nonlocal end
+            end += math.prod(shape)
+            return np.arange(end - math.prod(shape), end).reshape(shape)
+
         held = frames if not free.angles else int(free.camera)
-        angle = radial + frames - held
-        motion = angle + (5 * frames if free.motion_sigmas else 0)
-        hidden_sizes = [0 if part.hidden is None else part.hidden.shape[-1] for part in residuals]
-        size = end = motion + sum(hidden_sizes)
-        landmarks = []
-        for part in residuals:
-            landmarks.append(end + np.arange(part.size * part.d).reshape(part.size, part.d))
-            end += part.size * part.d
         return ParameterLayout(
-            motion_size=size,
-            camera=np.arange(camera),
-            radial=np.arange(camera, radial),
-            angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
-            motion=np.arange(angle, motion).reshape(-1, 5),
-            hidden=tuple(np.split(np.arange(motion, size), np.cumsum(hidden_sizes)[:-1])),
-            landmarks=tuple(landmarks),
+            camera=take((4 + free.distance) * free.camera),
+            radial=take(free.radial_terms),
+            angle=np.concatenate([np.full(held, -1), take(frames - held)]),
+            motion=take(frames if free.motion_sigmas else 0, 5),
+            hidden=tuple(take(0 if part.hidden is None else part.hidden.shape[-1]) for part in residuals),
+            motion_size=end,
+            landmarks=tuple(take(part.size, part.d) for part in residuals),
+            size=end,
         )
 
 
 class Problem:
     """Residuals of a turntable, their derivatives and robust normal equations."""
 
-    def __init__(self, start: Turntable, *residuals: Residuals, free: FreeParameters | None = None) -> None:
+    def __init__(self, *residuals: Residuals, free: FreeParameters | None = None) -> None:
         """Args:
-        start: the turntable that the residuals were made for.
-        residuals: of each kind of landmarks.
+        residuals: of each kind of landmarks, made for the same turntable.
         free: parameters to adjust beside the landmarks; by default camera and angles.
         """
         self.residuals, self.free = residuals, free or FreeParameters()
-        self.layout = ParameterLayout.of(self.free, len(start.frames), residuals)
+        self.layout = ParameterLayout.of(self.free, residuals)
         self.numbers = sum(part.numbers for part in residuals)
 
     def cost(self, turntable: Turntable) -> float:
@@ -143,62 +141,41 @@ class Problem:
             add(about_mean @ (turntable.angles_rad - angles_rad) / sigma, c.angle, about_mean / sigma)
         return np.concatenate(away), np.concatenate(by)
 
-    def motion_jacobian(
-        self, part: Residuals, jacobian: Jacobian
-    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
-        """The columns that a row depends on, and its derivatives by them."""
-        c, n = self.layout, len(part.frame)
-        shared = np.concatenate([c.camera, c.radial])
-        columns = [np.broadcast_to(shared, (n, len(shared)))]
-        values = [jacobian.camera[..., : len(c.camera)], jacobian.radial[..., : len(c.radial)]]
-        if self.free.angles:
-            columns.append(c.angle[part.frame][:, None])
-            values.append(jacobian.angle)
-        if jacobian.motion is not None and c.motion.size:
-            columns.append(c.motion[part.frame])
-            values.append(jacobian.motion)
-        if jacobian.hidden is not None:
-            hidden = c.hidden[self.residuals.index(part)]
-            columns.append(np.broadcast_to(hidden, (n, len(hidden))))
-            values.append(jacobian.hidden)
-        return np.concatenate(columns, axis=1), np.concatenate(values, axis=2)
-
     def normal_equations(self, turntable: Turntable) -> NormalEquations:
         """The normal equations with each residual weighted by its loss."""
-        width = self.layout.motion_size + 1
-        motion, gradient, landmarks = np.zeros((width, width)), np.zeros(width), []
+        jacobians, residuals, width = [], [], self.layout.size + 1
         for part in self.residuals:
-            residual = part.values(turntable)
-            jacobian, by_landmark = part.jacobian(turntable)
-            columns, values = self.motion_jacobian(part, jacobian)
-            weight, residual = (a.reshape(len(values), -1, 1) for a in (part.weights(residual), residual))
-            weighted = np.swapaxes(weight * values, 1, 2)
-            cell = columns[:, :, None] * width + columns[:, None, :]
-            own = np.bincount(cell.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
-            weighted_landmark = np.swapaxes(weight * by_landmark, 1, 2)
-            pair = (part.landmark[:, None] * width + columns).ravel()
-            products = weighted_landmark @ values
-            coupling = [np.bincount(pair, products[:, k].ravel(), part.size * width) for k in range(part.d)]
-            scores = np.bincount(pair, (weighted @ residual).ravel(), part.size * width).reshape(part.size, width)
-            motion += own
-            gradient += scores.sum(axis=0)
-            landmarks.append(
-                LandmarkEquations(
-                    normal=_summed(weighted_landmark @ by_landmark, part.landmark, part.size),
-                    gradient=_summed((weighted_landmark @ residual)[..., 0], part.landmark, part.size),
-                    coupling=np.array(coupling).reshape(part.d, part.size, width).swapaxes(0, 1)[..., :-1],
-                    motion=own[:-1, :-1],
-                    motion_gradient=scores[:, :-1],
-                )
-            )
+            residual, (columns, values) = part.values(turntable), self._derivatives(part, turntable)
+            root = np.sqrt(part.weights(residual)).reshape(*values.shape[:2], 1)
+            cells = np.broadcast_to(columns[:, None] % width, values.shape)
+            starts = np.arange(values.shape[0] * values.shape[1] + 1) * values.shape[2]
+            jacobians.append(csr_array(((root * values).ravel(), cells.ravel(), starts), (len(starts) - 1, width)))
+            residuals.append(root.ravel() * residual.ravel())
         away, by = self.priors(turntable)
-        motion += by.T @ by
-        gradient += by.T @ away
-        return NormalEquations(motion[:-1, :-1], gradient[:-1], tuple(landmarks))
+        jacobians.append(csr_array(np.pad(by[:, :-1], ((0, 0), (0, width - by.shape[1] + 1)))))
+        jacobian = vstack(jacobians, format="csr")[:, :-1]
+        return NormalEquations(jacobian, np.concatenate([*residuals, away]), self)
 
-    def moved(
-        self, turntable: Turntable, step: Float[np.ndarray, "p"], landmark_steps: Sequence[Float[np.ndarray, "l d"]]
-    ) -> Turntable:
+    def _derivatives(
+        self, part: Residuals, turntable: Turntable
+    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
+        """The columns that the rows of a sighting depend on, and the derivatives by them."""
+        (jacobian, by_landmark), c, kind = part.jacobian(turntable), self.layout, self.residuals.index(part)
+        pairs = [
+            (c.camera, jacobian.camera[..., : len(c.camera)]),
+            (c.radial, jacobian.radial[..., : len(c.radial)]),
+            (c.landmarks[kind][part.landmark], by_landmark),
+        ]
+        if self.free.angles:
+            pairs.append((c.angle[part.frame][:, None], jacobian.angle))
+        if jacobian.motion is not None and c.motion.size:
+            pairs.append((c.motion[part.frame], jacobian.motion))
+        if jacobian.hidden is not None:
+            pairs.append((c.hidden[kind], jacobian.hidden))
+        columns = [np.broadcast_to(own, (len(part.frame), own.shape[-1])) for own, _ in pairs]
+        return np.concatenate(columns, axis=1), np.concatenate([by for _, by in pairs], axis=2)
+
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "m"]) -> Turntable:
         """The turntable after a step of the parameters."""
         c = self.layout
         camera, radial = np.zeros(5), np.array(turntable.radial)
@@ -216,8 +193,8 @@ class Problem:
         if c.motion.size:
             before = 0.0 if turntable.motion is None else turntable.motion
             turntable = replace(turntable, motion=before + step[c.motion])
-        for part, landmark_step in zip(self.residuals, landmark_steps, strict=True):
-            turntable = part.moved(turntable, landmark_step) if part.d else turntable
+        for part, columns in zip(self.residuals, c.landmarks, strict=True):
+            turntable = part.moved(turntable, step[columns]) if part.d else turntable
         return turntable
 
     def minimise(self, turntable: Turntable, smallest_gain: float = 1e-9) -> Turntable:
@@ -234,19 +211,15 @@ class Problem:
             turntable = replace(turntable, motion=np.zeros((len(turntable.frames), 5)))
         cost, damping = self.cost(turntable), _FIRST_DAMPING
         if not np.isfinite(cost):
-            raise InputError(
-                "the points of the object do not lie before the camera; the poses to start from are wrong"
-            )
+            raise InputError("the object's points lie behind the camera; the poses to start from are wrong")
         for _ in range(_MOST_STEPS):
-            equations, lower = self.normal_equations(turntable), np.inf
-            while not lower < cost:
-                try:
-                    candidate = self.moved(turntable, *equations.solve(damping))
+            equations = self.normal_equations(turntable)
+            while True:
+                with suppress(LinAlgError, RuntimeError, ValueError):
+                    candidate = self.moved(turntable, equations.solve(damping))
                     lower = self.cost(candidate)
-                except (LinAlgError, ValueError):
-                    lower = np.inf
-                if lower < cost:
-                    break
+                    if lower < cost:
+                        break
                 damping *= _DAMPING_FACTOR
                 if damping > _DAMPING_RANGE[1]:
                     return turntable
@@ -255,6 +228,65 @@ class Problem:
             if gain < smallest_gain * cost:
                 break
         return turntable
+
+
+class NormalEquations:
+    """Gauss-Newton equations of all parameters. No landmark meets another: their part is block-diagonal."""
+
+    def __init__(self, jacobian: csr_array, residual: Float[np.ndarray, "N"], problem: Problem) -> None:
+        """Args:
+        jacobian: by the m parameters, rows weighted; those of each kind of residuals, then those of the priors.
+        residual: weighted likewise.
+        problem: that is linearised.
+        """
+        self.jacobian, self.residual, self.problem = jacobian, residual, problem
+        self.gradient, normal = jacobian.T @ residual, csc_array(jacobian.T @ jacobian)
+        p = self.p = problem.layout.motion_size
+        self.motion, self.coupling = normal[:p, :p].toarray(), normal[p:, :p].toarray()
+        self.landmarks = normal[p:, p:]
+
+    def solve(self, damping: float) -> Float[np.ndarray, "m"]:
+        """The damped step.
+
+        Raises:
+            LinAlgError, RuntimeError: the damped equations are singular.
+        """
+        right = np.column_stack([self.coupling, self.gradient[self.p :]])
+        through, alone = np.split(self._by_landmarks(right, damping), [self.p], axis=1)
+        normal = self.motion - self.coupling.T @ through
+        normal[np.diag_indices(self.p)] += damping * np.maximum(self.motion.diagonal(), 1e-12)
+        step = -cho_solve(cho_factor(normal), self.gradient[: self.p] - through.T @ self.gradient[self.p :])
+        return np.concatenate([step, -alone[:, 0] - through @ step])
+
+    def information(self) -> Float[np.ndarray, "p p"]:
+        """The inverse covariance of camera and motion for residuals of unit variance, the landmarks being unknown."""
+        return self.motion + self.coupling.T @ self.landmark_responses()
+
+    def reduced(self, kind: int) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]:
+        """Of one kind of landmarks, these being unknown: its part of ``information``, and of the gradient of camera
+        and motion what each landmark contributes. The latter add to zero where the turntable is adjusted."""
+        columns, part = self.problem.layout.landmarks[kind] - self.p, self.problem.residuals[kind]
+        first = sum(other.numbers for other in self.problem.residuals[:kind])
+        motion, residual = (a[first : first + part.numbers] for a in (self.jacobian[:, : self.p], self.residual))
+        response = self.landmark_responses()[columns]
+        row = np.repeat(part.landmark, part.numbers // len(part.landmark)), np.arange(part.numbers)
+        scores = coo_array((residual, row), shape=(part.size, part.numbers)) @ motion
+        return (
+            (motion.T @ motion).toarray() + np.einsum("ldp,ldq->pq", self.coupling[columns], response),
+            scores.toarray() + np.einsum("ldp,ld->lp", response, self.gradient[self.p :][columns]),
+        )
+
+    def landmark_responses(self) -> Float[np.ndarray, "m-p p"]:
+        """Derivatives of the landmarks that fit best by camera and motion."""
+        return -self._by_landmarks(self.coupling)
+
+    def _by_landmarks(self, right: Float[np.ndarray, "m-p k"], damping: float = 0.0) -> Float[np.ndarray, "m-p k"]:
+        """The right sides times the inverse of the landmarks' damped blocks."""
+        if len(right) == 0:
+            return right
+        diagonal = self.landmarks.diagonal()
+        floor = 1e-12 * (1.0 + diagonal.max())
+        return splu(csc_array(self.landmarks + diags_array(damping * diagonal + floor))).solve(right)
 
 
 @dataclass(frozen=True)
@@ -296,8 +328,9 @@ class Adjusted:
         equations = self.problem.normal_equations(self.turntable)
         information, hidden = equations.information(), np.concatenate(self.problem.layout.hidden)
         scatter = self.variance * information
-        for part, (own, scores) in zip(self.problem.residuals, equations.reduced(), strict=True):
+        for kind, part in enumerate(self.problem.residuals):
             if isinstance(part, PointResiduals):
+                own, scores = equations.reduced(kind)
                 scatter += scores.T @ scores - self.variance * own
                 information += (part.curvature(self.turntable) - 1.0) * own
         if self.problem.free.known_focal is not None:
@@ -315,10 +348,3 @@ class Adjusted:
         angles = np.pad(covariance, ((0, 1), (0, 1)))[np.ix_(self.problem.layout.angle, self.problem.layout.angle)]
         variance = angles.diagonal() - 2.0 * angles.mean(axis=0) + angles.mean()
         return np.rad2deg(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _summed(values, index, size):
-    """Sums of the values (n, ...) of equal index."""
-    columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-    sums = [np.bincount(index, c, size) for c in columns]
-    return np.array(sums).reshape(len(columns), size).T.reshape(size, *values.shape[1:])

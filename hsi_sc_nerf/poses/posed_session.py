@@ -174,9 +174,10 @@ def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Flo
     By camera, angles and the rest, with all landmarks following. Markers count where there are any.
     """
     turntable = adjusted.turntable
-    equations = adjusted.problem.normal_equations(turntable)
     # The markers' residuals come last, where there are any.
-    response, residuals = equations.landmark_responses()[-1], adjusted.problem.residuals[-1]
+    residuals, layout = adjusted.problem.residuals[-1], adjusted.problem.layout
+    response = adjusted.problem.normal_equations(turntable).landmark_responses()
+    response = response[layout.landmarks[-1] - layout.motion_size]
     if isinstance(residuals, PointResiduals):
         shifts, places = response, turntable.points_3d
     else:
@@ -199,14 +200,14 @@ def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
         )
         for part in problem.residuals
     ]
-    counted = Problem(turntable, *parts, free=problem.free)
+    counted = Problem(*parts, free=problem.free)
     larger = [
         part.with_hidden(part.hidden * np.sqrt(max(1.0, _shown_variance(counted, turntable, k))))
         if isinstance(part, PointResiduals) and part.hidden is not None
         else part
         for k, part in enumerate(parts)
     ]
-    return replace(adjusted, problem=Problem(turntable, *larger, free=problem.free))
+    return replace(adjusted, problem=Problem(*larger, free=problem.free))
 
 
 def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
@@ -216,7 +217,7 @@ def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
     their information, and the noise is the scatter from point to point.
     """
     equations, hidden = problem.normal_equations(turntable), problem.layout.hidden[kind]
-    information, (_, scores) = equations.information(), equations.reduced()[kind]
+    information, (_, scores) = equations.information(), equations.reduced(kind)
     shown = np.setdiff1d(np.arange(len(information)), np.concatenate(problem.layout.hidden))
     response = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True) @ information[np.ix_(shown, hidden)]
     left = information[np.ix_(hidden, hidden)] - information[np.ix_(hidden, shown)] @ response

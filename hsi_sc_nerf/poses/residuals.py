@@ -49,7 +49,7 @@ class Residuals(ABC):
         loss_scale: residuals well above this count by their size, not its square.
         d: number of parameters of a landmark; 0 where landmarks are held.
         """
-        self.frame, self.landmark = turntable.rows(seen)
+        self.frames, (self.frame, self.landmark) = len(turntable.frames), turntable.rows(seen)
         self.loss_scale, self.d = loss_scale, d
         self.size = len(turntable.points if isinstance(seen, Tracks) else turntable.markers)
 
@@ -102,7 +102,6 @@ class MarkerResiduals(Residuals):
         weights: multiply the residuals (x0, y0, x1, ...) of an observation; by default they whiten its covariance.
         free: whether the markers' poses are adjusted.
         free_sides: whether the log of each marker's side is adjusted.
-        hidden: displacements of the corners, px, that are not adjusted but count in the covariance.
         """
         super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
         self.free, self.free_sides = free, free_sides

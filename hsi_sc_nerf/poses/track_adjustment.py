@@ -140,7 +140,7 @@ def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None 
 def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free: FreeParameters | None) -> Turntable:
     turntable = turntable.restricted(kept)
     parameters = FreeParameters(distance=False, angles=free is None or free.angles)
-    problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
+    problem = Problem(PointResiduals(turntable, kept, loss_px), free=parameters)
     return problem.minimise(turntable, _SMALLEST_GAIN)
 
 
@@ -166,10 +166,10 @@ def adjust_together(
     sigma_px *= 1.0 if alone else _BESIDE_MARKERS
     points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
     if markers is None or alone:
-        problem = Problem(start, points(start), free=replace(free, distance=False))
+        problem = Problem(points(start), free=replace(free, distance=False))
         return with_hidden_errors(Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem)), None
     for last in (False, True):
-        problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
+        problem = Problem(points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
         away_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
         fits = away_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(away_px)))

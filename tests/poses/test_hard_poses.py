@@ -31,7 +31,7 @@ def started(scene, seen):
 
 
 def adjusted(start, seen):
-    return Problem(start, MarkerResiduals(start, seen, 3.0)).minimise(start)
+    return Problem(MarkerResiduals(start, seen, 3.0)).minimise(start)
 
 
 def normals_deg(one, other):

@@ -24,7 +24,7 @@ INFO = SessionInfo(marker_side_m=SIDE_M)
 def solve(scene, observations):
     centre = (scene.size_px / 2, scene.size_px / 2)
     start = initialise(observations, centre, scene.size_px, SIDE_M)
-    return Problem(start, MarkerResiduals(start, observations, 3.0)).minimise(start)
+    return Problem(MarkerResiduals(start, observations, 3.0)).minimise(start)
 
 
 @lru_cache(maxsize=8)
