@@ -188,7 +188,7 @@ def poses_from_features(
     )
     if hold_angles and known_angles is not None:
         held = replace(found.turntable, angles_rad=known_angles[0])
-        found = adjust_tracks(held, free.tracks, free=parameters)
+        found = adjust_tracks(held, free.tracks, free_angles=False)
     if camera is not None and info.camera_distance_m is None:
         info = replace(info, camera_distance_m=camera.distance_m)
     return _posed(found, images, names, info, parameters, camera)

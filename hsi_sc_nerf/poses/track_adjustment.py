@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.posed_session import with_hidden_errors
@@ -76,18 +76,18 @@ class AdjustedTracks:
         return loop_closure_deg(PointResiduals(self.turntable, self.tracks, _LOSS_PX), self.turntable)
 
 
-def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | None = None) -> AdjustedTracks:
+def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
     """Adjust camera, angles and points to the tracks, reject outliers, and adjust again.
 
     Args:
         start: where to start. Tracks of frames or points that it lacks count as outliers.
         tracks: points seen in frames.
-        free: whether angles are adjusted, which they are by default.
+        free_angles: whether the angles are adjusted.
 
     Raises:
         InputError: too few tracks fit to determine an axis.
     """
-    return _refined(_roughly_adjusted(start, tracks, free), tracks, free)
+    return _refined(_roughly_adjusted(start, tracks, free_angles), tracks, free_angles)
 
 
 def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
@@ -116,17 +116,17 @@ def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
     return min(found, key=lambda adjusted: adjusted.misfit_px)
 
 
-def _roughly_adjusted(start: Turntable, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+def _roughly_adjusted(start: Turntable, tracks: Tracks, free_angles: bool = True) -> AdjustedTracks:
     good = _enough(tracks, start.knows(tracks))
     kept = tracks.select(good)
-    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free), kept, ~good)
+    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free_angles), kept, ~good)
 
 
-def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+def _refined(rough: AdjustedTracks, tracks: Tracks, free_angles: bool = True) -> AdjustedTracks:
     turntable, good = rough.turntable, ~rough.outliers
     for last in [False] * _OUTLIER_ROUNDS + [True]:
         kept = tracks.select(good)
-        turntable = _adjusted(turntable, kept, _LOSS_PX, free)
+        turntable = _adjusted(turntable, kept, _LOSS_PX, free_angles)
         size_px = turntable.errors_px(kept)
         outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
         if last or not outlier.any():
@@ -137,11 +137,10 @@ def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None 
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free: FreeParameters | None) -> Turntable:
+def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free_angles: bool) -> Turntable:
     turntable = turntable.restricted(kept)
-    parameters = FreeParameters(distance=False, angles=free is None or free.angles)
-    problem = Problem(PointResiduals(turntable, kept, loss_px), free=parameters)
-    return problem.minimise(turntable, _SMALLEST_GAIN)
+    free = FreeParameters(distance=False, angles=free_angles)
+    return Problem(PointResiduals(turntable, kept, loss_px), free=free).minimise(turntable, _SMALLEST_GAIN)
 
 
 def adjust_together(
@@ -198,21 +197,14 @@ def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:
 
 def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     """The turntable with the markers that its rays determine, in its unit of length, all of one side."""
-    poses, marker_corners = turntable.camera_to_world(), {}
-    width, height = (int(2.0 * centre) for centre in turntable.centre_px)
-    camera = PinholeIntrinsics(width, height, turntable.focal_px, turntable.focal_px, *turntable.centre_px)
-    for marker in np.unique(seen.marker).tolist():
-        rows = np.flatnonzero((seen.marker == marker) & np.isin(seen.frame, turntable.frames))
-        frames = np.searchsorted(turntable.frames, seen.frame[rows])
-        rays = [pixel_rays(camera, poses[f], seen.corners_px[r]) for f, r in zip(frames, rows, strict=True)]
-        if len(rays) < 2:
-            continue
-        origins, directions = (np.stack(part) for part in zip(*rays, strict=True))
-        corner = np.tile(np.arange(4), (len(rows), 1))
-        corners, eigenvalue = closest_point_to_rays(np.repeat(origins[:, None], 4, axis=1), directions, corner)
-        if eigenvalue.min() > _LEAST_EIGENVALUE * len(rows):
-            marker_corners[marker] = corners
-    faces = np.array(list(marker_corners.values())).reshape(-1, 4, 3)
+    seen = seen.select(np.isin(seen.frame, turntable.frames))
+    markers, marker, views = np.unique(seen.marker, return_inverse=True, return_counts=True)
+    poses = turntable.camera_to_world()[np.searchsorted(turntable.frames, seen.frame)] @ OPENCV_TO_OPENGL
+    in_camera = np.insert((seen.corners_px - turntable.centre_px) / turntable.focal_px, 2, 1.0, axis=-1)
+    directions = in_camera / np.linalg.norm(in_camera, axis=-1, keepdims=True) @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    corners, eigenvalue = closest_point_to_rays(poses[:, None, :3, 3], directions, 4 * marker[:, None] + np.arange(4))
+    placed = eigenvalue.reshape(-1, 4).min(axis=1) > _LEAST_EIGENVALUE * views
+    faces = corners.reshape(-1, 4, 3)[placed]
     right, up = faces[:, 1] + faces[:, 2] - faces[:, 0] - faces[:, 3], faces[:, 0] - faces[:, 3]
     normal = np.cross(right, up)
     marker_poses = np.tile(np.eye(4), (len(faces), 1, 1))
@@ -221,7 +213,7 @@ def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     marker_poses[:, :3, 3] = faces.mean(axis=1)
     sides = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=-1)
     side = float(np.median(sides)) if len(faces) else 1.0
-    return replace(turntable, side=side, markers=np.array(list(marker_corners), int), marker_poses=marker_poses)
+    return replace(turntable, side=side, markers=markers[placed], marker_poses=marker_poses)
 
 
 def _search_angle(turntable: Turntable, seen: Tracks) -> float | None:

@@ -8,7 +8,6 @@ from exact_turntable import point_tracks, point_turntable
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
 from hsi_sc_nerf.poses.track_adjustment import (
     adjust_either_way,
     adjust_tracks,
@@ -112,7 +111,7 @@ def test_a_frame_with_too_few_points_is_left_out():
 def test_held_angles_stay():
     true = machine(np.arange(0, 360, 18.0))
     start = replace(disturbed(true), angles_rad=true.angles_rad)
-    found = adjust_tracks(start, point_tracks(true), free=FreeParameters(angles=False))
+    found = adjust_tracks(start, point_tracks(true), free_angles=False)
     np.testing.assert_array_equal(found.turntable.angles_rad, true.angles_rad)
     assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
     assert pose_error_deg(found.turntable, true) < 1e-3
