@@ -152,24 +152,22 @@ class Turntable:
 
     def rows(self, seen: MarkerObservations | Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         """Rows of ``frames``, and of ``markers`` or ``points``, that the sightings belong to."""
-        known, landmark = self._landmarks(seen)
+        known, landmark, _, _ = self._landmarks(seen)
         return np.searchsorted(self.frames, seen.frame), np.searchsorted(known, landmark)
 
     def knows(self, seen: MarkerObservations | Tracks) -> np.ndarray:
         """Mask of the sightings whose frame and landmark the turntable has."""
-        known, landmark = self._landmarks(seen)
+        known, landmark, _, _ = self._landmarks(seen)
         return np.isin(seen.frame, self.frames) & np.isin(landmark, known)
 
     def restricted(self, *seen: MarkerObservations | Tracks) -> Turntable:
         """The turntable with only the frames and landmarks that are seen; angles keep their zero."""
         keep = np.isin(self.frames, np.concatenate([sightings.frame for sightings in seen]))
-        of_kind = [
-            [self._landmarks(s)[1] for s in seen if isinstance(s, kind)] for kind in (MarkerObservations, Tracks)
+        numbers = [
+            np.concatenate([_no_numbers(), *(self._landmarks(s)[1] for s in seen if isinstance(s, kind))])
+            for kind in (MarkerObservations, Tracks)
         ]
-        markers, points = (
-            np.isin(known, np.concatenate([_no_numbers(), *found]))
-            for known, found in zip((self.markers, self.points), of_kind, strict=True)
-        )
+        markers, points = np.isin(self.markers, numbers[0]), np.isin(self.points, numbers[1])
         return replace(
             self,
             frames=self.frames[keep],
@@ -191,15 +189,17 @@ class Turntable:
 
     def reproject(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n *corners 2"]:
         """Pixels of each sighting: of a marker's four corners, or of a point."""
+        return self.project(seen).pixels.reshape(self._landmarks(seen)[3].shape)
+
+    def project(self, seen: MarkerObservations | Tracks) -> Projection:
+        """Projections of each sighting's corners, one after the other, or of its point."""
         frame, landmark = self.rows(seen)
-        if isinstance(seen, Tracks):
-            return project(self, frame, self.points_3d[landmark]).pixels
-        corners = self.corners()[landmark].reshape(-1, 3)
-        return project(self, np.repeat(frame, 4), corners).pixels.reshape(-1, 4, 2)
+        points = self._landmarks(seen)[2][landmark]
+        return project(self, np.repeat(frame, points.shape[1]), points.reshape(-1, 3))
 
     def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
         """Distance of each sighting from its projection; of a marker the root mean square over its corners."""
-        away = self.reproject(seen) - (seen.pixels if isinstance(seen, Tracks) else seen.corners_px)
+        away = self.reproject(seen) - self._landmarks(seen)[3]
         return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
 
     def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
@@ -223,8 +223,10 @@ class Turntable:
         )
 
     def _landmarks(self, seen):
-        """The turntable's landmarks of this kind, and those that are seen."""
-        return (self.points, seen.point) if isinstance(seen, Tracks) else (self.markers, seen.marker)
+        """Numbers of this kind's landmarks and of the seen ones; points (l, c, 3) of the former, pixels of the latter."""
+        if isinstance(seen, Tracks):
+            return self.points, seen.point, self.points_3d[:, None], seen.pixels
+        return self.markers, seen.marker, self.corners(), seen.corners_px
 
 
 @dataclass(frozen=True)
