@@ -60,24 +60,15 @@ class FramePictures:
     Attributes:
         picture: the picture of a name.
         scores: by the names of those in which markers are looked for, best first (``edge_precision``).
-        flagged: pixels with so many flagged values that the best picture does not measure them well; None if all are.
     """
 
     picture: Callable[[str], UInt8[np.ndarray, "h w"]]
     scores: Mapping[str, float]
-    flagged: Bool[np.ndarray, "h w"] | None = None
 
     @property
     def ranking(self) -> tuple[str, ...]:
         """Names of the pictures in which markers are looked for, best first."""
         return tuple(self.scores)
-
-    @property
-    def ill_exposed(self) -> Bool[np.ndarray, "h w"]:
-        """Pixels of the best picture that are black, clipped or flagged."""
-        best = self.picture(self.ranking[0])
-        clipped = (best == 0) | (best == 255)
-        return clipped if self.flagged is None else clipped | self.flagged
 
 
 class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
@@ -158,10 +149,7 @@ def frame_pictures(
     def picture(name: str) -> UInt8[np.ndarray, "h w"]:
         return gray if name == GRAY else _picture(cube.memmap(), flags_path, members[name])
 
-    best_well = well[best_first[0]]
-    return FramePictures(
-        picture, {name: scores[name] for name in best_first}, None if best_well.all() else ~best_well
-    )
+    return FramePictures(picture, {name: scores[name] for name in best_first})
 
 
 def _evenly_spread(inside: Bool[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands"]:

@@ -223,7 +223,7 @@ class Turntable:
         )
 
     def _landmarks(self, seen):
-        """Numbers of this kind's landmarks and of the seen ones; points (l, c, 3) of the former, pixels of the latter."""
+        """Numbers of the landmarks of this kind, those of the seen ones; points (l, c, 3) and pixels likewise."""
         if isinstance(seen, Tracks):
             return self.points, seen.point, self.points_3d[:, None], seen.pixels
         return self.markers, seen.marker, self.corners(), seen.corners_px
