@@ -241,12 +241,16 @@ def edge_precision(
     if not whole.any():
         return 0.0
     picture = np.asarray(reflectance, np.float32)
-    across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
-    slope = np.where(whole, cv2.magnitude(across, down), 0.0)
-    strongest = max(1, round(_EDGE_FRACTION * slope.size))
-    # Of the negative slopes the first: the many zeros at the other end make partition slow.
-    edges = -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())
     bright = whole & (picture >= np.median(picture[whole]))
     curvature = np.abs(cv2.filter2D(picture, cv2.CV_32F, _NOISE_MASK)[bright])
     noise = float(np.median(curvature)) / (_NOISE_GAIN * _MEDIAN_OF_NORMAL * np.sqrt(bands))
-    return edges / float(np.hypot(noise, _ROUNDING))
+    return edge_slope(picture, whole) / float(np.hypot(noise, _ROUNDING))
+
+
+def edge_slope(picture: Float[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | bool = True) -> float:
+    """Mean slope, per px, of a picture's strongest edges among ``counted`` pixels; 32 bit."""
+    across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
+    slope = np.where(counted, cv2.magnitude(across, down), 0.0)
+    strongest = max(1, round(_EDGE_FRACTION * slope.size))
+    # Of the negative slopes the first: the many zeros at the other end make partition slow.
+    return -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())

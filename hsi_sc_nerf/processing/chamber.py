@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.geometry.camera import through_lens
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
-from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of, through_lens
+from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of
 
 MAX_FRAMES = 16
 """Frames that are compared, evenly spread over the session."""

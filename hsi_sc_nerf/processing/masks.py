@@ -21,7 +21,7 @@ from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays, project
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
 from hsi_sc_nerf.morphology import (
     dilate,
     draw_outline,
@@ -76,7 +76,7 @@ class MaskConfig:
 def foreground_masks(
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     config: MaskConfig,
-    regions: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    regions: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> Bool[np.ndarray, "frames h w"]:
     """Masks of the object in all frames, with one threshold.
 
@@ -199,12 +199,7 @@ def lid_middle(
     ticks = np.linspace(-1.0, 1.0, 41) * LID_MIDDLE * container.diameter_m / 2.0
     x, y = (coordinate.ravel() for coordinate in np.meshgrid(ticks, ticks))
     points = np.stack([x, y, np.full_like(x, container.height_m)], axis=-1)[np.hypot(x, y) <= ticks[-1]]
-    pixels, depth = project(points, camera_to_world, intrinsics)
-    inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
-    column, row = pixels[inside].astype(int).T
-    seen = np.zeros((intrinsics.h, intrinsics.w), bool)
-    seen[row, column] = True
-    return seen
+    return image_of(points, camera_to_world, intrinsics)
 
 
 def mask_picture(

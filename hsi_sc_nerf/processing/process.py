@@ -279,21 +279,16 @@ def _write_masks(
         InputError: a finding is red and not accepted.
     """
     regions = lid_middles = None
+    camera_to_worlds, lens = np.stack([frame.camera_to_world for frame in frames]), poses.intrinsics
     if container is not None:
-        distortion = np.array(poses.distortion, dtype=float)
-        regions = np.stack(
-            [
-                above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
-                for frame in frames
-            ]
-        )
-        lid_middles = np.stack([lid_middle(poses.intrinsics, frame.camera_to_world, container) for frame in frames])
-    masks = foreground_masks([cache.bins for cache in caches], config, None if regions is None else list(regions))
-    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
+        distortion, overhang = np.array(poses.distortion, dtype=float), config.overhang
+        regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
+        lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
+    masks = foreground_masks([cache.bins for cache in caches], config, regions)
     brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
-    hull = voted_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
+    hull = voted_hull(masks, camera_to_worlds, lens, lid_z_m)
     findings = check_masks(masks, names, hull.silhouettes, brightness, regions, lid_middles)
     if all(finding.level != "red" for finding in findings):
         masks = hull.trim(masks)

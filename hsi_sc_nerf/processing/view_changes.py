@@ -12,13 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics, project
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, through_lens
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.processing.voted_hull import VotedHull
 
@@ -228,18 +227,6 @@ def sightings(
         found.append((rows, np.full(len(rows), frame), normals[rows] @ pose[:3, :3], values))
     point, frames, normal, reflectance = map(np.concatenate, zip(*found, strict=True))
     return Sightings(point, frames, normal, reflectance, points, normals)
-
-
-def through_lens(
-    points: Float[np.ndarray, "n 3"],
-    pose: Float[np.ndarray, "4 4"],
-    intrinsics: PinholeIntrinsics,
-    distortion: Float[np.ndarray, "4"],
-) -> Float[np.ndarray, "n 2"]:
-    """Pixel coordinates of points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
-    to_camera = np.linalg.inv(pose @ OPENCV_TO_OPENGL)
-    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
-    return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]
 
 
 def _surface(hull: VotedHull, inwards_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
