@@ -1,4 +1,4 @@
-"""Turntables in the adjustment's terms, and exact or noisy sightings of their markers and points."""
+"""Turntables in the adjustment's terms, and exact or noisy observations of their markers and points."""
 
 from dataclasses import replace
 

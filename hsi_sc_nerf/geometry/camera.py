@@ -99,7 +99,7 @@ def image_of(
     return image
 
 
-def through_lens(
+def project_distorted(
     points: Float[np.ndarray, "n 3"],
     camera_to_world: Float[np.ndarray, "4 4"],
     intrinsics: PinholeIntrinsics,

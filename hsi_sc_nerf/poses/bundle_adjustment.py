@@ -5,8 +5,8 @@ radial lens distortion and small motions of a wobbling table. The Schur compleme
 et al., "Bundle adjustment - a modern synthesis" (2000), sections 4.3 and 6.1. SciPy's ``least_squares`` has no such
 elimination; thousands of points would take it minutes.
 
-Symbols: n sightings with g residuals of r numbers each, l landmarks of d parameters, p other parameters, m parameters
-and N residual numbers in all.
+Symbols: n observations with g residuals of r numbers each, l landmarks of d parameters, p other parameters, m
+parameters and N residual numbers in all.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
 _DAMPING_RANGE = (1e-12, 1e8)
 # A known focal length weighs as if its standard deviation were this fraction of what it is, for that of the landmarks
 # may be wrong by more than they tell (``Adjusted.covariance`` counts what it is).
-_HELD = 0.03
+_PRIOR_SCALE = 0.03
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ class Problem:
 
     def cost(self, turntable: Turntable) -> float:
         """Sum of the losses of the residuals, and of the squares of what contradicts prior knowledge."""
-        away, _ = self.priors(turntable)
-        return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(away @ away)
+        residual, _ = self.priors(turntable)
+        return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(residual @ residual)
 
     def priors(self, turntable: Turntable) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k p+1"]]:
         """Distances from what is known before in standard deviations, and their derivatives.
@@ -121,10 +121,10 @@ class Problem:
         relative to the mean of all.
         """
         free, c = self.free, self.layout
-        away, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
+        residual, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
 
         def add(distances: np.ndarray, columns: np.ndarray, jacobian: np.ndarray) -> None:
-            away.append(distances)
+            residual.append(distances)
             by.append(np.zeros((len(distances), c.motion_size + 1)))
             np.add.at(by[-1], (np.arange(len(distances))[:, None], columns), jacobian)
 
@@ -133,13 +133,13 @@ class Problem:
             add(turntable.motion.ravel() / sigmas, c.motion.reshape(-1, 1), 1.0 / sigmas[:, None])
         if free.known_focal is not None:
             focal_px, sigma = free.known_focal
-            sigma *= _HELD
+            sigma *= _PRIOR_SCALE
             add(np.log([turntable.focal_px / focal_px]) / sigma, c.camera[:1], np.array([[1.0 / sigma]]))
         if free.known_angles is not None:
             angles_rad, sigma = free.known_angles
             about_mean = np.eye(len(angles_rad)) - 1.0 / len(angles_rad)
             add(about_mean @ (turntable.angles_rad - angles_rad) / sigma, c.angle, about_mean / sigma)
-        return np.concatenate(away), np.concatenate(by)
+        return np.concatenate(residual), np.concatenate(by)
 
     def normal_equations(self, turntable: Turntable) -> NormalEquations:
         """The normal equations with each residual weighted by its loss."""
@@ -151,15 +151,15 @@ class Problem:
             starts = np.arange(values.shape[0] * values.shape[1] + 1) * values.shape[2]
             jacobians.append(csr_array(((root * values).ravel(), cells.ravel(), starts), (len(starts) - 1, width)))
             residuals.append(root.ravel() * residual.ravel())
-        away, by = self.priors(turntable)
+        prior, by = self.priors(turntable)
         jacobians.append(csr_array(np.pad(by[:, :-1], ((0, 0), (0, width - by.shape[1] + 1)))))
         jacobian = vstack(jacobians, format="csr")[:, :-1]
-        return NormalEquations(jacobian, np.concatenate([*residuals, away]), self)
+        return NormalEquations(jacobian, np.concatenate([*residuals, prior]), self)
 
     def _derivatives(
         self, part: Residuals, turntable: Turntable
     ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
-        """The columns that the rows of a sighting depend on, and the derivatives by them."""
+        """The columns that the rows of an observation depend on, and the derivatives by them."""
         (jacobian, by_landmark), c, kind = part.jacobian(turntable), self.layout, self.residuals.index(part)
         pairs = [
             (c.camera, jacobian.camera[..., : len(c.camera)]),
@@ -236,7 +236,7 @@ class NormalEquations:
     def __init__(self, jacobian: csr_array, residual: Float[np.ndarray, "N"], problem: Problem) -> None:
         """Args:
         jacobian: by the m parameters, rows weighted; those of each kind of residuals, then those of the priors.
-        residual: weighted likewise.
+        residual: rows weighted in the same way.
         problem: that is linearised.
         """
         self.jacobian, self.residual, self.problem = jacobian, residual, problem
@@ -299,8 +299,8 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """How strongly the sightings call for lens_distortion and for wobble: -log10 of the probability that chance alone
-    lowers the squares as much."""
+    """How strongly the observations call for lens_distortion and for wobble: -log10 of the probability that chance
+    alone lowers the squares as much."""
 
     @cached_property
     def cost(self) -> float:
@@ -314,13 +314,13 @@ class Adjusted:
 
     @property
     def variance(self) -> float:
-        """Of the residuals: 1 if the sightings' covariances are right; at least that."""
+        """Of the residuals: 1 if the observations' covariances are right; at least that."""
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
         """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
 
-        Errors of one point in neighbouring frames are alike. Its sightings count together, by how much the points
+        Errors of one point in neighbouring frames are alike. Its observations count together, by how much the points
         contradict each other (the cluster-robust estimate of K.-Y. Liang and S. L. Zeger, 1986; A. C. Cameron and
         D. L. Miller, "A practitioner's guide to cluster-robust inference", 2015). Hidden errors, of unit variance,
         were not adjusted: they add what they do to the parameters.
@@ -335,7 +335,7 @@ class Adjusted:
                 information += (part.curvature(self.turntable) - 1.0) * own
         if self.problem.free.known_focal is not None:
             sigma = self.problem.free.known_focal[1]
-            scatter[0, 0] += 1.0 / (_HELD**2 * sigma) ** 2 - self.variance / (_HELD * sigma) ** 2
+            scatter[0, 0] += 1.0 / (_PRIOR_SCALE**2 * sigma) ** 2 - self.variance / (_PRIOR_SCALE * sigma) ** 2
         shown = np.setdiff1d(np.arange(len(information)), hidden)
         inverse = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True)
         response = inverse @ information[np.ix_(shown, hidden)]

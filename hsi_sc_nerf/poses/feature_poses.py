@@ -29,7 +29,7 @@ from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
-    adjust_either_way,
+    adjust_either_depth,
     adjust_together,
     adjust_tracks,
     with_lost_frames,
@@ -178,7 +178,7 @@ def poses_from_features(
             f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
-    found = adjust_either_way(start, free.tracks)
+    found = adjust_either_depth(start, free.tracks)
     found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
     known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(

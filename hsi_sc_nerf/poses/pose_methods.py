@@ -42,8 +42,8 @@ def find_poses(
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
-        from_markers: the function behind the method.
-        from_features: likewise.
+        from_markers: called like `poses_from_markers`.
+        from_features: called like `poses_from_features`.
 
     Raises:
         InputError: the method, or every method, fails; says why.

@@ -1,6 +1,6 @@
 """Residuals of a turntable's landmarks, markers or points, and their derivatives.
 
-Symbols: n sightings with g residuals of r numbers each, of l landmarks with d parameters.
+Symbols: n observations with g residuals of r numbers each, of l landmarks with d parameters.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from hsi_sc_nerf.poses.turntable import Jacobian, MarkerObservations, Tracks, Tu
 
 
 class Residuals(ABC):
-    """Projections less sightings, in standard deviations.
+    """Projections less observations, in standard deviations.
 
     The loss of a residual of length r is soft L1, rho = 2 s^2 (sqrt(1 + r^2 / s^2) - 1) with the scale s: r^2 where
     it is small, 2 s r where it is large.
     """
 
     shape: tuple[int, int]
-    """Residuals of a sighting and numbers of each: g, r."""
+    """Residuals of an observation and numbers of each: g, r."""
     nearest: float
     """A residual is infinite if its point is nearer to the camera's plane than this, in distances of the camera."""
     hidden: Float[np.ndarray, "m 2 k"] | None = None
@@ -34,8 +34,8 @@ class Residuals(ABC):
 
     def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
         """Args:
-        turntable: one that has the frames and landmarks of the sightings.
-        seen: sightings.
+        turntable: one that has the frames and landmarks of the observations.
+        seen: observations.
         loss_scale: residuals well above this count by their size, not its square.
         d: number of parameters of a landmark; 0 where landmarks are held.
         """
@@ -78,7 +78,7 @@ class Residuals(ABC):
         return other
 
     def losses(self, turntable: Turntable) -> Float[np.ndarray, "n"]:
-        """The loss of each sighting."""
+        """The loss of each observation."""
         r = np.linalg.norm(self.values(turntable), axis=-1)
         return (2.0 * self.loss_scale**2 * (np.sqrt(1.0 + (r / self.loss_scale) ** 2) - 1.0)).sum(axis=-1)
 

@@ -78,7 +78,7 @@ class Uncertainty:
     rotation_deg: float
     """Of the rotation in the object frame: root mean square of the largest error of all frames."""
     position_m: float
-    """Likewise, of the camera's position in the object frame."""
+    """Of the camera's position in the object frame: root mean square of the largest error of all frames."""
 
 
 @dataclass(frozen=True)

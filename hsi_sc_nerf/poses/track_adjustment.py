@@ -90,7 +90,7 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True)
     return _refined(_roughly_adjusted(start, tracks, free_angles), tracks, free_angles)
 
 
-def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
+def adjust_either_depth(start: Turntable, tracks: Tracks) -> AdjustedTracks:
     """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
 
     Raises:
@@ -104,11 +104,11 @@ def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
             rough.append(_roughly_adjusted(turned, tracks))
         except InputError as error:
             refused = refused or error
-    best_px = min((way.misfit_px for way in rough), default=0.0)
-    for way in rough:
+    best_px = min((candidate.misfit_px for candidate in rough), default=0.0)
+    for candidate in rough:
         try:
-            if way.misfit_px < _CLEARLY_WORSE * best_px:
-                found.append(_refined(way, tracks))
+            if candidate.misfit_px < _CLEARLY_WORSE * best_px:
+                found.append(_refined(candidate, tracks))
         except InputError as error:
             refused = refused or error
     if refused is not None and not found:
@@ -154,7 +154,7 @@ def adjust_together(
         free: whether angles are adjusted, and prior knowledge.
 
     Returns:
-        The turntable, with markers if they determine their places; and the markers that it was adjusted to.
+        The turntable, with markers if they determine their poses; and the markers that it was adjusted to.
     """
     start = found.turntable
     sigma_px = max(float(np.median(start.errors_px(found.tracks))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
@@ -170,8 +170,8 @@ def adjust_together(
     for last in (False, True):
         problem = Problem(points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
-        away_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
-        fits = away_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(away_px)))
+        error_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
+        fits = error_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(error_px)))
         if last or fits.all():
             break
         markers = markers.select(fits)

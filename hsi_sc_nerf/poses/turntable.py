@@ -44,8 +44,8 @@ def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) 
         )
 
 
-class _Sightings:
-    """Arrays with one row for each sighting of a landmark in a frame: the frame, the landmark's number, the rest."""
+class _Observations:
+    """Arrays with one row an observation of a landmark in a frame: the frame, the landmark's number, the rest."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
@@ -56,7 +56,7 @@ class _Sightings:
 
 
 @dataclass(frozen=True)
-class MarkerObservations(_Sightings):
+class MarkerObservations(_Observations):
     """Corners of markers in frames. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
@@ -75,8 +75,8 @@ class MarkerObservations(_Sightings):
 
 
 @dataclass(frozen=True)
-class Tracks(_Sightings):
-    """Points of the object in frames. Pixel origin as above."""
+class Tracks(_Observations):
+    """Points of the object in frames. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
@@ -151,18 +151,18 @@ class Turntable:
         return rows
 
     def rows(self, seen: MarkerObservations | Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of ``frames``, and of ``markers`` or ``points``, that the sightings belong to."""
+        """Rows of ``frames``, and of ``markers`` or ``points``, that the observations belong to."""
         known, landmark, _, _ = self._landmarks(seen)
         return np.searchsorted(self.frames, seen.frame), np.searchsorted(known, landmark)
 
     def knows(self, seen: MarkerObservations | Tracks) -> np.ndarray:
-        """Mask of the sightings whose frame and landmark the turntable has."""
+        """Mask of the observations whose frame and landmark the turntable has."""
         known, landmark, _, _ = self._landmarks(seen)
         return np.isin(seen.frame, self.frames) & np.isin(landmark, known)
 
     def restricted(self, *seen: MarkerObservations | Tracks) -> Turntable:
         """The turntable with only the frames and landmarks that are seen; angles keep their zero."""
-        keep = np.isin(self.frames, np.concatenate([sightings.frame for sightings in seen]))
+        keep = np.isin(self.frames, np.concatenate([part.frame for part in seen]))
         numbers = [
             np.concatenate([_no_numbers(), *(self._landmarks(s)[1] for s in seen if isinstance(s, kind))])
             for kind in (MarkerObservations, Tracks)
@@ -188,22 +188,22 @@ class Turntable:
         return np.einsum("mij,kj->mki", self.marker_poses[:, :3, :3], square_corners(self.side))
 
     def reproject(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n *corners 2"]:
-        """Pixels of each sighting: of a marker's four corners, or of a point."""
+        """Pixels of each observation: of a marker's four corners, or of a point."""
         return self.project(seen).pixels.reshape(self._landmarks(seen)[3].shape)
 
     def project(self, seen: MarkerObservations | Tracks) -> Projection:
-        """Projections of each sighting's corners, one after the other, or of its point."""
+        """Projections of each observation's corners, one after the other, or of its point."""
         frame, landmark = self.rows(seen)
         points = self._landmarks(seen)[2][landmark]
         return project(self, np.repeat(frame, points.shape[1]), points.reshape(-1, 3))
 
     def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
-        """Distance of each sighting from its projection; of a marker the root mean square over its corners."""
+        """Distance of each observation from its projection; of a marker the root mean square over its corners."""
         away = self.reproject(seen) - self._landmarks(seen)[3]
         return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
 
     def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
-        """Root mean square error in each of the session's ``size`` frames, nan without sightings; and in all."""
+        """Root mean square error in each of the session's ``size`` frames, nan without observations; and in all."""
         squared = self.errors_px(seen) ** 2
         with np.errstate(invalid="ignore"):
             of_frames = np.bincount(seen.frame, squared, size) / np.bincount(seen.frame, minlength=size)
@@ -223,7 +223,7 @@ class Turntable:
         )
 
     def _landmarks(self, seen):
-        """Numbers of the landmarks of this kind, those of the seen ones; points (l, c, 3) and pixels likewise."""
+        """Numbers of this kind's landmarks, of the seen ones; points (l, c, 3) of the former, the latter's pixels."""
         if isinstance(seen, Tracks):
             return self.points, seen.point, self.points_3d[:, None], seen.pixels
         return self.markers, seen.marker, self.corners(), seen.corners_px

@@ -261,7 +261,7 @@ def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
 
 
 def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, int]]:
-    """The same of the files that belong to one capture."""
+    """Name, size and time of last change of the files that belong to one capture."""
     paths = [path for cube in capture.cubes for path in (cube.header_path, cube.data_path)]
     if capture.metadata is not None:
         paths.append(capture.metadata.path)
@@ -269,7 +269,7 @@ def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, in
 
 
 def shared_files(session: Session) -> list[tuple[str, int, int]]:
-    """The same of the files that every frame's reflectance depends on.
+    """Name, size and time of last change of the files that every frame's reflectance depends on.
 
     These are ``session.json``, the files it names, and the tarp.
     """

@@ -78,6 +78,8 @@ def test_two_frames_fix_no_axis_but_have_poses_by_a_known_camera():
     for find in (lambda: poses_from_markers(images, names, INFO), lambda: structure_from_motion(images, names)):
         with pytest.raises(InputError, match=r"2 frame\(s\) \(a, b\) cannot fix"):
             find()
+    with pytest.raises(InputError, match=r"1 frame\(s\) \(a\) cannot fix"):
+        poses_from_markers(images[:1], names[:1], INFO)
     first = look_at([0.4, 0.0, 0.2], [0, 0, 0.06])
     camera = KnownCamera(PinholeIntrinsics(64, 48, 100.0, 100.0, 32.0, 24.0), (0.0,) * 4, first, "ccw")
     info = SessionInfo(frame_angles_deg=(0.0, 180.0))

@@ -77,7 +77,7 @@ def test_features_that_creep_are_covered(markers):
 
 
 def test_points_that_err_together_in_their_frames_are_covered_by_their_scatter():
-    """Each point is seen at a wrong place of its own, which turns as it passes; its sightings are not independent."""
+    """Each point is seen at a wrong place of its own, which turns as it passes: observations are not independent."""
     scene, found = MarkerScene(size_px=256, frames=18), []
     for seed in range(SEEDS):
         true = point_turntable(marker_turntable(scene), 150, seed)

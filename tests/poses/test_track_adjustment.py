@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.track_adjustment import (
-    adjust_either_way,
+    adjust_either_depth,
     adjust_tracks,
     with_lost_frames,
 )
@@ -78,10 +78,10 @@ def test_a_turn_that_was_found_reversed_in_depth_is_set_right():
     true = narrow_machine()
     start, tracks = disturbed(reversed_in_depth(true)), point_tracks(true, noise_px=0.1)
     assert pose_error_deg(adjust_tracks(start, tracks).turntable, true) > 90.0
-    assert pose_error_deg(adjust_either_way(start, tracks).turntable, true) < 2.0
+    assert pose_error_deg(adjust_either_depth(start, tracks).turntable, true) < 2.0
 
 
-def test_wrong_sightings_are_thrown_out():
+def test_wrong_observations_are_left_out():
     true = machine(np.arange(0, 360, 18.0))
     tracks = point_tracks(true, noise_px=0.1)
     rng = np.random.default_rng(5)

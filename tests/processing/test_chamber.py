@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.processing.chamber import border_spectrum, picture_of_chamber
+from hsi_sc_nerf.processing.chamber import border_spectrum, gain_of_background_image
 
 FRAMES, PIXELS, COLOURS = 12, 800, 3
 TEXTURE, NOISE = 0.05, 0.02
@@ -20,23 +20,23 @@ def chamber(still=0.0, moving=0.0, stem=0.0, seed=0):
 
 
 def test_a_texture_that_stands_still_is_measured():
-    found = picture_of_chamber(*chamber(still=TEXTURE))
+    found = gain_of_background_image(*chamber(still=TEXTURE))
     assert found.rms == pytest.approx(TEXTURE, rel=0.1)
     assert 3.0 * found.noise < found.rms
 
 
 @pytest.mark.parametrize("departure", [{}, {"moving": TEXTURE}, {"stem": 0.5}])
 def test_an_even_or_moving_chamber_needs_no_picture(departure):
-    found = picture_of_chamber(*chamber(**departure))
+    found = gain_of_background_image(*chamber(**departure))
     assert found.rms < 0.005
     assert found.noise < 0.02
 
 
 def test_a_chamber_that_is_hardly_seen_tells_nothing():
     spectra, free = chamber()
-    assert picture_of_chamber(spectra, free & (np.arange(PIXELS) < 10)) is None
+    assert gain_of_background_image(spectra, free & (np.arange(PIXELS) < 10)) is None
     free[2:] = False
-    assert picture_of_chamber(spectra, free) is None
+    assert gain_of_background_image(spectra, free) is None
 
 
 def test_border_spectrum_of_measured_values(tmp_path):
