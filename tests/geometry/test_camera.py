@@ -78,6 +78,4 @@ def test_a_rotation_about_any_axis_has_its_angle(axis, angle_deg):
     turn = np.eye(4)
     direction = np.array(axis) / np.linalg.norm(axis)
     turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(angle_deg) * direction).as_matrix()
-    assert rotation_angle_deg(turn @ POSE, POSE) == pytest.approx(
-        angle_deg, abs=3e-6 if angle_deg > 179.0 else 1e-12, rel=1e-6
-    )
+    assert rotation_angle_deg(turn @ POSE, POSE) == pytest.approx(angle_deg, rel=1.6e-8, abs=1e-12)
