@@ -16,11 +16,7 @@ from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.posed_session import with_hidden_errors
-from hsi_sc_nerf.poses.residuals import (
-    MarkerResiduals,
-    PointResiduals,
-    loop_closure_deg,
-)
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 

@@ -17,12 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import (
-    closest_point_to_rays,
-    cross_matrix,
-    rotation_about_z,
-    rotation_angle_deg,
-)
+from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable, require_parallax
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.

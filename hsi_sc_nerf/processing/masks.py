@@ -22,14 +22,7 @@ from scipy.stats import median_abs_deviation
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
-from hsi_sc_nerf.morphology import (
-    dilate,
-    draw_outline,
-    ellipse_close_open,
-    fill_holes,
-    largest_component,
-    touching,
-)
+from hsi_sc_nerf.morphology import dilate, draw_outline, ellipse_close_open, fill_holes, largest_component, touching
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 

@@ -14,12 +14,7 @@ from rich.console import Console
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
-from hsi_sc_nerf.calibration.report import (
-    REPORT_NAME,
-    describe_calibration,
-    draw_calibration,
-    write_calibration,
-)
+from hsi_sc_nerf.calibration.report import REPORT_NAME, describe_calibration, draw_calibration, write_calibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
@@ -43,13 +38,7 @@ from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_e
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
-from hsi_sc_nerf.processing.posed_frames import (
-    PoseFunction,
-    container_under,
-    known_camera,
-    pose_frames,
-    posed_frames,
-)
+from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.voted_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands

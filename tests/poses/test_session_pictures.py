@@ -7,14 +7,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from capture_factory import (
-    INTRINSICS,
-    WAVELENGTHS_NM,
-    frame_reflectance,
-    true_pose,
-    true_poses,
-    write_session,
-)
+from capture_factory import INTRINSICS, WAVELENGTHS_NM, frame_reflectance, true_pose, true_poses, write_session
 from exact_turntable import marker_turntable
 from rich.console import Console
 from scipy.special import ndtr

@@ -8,11 +8,7 @@ from exact_turntable import point_tracks, point_turntable
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.track_adjustment import (
-    adjust_either_depth,
-    adjust_tracks,
-    with_lost_frames,
-)
+from hsi_sc_nerf.poses.track_adjustment import adjust_either_depth, adjust_tracks, with_lost_frames
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
