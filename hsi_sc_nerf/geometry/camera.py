@@ -194,14 +194,14 @@ class Similarity:
         return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """As a homogeneous matrix."""
+        """The transformation as a homogeneous matrix."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> Similarity:
-        """Of a homogeneous matrix that is a similarity."""
+        """The transformation of a homogeneous matrix that is a similarity."""
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 

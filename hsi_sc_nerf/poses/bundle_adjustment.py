@@ -70,7 +70,7 @@ class ParameterLayout:
     motion_size: int
     """p, the number of parameters without the landmarks'."""
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
-    """Of each kind of residuals, and so are the hidden errors."""
+    """One array for each kind of residuals, as in ``hidden``."""
     size: int
     """m, the number of all parameters."""
 
@@ -263,8 +263,8 @@ class NormalEquations:
         return self.motion + self.coupling.T @ self.landmark_responses()
 
     def reduced(self, kind: int) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]:
-        """Of one kind of landmarks, these being unknown: its part of ``information``, and of the gradient of camera
-        and motion what each landmark contributes. The latter add to zero where the turntable is adjusted."""
+        """One kind's part of ``information``, and what each of its landmarks, being unknown, contributes to the gradient
+        by camera and motion. The contributions add to zero where the turntable is adjusted."""
         columns, part = self.problem.layout.landmarks[kind] - self.p, self.problem.residuals[kind]
         first = sum(other.numbers for other in self.problem.residuals[:kind])
         motion, residual = (a[first : first + part.numbers] for a in (self.jacobian[:, : self.p], self.residual))
@@ -304,7 +304,7 @@ class Adjusted:
 
     @cached_property
     def cost(self) -> float:
-        """Of the problem at the turntable."""
+        """Cost of the problem at the turntable."""
         return self.problem.cost(self.turntable)
 
     @property
@@ -314,11 +314,11 @@ class Adjusted:
 
     @property
     def variance(self) -> float:
-        """Of the residuals: 1 if the observations' covariances are right; at least that."""
+        """Variance of the residuals, at least 1, which it is if the observations' covariances are right."""
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
+        """Covariance of camera, lens, angles and motions, in the order of ``ParameterLayout``.
 
         Errors of one point in neighbouring frames are alike. Its observations count together, by how much the points
         contradict each other (the cluster-robust estimate of K.-Y. Liang and S. L. Zeger, 1986; A. C. Cameron and

@@ -47,9 +47,9 @@ class ContainerOutline:
 
     radius: float
     radius_sigma: float
-    """As a fraction of the radius."""
+    """Standard deviation of the radius, as a fraction of it."""
     foot: float
-    """Its height in the turntable frame, which is that of the disc."""
+    """Height of the container's foot, which stands on the disc, in the turntable frame."""
     foot_sigma: float
 
 

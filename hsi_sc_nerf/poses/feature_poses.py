@@ -38,14 +38,14 @@ from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 
 _FOCAL_SIGMA = 0.002
-"""Of an earlier session's focal length, as a fraction."""
+"""Standard deviation of an earlier session's focal length, as a fraction."""
 _LEAST_ANGLE_SIGMA_RAD = 1e-3
-"""Of a turntable's known angles."""
+"""Least standard deviation of a turntable's known angles."""
 _SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
 """An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis or this fraction of
 the focal length."""
 MOST_CONTRADICTING = 1 / 3
-"""Of COLMAP's poses; where a larger fraction contradicts one turntable, it is not known which are right."""
+"""Largest fraction of COLMAP's poses that may contradict one turntable: of more it is not known which are right."""
 
 Images = Sequence[UInt8[np.ndarray, "h w"]]
 """One image per frame, or ``SessionPictures``."""
@@ -64,7 +64,7 @@ class KnownCamera:
 
     @property
     def distance_m(self) -> float:
-        """From the turntable's axis."""
+        """The camera's distance from the turntable's axis."""
         return float(np.hypot(self.camera_to_world[0, 3], self.camera_to_world[1, 3]))
 
     def check_size(self, size_px: tuple[int, int]) -> None:

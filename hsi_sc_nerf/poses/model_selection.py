@@ -325,7 +325,7 @@ def _motion_spread(turntable: Turntable) -> tuple[float, float]:
 
 
 def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
-    """With as many terms of radial distortion as the corners call for, one after the other."""
+    """The model with as many terms of radial distortion as the corners call for, one after the other."""
     evidence = {**plain.evidence, "lens_distortion": 0.0}
     for terms in (1, 2):
         distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))

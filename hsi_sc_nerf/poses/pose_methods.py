@@ -18,7 +18,8 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 PoseMethod: TypeAlias = Literal["auto", "markers", "colmap", "angles"]
 
 FIELD_OF_VIEW_DEG = (4.0, 100.0)
-"""Over the image's width, from a long tele lens to a very wide one. Features that give another camera are too few."""
+"""Fields of view over the image's width, from a long tele lens to a very wide one: features that give another camera
+are too few."""
 # In the order in which they are tried.
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
 

@@ -33,7 +33,7 @@ _FEATURE_FIELD_PX = 0.03
 """Standard deviation of each field's amplitude for features: they creep over a skin as its light and its slope change
 (docs/validation/poses.md)."""
 _DRAWS = 2000
-"""Of errors by the covariance; the largest of all frames has no closed form."""
+"""Errors that are drawn by the covariance, for the largest of all frames has no closed form."""
 
 
 def in_object_frame(

@@ -46,7 +46,7 @@ class Residuals(ABC):
         self.numbers = self.pixels.size
 
     def values(self, turntable: Turntable) -> Float[np.ndarray, "n g r"]:
-        """In standard deviations."""
+        """Projections less observations, in standard deviations."""
         projection = turntable.project(self.seen)
         behind = projection.in_camera[:, 2:] <= self.nearest * turntable.distance
         away = np.where(behind, np.inf, projection.pixels - self.pixels)
@@ -83,7 +83,7 @@ class Residuals(ABC):
         return (2.0 * self.loss_scale**2 * (np.sqrt(1.0 + (r / self.loss_scale) ** 2) - 1.0)).sum(axis=-1)
 
     def weights(self, residual: Float[np.ndarray, "n g r"]) -> Float[np.ndarray, "n g r"]:
-        """Of each number, by the loss of its residual: 1 / sqrt(1 + r^2 / s^2)."""
+        """Weight of each number by the loss of its residual: 1 / sqrt(1 + r^2 / s^2)."""
         r = np.linalg.norm(residual, axis=-1, keepdims=True)
         return np.broadcast_to(1.0 / np.sqrt(1.0 + (r / self.loss_scale) ** 2), residual.shape)
 
@@ -116,11 +116,11 @@ class MarkerResiduals(Residuals):
         self.whitening = whitening(observations.covariance_px2) if weights is None else weights
 
     def scaled(self, pixels: Float[np.ndarray, "4*n 2 k"]) -> Float[np.ndarray, "n 8 k"]:
-        """Whitened."""
+        """Displacements, whitened."""
         return self.whitening @ pixels.reshape(len(self.frame), 8, pixels.shape[-1])
 
     def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "m 2 3"]) -> Float[np.ndarray, "m 2 d"]:
-        """By a small rotation of the marker in the object's axes, a shift, and the log of its side."""
+        """Derivatives by a small rotation of the marker in the object's axes, its shift, and the log of its side."""
         offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
         parts = [by_point @ -cross_matrix(offset), by_point] * self.free
         parts += [by_point @ offset[:, :, None]] * self.free_sides
@@ -144,11 +144,11 @@ class PointResiduals(Residuals):
         self.sigma_px = sigma_px
 
     def scaled(self, pixels: Float[np.ndarray, "n 2 k"]) -> Float[np.ndarray, "n 2 k"]:
-        """Over the standard deviation."""
+        """Displacements over the standard deviation."""
         return pixels / self.sigma_px
 
     def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 3"]:
-        """By the point's coordinates."""
+        """Derivatives by the point's coordinates."""
         return by_point
 
     def curvature(self, turntable: Turntable) -> float:

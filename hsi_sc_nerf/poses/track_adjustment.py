@@ -239,7 +239,7 @@ def _search_angle(turntable: Turntable, seen: Tracks) -> float | None:
 
 
 def _enough(tracks: Tracks, good: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Of the good rows those of points in enough frames and of frames with enough points."""
+    """The good rows of points that are seen in enough frames, in frames that show enough points."""
     while True:
         views = np.bincount(tracks.point[good], minlength=tracks.point.max(initial=0) + 1)
         good = good & (views[tracks.point] >= _FEWEST_VIEWS)

@@ -24,7 +24,8 @@ from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, cross_matrix
 FEWEST_FRAMES = 3
 """Fewer frames do not determine a turntable's axis."""
 _LEAST_DISTANCE = 0.02
-"""Of the camera from the axis, in distances of the object: nearer, all frames see it from within two degrees."""
+"""Least distance of the camera from the axis, over its distance from the object: where it is smaller, all frames see
+the object from within two degrees."""
 
 
 def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) -> None:
@@ -101,16 +102,16 @@ class Turntable:
     radial: tuple[float, float] = (0.0, 0.0)
     """Lens distortion: OpenCV's k1 and k2."""
     camera_rotation: Float[np.ndarray, "3 3"]
-    """From the turntable frame to OpenCV camera axes."""
+    """Rotation from the turntable frame to OpenCV camera axes."""
     distance: float = 1.0
-    """Of the camera from the axis."""
+    """Distance of the camera from the axis."""
     frames: Int[np.ndarray, "f"]
     angles_rad: Float[np.ndarray, "f"]
     """Counter-clockwise seen from above."""
     motion: Float[np.ndarray, "f 5"] | None = None
     """Rotation vectors (x, y, 0; rad) and shifts (3) of a wobbling table; None for a table that does not wobble."""
     side: float = 1.0
-    """Of the markers' black square."""
+    """Side of the markers' black square."""
     markers: Int[np.ndarray, "m"] = field(default_factory=_no_numbers)
     """Ids, ascending."""
     marker_poses: Float[np.ndarray, "m 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -248,17 +249,17 @@ class Jacobian:
     """Derivatives of the pixels."""
 
     camera: Float[np.ndarray, "n 2 5"]
-    """By the log of the focal length, a small rotation of the camera (3, rad), the log of its distance."""
+    """Derivatives by the log of the focal length, a small camera rotation (3, rad), the log of the distance."""
     radial: Float[np.ndarray, "n 2 2"]
-    """By k1 and k2."""
+    """Derivatives by k1 and k2."""
     angle: Float[np.ndarray, "n 2 1"]
-    """By the frame's angle, rad."""
+    """Derivatives by the frame's angle, rad."""
     motion: Float[np.ndarray, "n 2 5"] | None
-    """By the frame's tilt (2, rad) and shift (3); None for a turntable without."""
+    """Derivatives by the frame's tilt (2, rad) and shift (3); None for a turntable without motions."""
     point: Float[np.ndarray, "n 2 3"]
-    """By the point, in the object's axes."""
+    """Derivatives by the point, in the object's axes."""
     hidden: Float[np.ndarray, "n 2 k"] | None = None
-    """By the amplitudes of displacements that the residuals hardly show."""
+    """Derivatives by the amplitudes of displacements that the residuals hardly show."""
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Jacobian:
         """The derivatives after ``function``, which acts on the pixels' axes."""

@@ -36,7 +36,7 @@ CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
 
 COLUMNS, TILE_PX = 6, 240
-"""Of the contact sheet: frames in a row, and the width of each."""
+"""Frames in a row of the contact sheet, and the width of each."""
 NEARBY_PX = 2.0
 """Standard deviation of the Gaussian weights with which what is next to a pixel is averaged."""
 HALF_COVERED = 0.5
