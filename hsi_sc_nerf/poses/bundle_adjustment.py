@@ -263,7 +263,7 @@ class NormalEquations:
         return self.motion + self.coupling.T @ self.landmark_responses()
 
     def reduced(self, kind: int) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]:
-        """One kind's part of ``information``, and what each of its landmarks, being unknown, contributes to the gradient
+        """One kind's part of ``information``, and what each of its landmarks, being unknown, adds to the gradient
         by camera and motion. The contributions add to zero where the turntable is adjusted."""
         columns, part = self.problem.layout.landmarks[kind] - self.p, self.problem.residuals[kind]
         first = sum(other.numbers for other in self.problem.residuals[:kind])
