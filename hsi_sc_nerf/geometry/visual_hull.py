@@ -48,10 +48,11 @@ def visual_hull(
     max_missed = int(max_missed_fraction * len(masks) + 1e-9)
     # A few frames rule out most points, before all frames test the rest.
     for step in (_FIRST_STEP, 1):
-        poses = camera_to_worlds[::step]
-        in_image, in_mask = silhouette_counts(
-            points, masks[::step], lambda frame, points, poses=poses: pixels_of(points, poses[frame], intrinsics)
-        )
+
+        def pixels_in(frame: int, points: Float[np.ndarray, "n 3"], step: int = step) -> tuple[Any, Any]:
+            return pixels_of(points, camera_to_worlds[frame * step], intrinsics)
+
+        in_image, in_mask = silhouette_counts(points, masks[::step], pixels_in)
         keep = in_image - in_mask <= max_missed
         points, in_image = points[keep], in_image[keep]
     return points[in_image >= MIN_VIEWS_FRACTION * len(masks) - 1e-9]
