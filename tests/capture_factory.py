@@ -35,12 +35,17 @@ def true_pose(angle_deg: float) -> np.ndarray:
     return turntable_camera_to_world(look_at([0.4, 0.0, 0.25], [0.0, 0.0, 0.1]), angle_deg)
 
 
-def sphere_mask(camera_to_world: np.ndarray, intrinsics: PinholeIntrinsics = INTRINSICS) -> np.ndarray:
+def sphere_mask(
+    camera_to_world: np.ndarray,
+    intrinsics: PinholeIntrinsics = INTRINSICS,
+    centre_m: np.ndarray = SPHERE_CENTRE_M,
+    radius_m: float = SPHERE_RADIUS_M,
+) -> np.ndarray:
     x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
     origin, directions = pixel_rays(intrinsics, camera_to_world, np.stack([x, y], axis=-1))
-    towards = SPHERE_CENTRE_M - origin
+    towards = centre_m - origin
     along = directions @ towards
-    return towards @ towards - along**2 < SPHERE_RADIUS_M**2
+    return towards @ towards - along**2 < radius_m**2
 
 
 def frame_reflectance(angle_deg: float) -> np.ndarray:

@@ -1,10 +1,14 @@
-"""Turntables in the adjustment's terms, and exact or noisy sightings of their markers and points."""
+"""Turntables in the adjustment's terms, and exact or noisy observations of their markers and points."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from hsi_sc_nerf.geometry.camera import rotation_angle_deg
+from hsi_sc_nerf.poses.bundle_adjustment import Problem
+from hsi_sc_nerf.poses.marker_initialisation import initialise
+from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Tracks, Turntable, project, rotations_about_z
 
 SIDE_M, NOISE_PX = 0.03, 0.03
@@ -36,20 +40,35 @@ def marker_turntable(scene, **changes):
     return replace(turntable, **changes)
 
 
-def marker_observations(turntable, noise_px=NOISE_PX, seed=0):
+def marker_observations(turntable, noise_px=NOISE_PX, seed=0, least_cosine=0.25):
     """Noisy corners of all markers that face the camera; their covariance is that of ``NOISE_PX``."""
     rng = np.random.default_rng(seed)
     normals, centres = turntable.marker_poses[:, :3, 2], turntable.marker_poses[:, :3, 3]
     pairs = []
     for frame, camera in enumerate(turntable.camera_positions()):
         view = camera - centres
-        facing = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1) > 0.25
+        facing = (view * normals).sum(-1) / np.linalg.norm(view, axis=-1) > least_cosine
         pairs += [(frame, marker) for marker in turntable.markers[facing]]
     frame, marker = np.array(pairs).T
     covariance = np.tile(np.eye(8) * NOISE_PX**2, (len(frame), 1, 1))
     blank = MarkerObservations(frame, marker, np.zeros((len(frame), 4, 2)), covariance)
     corners = turntable.reproject(blank)
     return replace(blank, corners_px=corners + noise_px * rng.normal(size=corners.shape))
+
+
+def started(scene, seen):
+    """The initial turntable of a ``MarkerScene`` whose markers are seen."""
+    return initialise(seen, (scene.size_px / 2, scene.size_px / 2), scene.size_px, SIDE_M)
+
+
+def adjusted(start, seen):
+    """The turntable adjusted to its markers."""
+    return Problem(MarkerResiduals(start, seen, 3.0)).minimise(start)
+
+
+def in_object_frame(turntable):
+    """Its poses in the object frame, whose origin is on the disc."""
+    return to_object_frame(turntable, disc_height(turntable)) @ turntable.camera_to_world()
 
 
 def point_turntable(turntable, points, seed=0):

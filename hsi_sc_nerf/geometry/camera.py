@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 # Multiplying a camera-to-world pose by this on the right turns OpenCV axes (y down, looking along +z) into
@@ -77,6 +78,37 @@ def project(
     depth = in_camera[..., 2]
     scale, centre = (intrinsics.fl_x, intrinsics.fl_y), (intrinsics.cx, intrinsics.cy)
     return in_camera[..., :2] / depth[..., None] * scale + centre, depth
+
+
+def pixels_of(
+    points: Float[np.ndarray, "n 3"], camera_to_world: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics
+) -> tuple[Bool[np.ndarray, "n"], Int[np.ndarray, "n 2"]]:
+    """Which object-frame points lie in the image, and their pixels (sample, line), (0, 0) where they do not."""
+    pixels, depth = project(points, camera_to_world, intrinsics)
+    inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
+    return inside, np.where(inside[:, None], pixels, 0.0).astype(int)
+
+
+def image_of(
+    points: Float[np.ndarray, "n 3"], camera_to_world: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels that object-frame points project into, hidden or not."""
+    inside, pixels = pixels_of(points, camera_to_world, intrinsics)
+    image = np.zeros((intrinsics.h, intrinsics.w), bool)
+    image[pixels[inside, 1], pixels[inside, 0]] = True
+    return image
+
+
+def project_distorted(
+    points: Float[np.ndarray, "n 3"],
+    camera_to_world: Float[np.ndarray, "4 4"],
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"],
+) -> Float[np.ndarray, "n 2"]:
+    """Pixel coordinates of object-frame points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
+    to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
+    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]
 
 
 def pixel_rays(
@@ -162,14 +194,14 @@ class Similarity:
         return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """As a homogeneous matrix."""
+        """The transformation as a homogeneous matrix."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> Similarity:
-        """Of a homogeneous matrix that is a similarity."""
+        """The transformation of a homogeneous matrix that is a similarity."""
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixels_of
 
 MIN_VIEWS_FRACTION = 2.0 / 3.0
 """A point of the hull lies in the image of this fraction of the frames: too few masks carve what lies far behind the
@@ -49,12 +49,10 @@ def visual_hull(
     # A few frames rule out most points, before all frames test the rest.
     for step in (_FIRST_STEP, 1):
 
-        def pixels_of(frame: int, points: Float[np.ndarray, "n 3"], step: int = step) -> tuple[Any, Any]:
-            pixels, depth = project(points, camera_to_worlds[frame * step], intrinsics)
-            inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
-            return inside, np.where(inside[:, None], pixels, 0.0).astype(int)
+        def pixels_in(frame: int, points: Float[np.ndarray, "n 3"], step: int = step) -> tuple[Any, Any]:
+            return pixels_of(points, camera_to_worlds[frame * step], intrinsics)
 
-        in_image, in_mask = silhouette_counts(points, masks[::step], pixels_of)
+        in_image, in_mask = silhouette_counts(points, masks[::step], pixels_in)
         keep = in_image - in_mask <= max_missed
         points, in_image = points[keep], in_image[keep]
     return points[in_image >= MIN_VIEWS_FRACTION * len(masks) - 1e-9]

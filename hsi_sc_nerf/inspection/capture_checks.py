@@ -13,7 +13,7 @@ from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.capture.session import Capture, Session, in_short
 from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
-from hsi_sc_nerf.inspection.look import Look, saturation_level
+from hsi_sc_nerf.inspection.quicklook import Quicklook, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
 _DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}")
@@ -163,19 +163,21 @@ def _same(
     return Finding(name, level, sentence, {"usual": usual, "others": {f: values[f] for f in others}})
 
 
-def check_frames(session: Session, looks: Sequence[Look], detections: Sequence[Detections]) -> list[Finding]:
+def check_frames(
+    session: Session, quicklooks: Sequence[Quicklook], detections: Sequence[Detections]
+) -> list[Finding]:
     """The findings ``exposure``, ``focus``, ``copies`` and ``other-object``.
 
     Args:
         session: the session.
-        looks: a look at each of its frames.
+        quicklooks: of its frames.
         detections: markers of each frame.
     """
     return [
-        _exposure(session, looks),
-        _focus(session, looks),
-        _copies(session, looks),
-        _other_object(session, looks, detections),
+        _exposure(session, quicklooks),
+        _focus(session, quicklooks),
+        _copies(session, quicklooks),
+        _other_object(session, quicklooks, detections),
     ]
 
 
@@ -195,10 +197,10 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     return deviation / max(float(np.median(deviation)), 1e-12)
 
 
-def _exposure(session: Session, looks: Sequence[Look]) -> Finding:
-    level = saturation_level(session, looks) if session.has_counts else None
-    saturated = np.array([look.at_top_fraction * (level is not None and look.top_counts >= level) for look in looks])
-    dark = np.array([look.dark_fraction for look in looks])
+def _exposure(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
+    level = saturation_level(session, quicklooks) if session.has_counts else None
+    saturated = np.array([q.at_top_fraction * (level is not None and q.top_counts >= level) for q in quicklooks])
+    dark = np.array([q.dark_fraction for q in quicklooks])
     wavelengths_nm = session.wavelengths_nm
     bright_frames, dark_frames = saturated.mean(axis=1), dark.mean(axis=1)
     worst = int(saturated.mean(axis=0).argmax())
@@ -214,35 +216,33 @@ def _exposure(session: Session, looks: Sequence[Look]) -> Finding:
         f"{100.0 * dark_frames.mean():.2g} % are dark"
     )
     if bright_frames.max() > SATURATED_AMBER:
-        told += f"; the brightest frame is {looks[int(bright_frames.argmax())].name}, expose shorter"
+        told += f"; the brightest frame is {quicklooks[int(bright_frames.argmax())].name}, expose shorter"
     elif dark_frames.max() > DARK_AMBER:
-        told += f"; the darkest frame is {looks[int(dark_frames.argmax())].name}, expose longer"
+        told += f"; the darkest frame is {quicklooks[int(dark_frames.argmax())].name}, expose longer"
     values = {
         "saturation_counts": level,
-        "saturated_fraction_by_frame": _by_name(looks, bright_frames),
-        "dark_fraction_by_frame": _by_name(looks, dark_frames),
+        "saturated_fraction_by_frame": _by_name(quicklooks, bright_frames),
+        "dark_fraction_by_frame": _by_name(quicklooks, dark_frames),
         "saturated_fraction_by_band": saturated.mean(axis=0).round(5).tolist(),
         "dark_fraction_by_band": dark.mean(axis=0).round(5).tolist(),
     }
     return Finding("exposure", found, f"{session.path}: {told}." if found == "red" else f"Exposure: {told}.", values)
 
 
-def _focus(session: Session, looks: Sequence[Look]) -> Finding:
-    sharpness = np.array([look.sharpness_per_px for look in looks])
+def _focus(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
+    sharpness = np.array([q.sharpness_per_px for q in quicklooks])
     relative = sharpness / max(float(np.median(sharpness)), 1e-12)
-    blurred = [look.name for look, ratio in zip(looks, relative, strict=True) if ratio < BLURRED]
-    values = {"sharpness_over_median": _by_name(looks, relative)}
+    blurred = [q.name for q, ratio in zip(quicklooks, relative, strict=True) if ratio < BLURRED]
+    values = {"sharpness_over_median": _by_name(quicklooks, relative)}
     if blurred:
         sentence = f"Focus: less sharp than the other frames: {names_in_short(blurred)}; look at the picture."
         return Finding("focus", "amber", sentence, values)
     return Finding("focus", "green", "Focus: all frames are about equally sharp.", values)
 
 
-def _copies(session: Session, looks: Sequence[Look]) -> Finding:
+def _copies(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
     first_of: dict[str, str] = {}
-    copies = [
-        (first, look.name) for look in looks if (first := first_of.setdefault(look.digest, look.name)) != look.name
-    ]
+    copies = [(first, q.name) for q in quicklooks if (first := first_of.setdefault(q.digest, q.name)) != q.name]
     if not copies:
         return Finding("copies", "green", "No frame is a copy of another.")
     told = ", ".join(f"{copy} is a copy of {first}" for first, copy in copies[:4])
@@ -250,20 +250,20 @@ def _copies(session: Session, looks: Sequence[Look]) -> Finding:
     return Finding("copies", "red", sentence, {"copies": [list(pair) for pair in copies]})
 
 
-def _other_object(session: Session, looks: Sequence[Look], detections: Sequence[Detections]) -> Finding:
-    if len(looks) < FEWEST_COMPARED:
+def _other_object(session: Session, quicklooks: Sequence[Quicklook], detections: Sequence[Detections]) -> Finding:
+    if len(quicklooks) < FEWEST_COMPARED:
         return Finding("other-object", "green", "There are too few frames to tell another object from a turn.")
-    ratios = deviations([look.picture for look in looks])
+    ratios = deviations([q.picture for q in quicklooks])
     seen = [set(found) for found in detections]
     strangers = [
-        look.name
-        for index, look in enumerate(looks)
+        q.name
+        for index, look in enumerate(quicklooks)
         if len(seen[index]) > 1
         and not any(seen[index] & other for number, other in enumerate(seen) if number != index)
     ]
-    different = [look.name for look, ratio in zip(looks, ratios, strict=True) if ratio > DIFFERENT_RED]
-    values = {"deviation_over_median": _by_name(looks, ratios), "unknown_markers": strangers}
-    wrong = [look.name for look in looks if look.name in {*different, *strangers}]
+    different = [q.name for q, ratio in zip(quicklooks, ratios, strict=True) if ratio > DIFFERENT_RED]
+    values = {"deviation_over_median": _by_name(quicklooks, ratios), "unknown_markers": strangers}
+    wrong = [q.name for q in quicklooks if q.name in {*different, *strangers}]
     if wrong:
         why = "unlike all other frames" if different else "other markers than in all other frames"
         sentence = (
@@ -271,12 +271,12 @@ def _other_object(session: Session, looks: Sequence[Look], detections: Sequence[
             f"{leave_out(wrong)}."
         )
         return Finding("other-object", "red", sentence, values)
-    doubtful = [look.name for look, ratio in zip(looks, ratios, strict=True) if ratio > DIFFERENT_AMBER]
+    doubtful = [q.name for q, ratio in zip(quicklooks, ratios, strict=True) if ratio > DIFFERENT_AMBER]
     if doubtful:
         sentence = f"Somewhat unlike the other frames: {names_in_short(doubtful)}; compare them in the picture."
         return Finding("other-object", "amber", sentence, values)
     return Finding("other-object", "green", "All frames look like frames of one object.", values)
 
 
-def _by_name(looks: Sequence[Look], numbers: Float[np.ndarray, "frames"]) -> dict[str, float]:
-    return {look.name: round(float(number), 5) for look, number in zip(looks, numbers, strict=True)}
+def _by_name(quicklooks: Sequence[Quicklook], numbers: Float[np.ndarray, "frames"]) -> dict[str, float]:
+    return {q.name: round(float(number), 5) for q, number in zip(quicklooks, numbers, strict=True)}

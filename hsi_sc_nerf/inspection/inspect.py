@@ -19,8 +19,8 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
-from hsi_sc_nerf.inspection.look import Look, look_at_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
+from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.feature_poses import known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
@@ -38,14 +38,14 @@ class Inspection:
 
     Attributes:
         session: the session, with the rotation of its images as measured.
-        looks: a look at each frame.
+        quicklooks: of each frame.
         markers: what is seen of markers.
         findings: results of all checks.
         session_json: content of ``session.json`` with what could be measured filled in; None for what is not known.
     """
 
     session: Session
-    looks: Sequence[Look]
+    quicklooks: Sequence[Quicklook]
     markers: Markers
     findings: Sequence[Finding]
     session_json: dict[str, object]
@@ -82,20 +82,20 @@ def inspect_session(
         >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))
         >>> refuse_red(inspection.findings)
     """
-    looks = look_at_frames(session)
-    markers = find_markers(session, looks)
+    quicklooks = quicklooks_of(session)
+    markers = find_markers(session, quicklooks)
     session, upright = _upright(session, markers)
     suggested = filled_in(session, markers)
     findings = [
         *check_files(session, skip_damaged),
         *check_white(session, white_source),
-        *check_frames(session, looks, markers.detections),
+        *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
         upright,
         check_scale(session, poses, scale_known),
         *check_angles(session, poses, markers),
     ]
-    return Inspection(session, looks, markers, findings, suggested)
+    return Inspection(session, quicklooks, markers, findings, suggested)
 
 
 def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
@@ -189,19 +189,19 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     Raises:
         InputError: the operating system refused to write.
     """
-    looks, session = inspection.looks, inspection.session
-    names = [look.name for look in looks]
+    quicklooks, session = inspection.quicklooks, inspection.session
+    names = [q.name for q in quicklooks]
     red = " ".join(finding.sentence for finding in inspection.findings if finding.level == "red")
-    rows = -(-len(looks) // THUMBNAIL_COLUMNS)
-    thumbnails = [_thumbnail(np.rot90(look.picture, session.quarter_turns)) for look in looks]
+    rows = -(-len(quicklooks) // THUMBNAIL_COLUMNS)
+    thumbnails = [_thumbnail(np.rot90(q.picture, session.quarter_turns)) for q in quicklooks]
     height, width = thumbnails[0].shape[:2]
     sheet = np.ones((rows * height, THUMBNAIL_COLUMNS * width, 3), np.float32)
     for index, thumbnail in enumerate(thumbnails):
         top, left = index // THUMBNAIL_COLUMNS * height, index % THUMBNAIL_COLUMNS * width
         sheet[top : top + height, left : left + width] = thumbnail
     lines: dict[str, Sequence[float]] = {
-        "brightness": [float(look.picture.mean()) for look in looks],
-        "sharpness, 1/px": [look.sharpness_per_px for look in looks],
+        "brightness": [float(q.picture.mean()) for q in quicklooks],
+        "sharpness, 1/px": [q.sharpness_per_px for q in quicklooks],
         "markers": [len(seen) for seen in inspection.markers.detections],
     }
     with rc_context(STYLE):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
-from hsi_sc_nerf.inspection.look import WORKERS, Look, reflectance_noise
+from hsi_sc_nerf.inspection.quicklook import WORKERS, Quicklook, reflectance_noise
 from hsi_sc_nerf.poses.marker_detection import Detections, detect_markers, find_dictionary
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 from hsi_sc_nerf.poses.marker_initialisation import initialise
@@ -79,9 +79,9 @@ class Markers:
         return float(steps[np.abs(steps - median) <= 0.5 * abs(median)].mean())
 
 
-def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
+def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
     """Look for markers in all frames, of the stated dictionary or of the one that fits best."""
-    grays = [look.gray for look in looks]
+    grays = [quicklook.gray for quicklook in quicklooks]
     dictionary = session.info.marker_dictionary or find_dictionary(grays)
     detections: list[Detections] = [{} for _ in grays]
     if dictionary is not None:
@@ -97,7 +97,7 @@ def find_markers(session: Session, looks: Sequence[Look]) -> Markers:
     for number in np.unique(np.linspace(0, max(len(seen) - 1, 0), FITTED_MARKERS).astype(int))[: len(seen)].tolist():
         index, marker = seen[number]
         assert dictionary is not None
-        image = looks[index].picture.mean(axis=-1).astype(float)
+        image = quicklooks[index].picture.mean(axis=-1).astype(float)
         fit = fit_marker(image, dictionary, marker, detections[index][marker])
         if fit is not None:
             errors.append(float(np.sqrt(np.diag(fit.covariance_px2).mean())))

@@ -11,7 +11,7 @@ from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_capture
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
-from hsi_sc_nerf.inspection.look import Look, look_at, white_counts
+from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklook_of, white_counts
 from hsi_sc_nerf.poses.marker_detection import detect_markers, find_dictionary
 
 FEWEST_TO_COMPARE = 3
@@ -36,7 +36,7 @@ class Watch:
         self.flagged: list[str] = []
         self.incomplete: dict[str, str] = {}
         self._seen: set[str] = set()
-        self._looks: list[Look] = []
+        self._quicklooks: list[Quicklook] = []
         self._markers: list[int] = []
         self._told: set[str] = set()
         self._info = SessionInfo()
@@ -84,9 +84,9 @@ class Watch:
         return self._first is None or self._first.dark is None or "dark" in files.headers
 
     def _line(self, capture: Capture, dictionary: str | None, is_white: bool) -> str:
-        look = look_at(capture, white_counts(capture))
-        saturated = float(look.at_top_fraction.mean()) if _is_full_scale(look.top_counts) else 0.0
-        dark = float(look.dark_fraction.mean())
+        quicklook = quicklook_of(capture, white_counts(capture))
+        saturated = float(quicklook.at_top_fraction.mean()) if _is_full_scale(quicklook.top_counts) else 0.0
+        dark = float(quicklook.dark_fraction.mean())
         parts = [f"saturated {100.0 * saturated:.1f} %", f"dark {100.0 * dark:.1f} %"]
         faults = []
         if saturated > SATURATED_RED:
@@ -100,25 +100,25 @@ class Watch:
                 faults.append(f"taken on {acquisition_day(capture)}, not {acquisition_day(self._first)}")
         if not is_white:
             self._first = self._first or capture
-            faults += self._compare(look, dictionary)
-            parts += [f"sharpness {look.sharpness_per_px:.3f}/px", f"markers {self._markers[-1]}"]
+            faults += self._compare(quicklook, dictionary)
+            parts += [f"sharpness {quicklook.sharpness_per_px:.3f}/px", f"markers {self._markers[-1]}"]
         if faults:
             self.flagged.append(capture.name)
         return f"{capture.name}: {', '.join(parts)}; {', '.join(faults).upper() if faults else 'ok'}"
 
-    def _compare(self, look: Look, dictionary: str | None) -> list[str]:
+    def _compare(self, quicklook: Quicklook, dictionary: str | None) -> list[str]:
         """What is wrong with a frame beside those before it."""
         faults = []
-        self._dictionary = dictionary or self._dictionary or find_dictionary([look.gray])
-        markers = 0 if self._dictionary is None else len(detect_markers(look.gray, self._dictionary))
-        if len(self._looks) >= FEWEST_TO_COMPARE:
-            if look.sharpness_per_px < BLURRED * np.median([other.sharpness_per_px for other in self._looks]):
+        self._dictionary = dictionary or self._dictionary or find_dictionary([quicklook.gray])
+        markers = 0 if self._dictionary is None else len(detect_markers(quicklook.gray, self._dictionary))
+        if len(self._quicklooks) >= FEWEST_TO_COMPARE:
+            if quicklook.sharpness_per_px < BLURRED * np.median([q.sharpness_per_px for q in self._quicklooks]):
                 faults.append("less sharp than before")
             if markers == 0 and np.median(self._markers) >= 1.0:
                 faults.append("no markers")
-        if any(look.digest == other.digest for other in self._looks):
+        if any(quicklook.digest == other.digest for other in self._quicklooks):
             faults.append("a copy of an earlier capture")
-        self._looks.append(look)
+        self._quicklooks.append(quicklook)
         self._markers.append(markers)
         return faults
 

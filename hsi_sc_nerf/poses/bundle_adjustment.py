@@ -1,35 +1,39 @@
 """Bundle adjustment of a turntable and its landmarks (markers, points): Levenberg-Marquardt with a robust loss.
 
 Only what a turntable has is adjusted: one camera, one axis, one angle per frame, the landmarks, and if they are free
-radial lens distortion and small motions of a wobbling table. The landmarks are eliminated (``normal_equations``):
-B. Triggs et al., "Bundle adjustment - a modern synthesis" (2000), section 4.3. SciPy's ``least_squares`` has no such
+radial lens distortion and small motions of a wobbling table. The Schur complement eliminates the landmarks: B. Triggs
+et al., "Bundle adjustment - a modern synthesis" (2000), sections 4.3 and 6.1. SciPy's ``least_squares`` has no such
 elimination; thousands of points would take it minutes.
 
-Symbols: n sightings with g residuals of r numbers each, l landmarks of d parameters, p other parameters.
+Symbols: n observations with g residuals of r numbers each, l landmarks of d parameters, p other parameters, m
+parameters and N residual numbers in all.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array, vstack
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.normal_equations import LandmarkEquations, NormalEquations
 from hsi_sc_nerf.poses.residuals import PointResiduals, Residuals
-from hsi_sc_nerf.poses.turntable import Jacobian, Turntable
+from hsi_sc_nerf.poses.turntable import Turntable
 
 _MOST_STEPS = 100
 _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
 _DAMPING_RANGE = (1e-12, 1e8)
 # A known focal length weighs as if its standard deviation were this fraction of what it is, for that of the landmarks
 # may be wrong by more than they tell (``Adjusted.covariance`` counts what it is).
-_HELD = 0.03
+_PRIOR_SCALE = 0.03
 
 
 @dataclass(frozen=True)
@@ -54,67 +58,61 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Columns of camera, radial terms, angles, motions and hidden errors; behind these p come the landmarks."""
+    """Columns of the Jacobian: camera, radial terms, angles, motions and hidden errors; then the landmarks'."""
 
-    motion_size: int
-    """p, the number of parameters without the landmarks'."""
     camera: Int[np.ndarray, "c"]
     """Log focal length, rotation (3), log distance."""
     radial: Int[np.ndarray, "r"]
     angle: Int[np.ndarray, "f"]
-    """Held angles have the column p, which is dropped."""
+    """Held angles have the column -1, which is dropped."""
     motion: Int[np.ndarray, "f 5"]
     hidden: tuple[Int[np.ndarray, "k"], ...]
+    motion_size: int
+    """p, the number of parameters without the landmarks'."""
     landmarks: tuple[Int[np.ndarray, "l d"], ...]
-    """Of each kind of residuals, and so are the hidden errors."""
-
-    @property
-    def size(self) -> int:
-        """Number of all parameters."""
-        return self.motion_size + sum(columns.size for columns in self.landmarks)
+    """One array for each kind of residuals, as in ``hidden``."""
+    size: int
+    """m, the number of all parameters."""
 
     @staticmethod
-    def of(free: FreeParameters, frames: int, residuals: Sequence[Residuals]) -> ParameterLayout:
-        """The columns for a number of frames, and the landmarks and hidden errors of the residuals."""
-        camera = (4 + free.distance) * free.camera
-        radial = camera + free.radial_terms
+    def of(free: FreeParameters, residuals: Sequence[Residuals]) -> ParameterLayout:
+        """The columns for the residuals' frames, landmarks and hidden errors."""
+        end, frames = 0, residuals[0].frames
+
+        def take(*shape: int) -> Int[np.ndarray, "*shape"]:
+            nonlocal end
+            end += math.prod(shape)
+            return np.arange(end - math.prod(shape), end).reshape(shape)
+
         held = frames if not free.angles else int(free.camera)
-        angle = radial + frames - held
-        motion = angle + (5 * frames if free.motion_sigmas else 0)
-        hidden_sizes = [0 if part.hidden is None else part.hidden.shape[-1] for part in residuals]
-        size = end = motion + sum(hidden_sizes)
-        landmarks = []
-        for part in residuals:
-            landmarks.append(end + np.arange(part.size * part.d).reshape(part.size, part.d))
-            end += part.size * part.d
         return ParameterLayout(
-            motion_size=size,
-            camera=np.arange(camera),
-            radial=np.arange(camera, radial),
-            angle=np.concatenate([np.full(held, size), np.arange(radial, angle)]),
-            motion=np.arange(angle, motion).reshape(-1, 5),
-            hidden=tuple(np.split(np.arange(motion, size), np.cumsum(hidden_sizes)[:-1])),
-            landmarks=tuple(landmarks),
+            camera=take((4 + free.distance) * free.camera),
+            radial=take(free.radial_terms),
+            angle=np.concatenate([np.full(held, -1), take(frames - held)]),
+            motion=take(frames if free.motion_sigmas else 0, 5),
+            hidden=tuple(take(0 if part.hidden is None else part.hidden.shape[-1]) for part in residuals),
+            motion_size=end,
+            landmarks=tuple(take(part.size, part.d) for part in residuals),
+            size=end,
         )
 
 
 class Problem:
     """Residuals of a turntable, their derivatives and robust normal equations."""
 
-    def __init__(self, start: Turntable, *residuals: Residuals, free: FreeParameters | None = None) -> None:
+    def __init__(self, *residuals: Residuals, free: FreeParameters | None = None) -> None:
         """Args:
-        start: the turntable that the residuals were made for.
-        residuals: of each kind of landmarks.
+        residuals: of each kind of landmarks, made for the same turntable.
         free: parameters to adjust beside the landmarks; by default camera and angles.
         """
         self.residuals, self.free = residuals, free or FreeParameters()
-        self.layout = ParameterLayout.of(self.free, len(start.frames), residuals)
+        self.layout = ParameterLayout.of(self.free, residuals)
         self.numbers = sum(part.numbers for part in residuals)
 
     def cost(self, turntable: Turntable) -> float:
         """Sum of the losses of the residuals, and of the squares of what contradicts prior knowledge."""
-        away, _ = self.priors(turntable)
-        return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(away @ away)
+        residual, _ = self.priors(turntable)
+        return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(residual @ residual)
 
     def priors(self, turntable: Turntable) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k p+1"]]:
         """Distances from what is known before in standard deviations, and their derivatives.
@@ -123,10 +121,10 @@ class Problem:
         relative to the mean of all.
         """
         free, c = self.free, self.layout
-        away, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
+        residual, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
 
         def add(distances: np.ndarray, columns: np.ndarray, jacobian: np.ndarray) -> None:
-            away.append(distances)
+            residual.append(distances)
             by.append(np.zeros((len(distances), c.motion_size + 1)))
             np.add.at(by[-1], (np.arange(len(distances))[:, None], columns), jacobian)
 
@@ -135,70 +133,49 @@ class Problem:
             add(turntable.motion.ravel() / sigmas, c.motion.reshape(-1, 1), 1.0 / sigmas[:, None])
         if free.known_focal is not None:
             focal_px, sigma = free.known_focal
-            sigma *= _HELD
+            sigma *= _PRIOR_SCALE
             add(np.log([turntable.focal_px / focal_px]) / sigma, c.camera[:1], np.array([[1.0 / sigma]]))
         if free.known_angles is not None:
             angles_rad, sigma = free.known_angles
             about_mean = np.eye(len(angles_rad)) - 1.0 / len(angles_rad)
             add(about_mean @ (turntable.angles_rad - angles_rad) / sigma, c.angle, about_mean / sigma)
-        return np.concatenate(away), np.concatenate(by)
-
-    def motion_jacobian(
-        self, part: Residuals, jacobian: Jacobian
-    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
-        """The columns that a row depends on, and its derivatives by them."""
-        c, n = self.layout, len(part.frame)
-        shared = np.concatenate([c.camera, c.radial])
-        columns = [np.broadcast_to(shared, (n, len(shared)))]
-        values = [jacobian.camera[..., : len(c.camera)], jacobian.radial[..., : len(c.radial)]]
-        if self.free.angles:
-            columns.append(c.angle[part.frame][:, None])
-            values.append(jacobian.angle)
-        if jacobian.motion is not None and c.motion.size:
-            columns.append(c.motion[part.frame])
-            values.append(jacobian.motion)
-        if jacobian.hidden is not None:
-            hidden = c.hidden[self.residuals.index(part)]
-            columns.append(np.broadcast_to(hidden, (n, len(hidden))))
-            values.append(jacobian.hidden)
-        return np.concatenate(columns, axis=1), np.concatenate(values, axis=2)
+        return np.concatenate(residual), np.concatenate(by)
 
     def normal_equations(self, turntable: Turntable) -> NormalEquations:
         """The normal equations with each residual weighted by its loss."""
-        width = self.layout.motion_size + 1
-        motion, gradient, landmarks = np.zeros((width, width)), np.zeros(width), []
+        jacobians, residuals, width = [], [], self.layout.size + 1
         for part in self.residuals:
-            residual = part.values(turntable)
-            jacobian, by_landmark = part.jacobian(turntable)
-            columns, values = self.motion_jacobian(part, jacobian)
-            weight, residual = (a.reshape(len(values), -1, 1) for a in (part.weights(residual), residual))
-            weighted = np.swapaxes(weight * values, 1, 2)
-            cell = columns[:, :, None] * width + columns[:, None, :]
-            own = np.bincount(cell.ravel(), (weighted @ values).ravel(), width**2).reshape(width, width)
-            weighted_landmark = np.swapaxes(weight * by_landmark, 1, 2)
-            pair = (part.landmark[:, None] * width + columns).ravel()
-            products = weighted_landmark @ values
-            coupling = [np.bincount(pair, products[:, k].ravel(), part.size * width) for k in range(part.d)]
-            scores = np.bincount(pair, (weighted @ residual).ravel(), part.size * width).reshape(part.size, width)
-            motion += own
-            gradient += scores.sum(axis=0)
-            landmarks.append(
-                LandmarkEquations(
-                    normal=_summed(weighted_landmark @ by_landmark, part.landmark, part.size),
-                    gradient=_summed((weighted_landmark @ residual)[..., 0], part.landmark, part.size),
-                    coupling=np.array(coupling).reshape(part.d, part.size, width).swapaxes(0, 1)[..., :-1],
-                    motion=own[:-1, :-1],
-                    motion_gradient=scores[:, :-1],
-                )
-            )
-        away, by = self.priors(turntable)
-        motion += by.T @ by
-        gradient += by.T @ away
-        return NormalEquations(motion[:-1, :-1], gradient[:-1], tuple(landmarks))
+            residual, (columns, values) = part.values(turntable), self._derivatives(part, turntable)
+            root = np.sqrt(part.weights(residual)).reshape(*values.shape[:2], 1)
+            cells = np.broadcast_to(columns[:, None] % width, values.shape)
+            starts = np.arange(values.shape[0] * values.shape[1] + 1) * values.shape[2]
+            jacobians.append(csr_array(((root * values).ravel(), cells.ravel(), starts), (len(starts) - 1, width)))
+            residuals.append(root.ravel() * residual.ravel())
+        prior, by = self.priors(turntable)
+        jacobians.append(csr_array(np.pad(by[:, :-1], ((0, 0), (0, width - by.shape[1] + 1)))))
+        jacobian = vstack(jacobians, format="csr")[:, :-1]
+        return NormalEquations(jacobian, np.concatenate([*residuals, prior]), self)
 
-    def moved(
-        self, turntable: Turntable, step: Float[np.ndarray, "p"], landmark_steps: Sequence[Float[np.ndarray, "l d"]]
-    ) -> Turntable:
+    def _derivatives(
+        self, part: Residuals, turntable: Turntable
+    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n g*r k"]]:
+        """The columns that the rows of an observation depend on, and the derivatives by them."""
+        (jacobian, by_landmark), c, kind = part.jacobian(turntable), self.layout, self.residuals.index(part)
+        pairs = [
+            (c.camera, jacobian.camera[..., : len(c.camera)]),
+            (c.radial, jacobian.radial[..., : len(c.radial)]),
+            (c.landmarks[kind][part.landmark], by_landmark),
+        ]
+        if self.free.angles:
+            pairs.append((c.angle[part.frame][:, None], jacobian.angle))
+        if jacobian.motion is not None and c.motion.size:
+            pairs.append((c.motion[part.frame], jacobian.motion))
+        if jacobian.hidden is not None:
+            pairs.append((c.hidden[kind], jacobian.hidden))
+        columns = [np.broadcast_to(own, (len(part.frame), own.shape[-1])) for own, _ in pairs]
+        return np.concatenate(columns, axis=1), np.concatenate([by for _, by in pairs], axis=2)
+
+    def moved(self, turntable: Turntable, step: Float[np.ndarray, "m"]) -> Turntable:
         """The turntable after a step of the parameters."""
         c = self.layout
         camera, radial = np.zeros(5), np.array(turntable.radial)
@@ -216,8 +193,8 @@ class Problem:
         if c.motion.size:
             before = 0.0 if turntable.motion is None else turntable.motion
             turntable = replace(turntable, motion=before + step[c.motion])
-        for part, landmark_step in zip(self.residuals, landmark_steps, strict=True):
-            turntable = part.moved(turntable, landmark_step) if part.d else turntable
+        for part, columns in zip(self.residuals, c.landmarks, strict=True):
+            turntable = part.moved(turntable, step[columns]) if part.d else turntable
         return turntable
 
     def minimise(self, turntable: Turntable, smallest_gain: float = 1e-9) -> Turntable:
@@ -234,19 +211,15 @@ class Problem:
             turntable = replace(turntable, motion=np.zeros((len(turntable.frames), 5)))
         cost, damping = self.cost(turntable), _FIRST_DAMPING
         if not np.isfinite(cost):
-            raise InputError(
-                "the points of the object do not lie before the camera; the poses to start from are wrong"
-            )
+            raise InputError("the object's points lie behind the camera; the poses to start from are wrong")
         for _ in range(_MOST_STEPS):
-            equations, lower = self.normal_equations(turntable), np.inf
-            while not lower < cost:
-                try:
-                    candidate = self.moved(turntable, *equations.solve(damping))
+            equations = self.normal_equations(turntable)
+            while True:
+                with suppress(LinAlgError, RuntimeError, ValueError):
+                    candidate = self.moved(turntable, equations.solve(damping))
                     lower = self.cost(candidate)
-                except (LinAlgError, ValueError):
-                    lower = np.inf
-                if lower < cost:
-                    break
+                    if lower < cost:
+                        break
                 damping *= _DAMPING_FACTOR
                 if damping > _DAMPING_RANGE[1]:
                     return turntable
@@ -255,6 +228,65 @@ class Problem:
             if gain < smallest_gain * cost:
                 break
         return turntable
+
+
+class NormalEquations:
+    """Gauss-Newton equations of all parameters. No landmark meets another: their part is block-diagonal."""
+
+    def __init__(self, jacobian: csr_array, residual: Float[np.ndarray, "N"], problem: Problem) -> None:
+        """Args:
+        jacobian: by the m parameters, rows weighted; those of each kind of residuals, then those of the priors.
+        residual: rows weighted in the same way.
+        problem: that is linearised.
+        """
+        self.jacobian, self.residual, self.problem = jacobian, residual, problem
+        self.gradient, normal = jacobian.T @ residual, csc_array(jacobian.T @ jacobian)
+        p = self.p = problem.layout.motion_size
+        self.motion, self.coupling = normal[:p, :p].toarray(), normal[p:, :p].toarray()
+        self.landmarks = normal[p:, p:]
+
+    def solve(self, damping: float) -> Float[np.ndarray, "m"]:
+        """The damped step.
+
+        Raises:
+            LinAlgError, RuntimeError: the damped equations are singular.
+        """
+        right = np.column_stack([self.coupling, self.gradient[self.p :]])
+        through, alone = np.split(self._by_landmarks(right, damping), [self.p], axis=1)
+        normal = self.motion - self.coupling.T @ through
+        normal[np.diag_indices(self.p)] += damping * np.maximum(self.motion.diagonal(), 1e-12)
+        step = -cho_solve(cho_factor(normal), self.gradient[: self.p] - through.T @ self.gradient[self.p :])
+        return np.concatenate([step, -alone[:, 0] - through @ step])
+
+    def information(self) -> Float[np.ndarray, "p p"]:
+        """The inverse covariance of camera and motion for residuals of unit variance, the landmarks being unknown."""
+        return self.motion + self.coupling.T @ self.landmark_responses()
+
+    def reduced(self, kind: int) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]:
+        """One kind's part of ``information``, and what each of its landmarks, being unknown, adds to the gradient
+        by camera and motion. The contributions add to zero where the turntable is adjusted."""
+        columns, part = self.problem.layout.landmarks[kind] - self.p, self.problem.residuals[kind]
+        first = sum(other.numbers for other in self.problem.residuals[:kind])
+        motion, residual = (a[first : first + part.numbers] for a in (self.jacobian[:, : self.p], self.residual))
+        response = self.landmark_responses()[columns]
+        row = np.repeat(part.landmark, part.numbers // len(part.landmark)), np.arange(part.numbers)
+        scores = coo_array((residual, row), shape=(part.size, part.numbers)) @ motion
+        return (
+            (motion.T @ motion).toarray() + np.einsum("ldp,ldq->pq", self.coupling[columns], response),
+            scores.toarray() + np.einsum("ldp,ld->lp", response, self.gradient[self.p :][columns]),
+        )
+
+    def landmark_responses(self) -> Float[np.ndarray, "m-p p"]:
+        """Derivatives of the landmarks that fit best by camera and motion."""
+        return -self._by_landmarks(self.coupling)
+
+    def _by_landmarks(self, right: Float[np.ndarray, "m-p k"], damping: float = 0.0) -> Float[np.ndarray, "m-p k"]:
+        """The right sides times the inverse of the landmarks' damped blocks."""
+        if len(right) == 0:
+            return right
+        diagonal = self.landmarks.diagonal()
+        floor = 1e-12 * (1.0 + diagonal.max())
+        return splu(csc_array(self.landmarks + diags_array(damping * diagonal + floor))).solve(right)
 
 
 @dataclass(frozen=True)
@@ -267,12 +299,12 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """How strongly the sightings call for lens_distortion and for wobble: -log10 of the probability that chance alone
-    lowers the squares as much."""
+    """How strongly the observations call for lens_distortion and for wobble: -log10 of the probability that chance
+    alone lowers the squares as much."""
 
     @cached_property
     def cost(self) -> float:
-        """Of the problem at the turntable."""
+        """Cost of the problem at the turntable."""
         return self.problem.cost(self.turntable)
 
     @property
@@ -282,13 +314,13 @@ class Adjusted:
 
     @property
     def variance(self) -> float:
-        """Of the residuals: 1 if the sightings' covariances are right; at least that."""
+        """Variance of the residuals, at least 1, which it is if the observations' covariances are right."""
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of camera, lens, angles and motions, in the order of ``ParameterLayout``.
+        """Covariance of camera, lens, angles and motions, in the order of ``ParameterLayout``.
 
-        Errors of one point in neighbouring frames are alike. Its sightings count together, by how much the points
+        Errors of one point in neighbouring frames are alike. Its observations count together, by how much the points
         contradict each other (the cluster-robust estimate of K.-Y. Liang and S. L. Zeger, 1986; A. C. Cameron and
         D. L. Miller, "A practitioner's guide to cluster-robust inference", 2015). Hidden errors, of unit variance,
         were not adjusted: they add what they do to the parameters.
@@ -296,13 +328,14 @@ class Adjusted:
         equations = self.problem.normal_equations(self.turntable)
         information, hidden = equations.information(), np.concatenate(self.problem.layout.hidden)
         scatter = self.variance * information
-        for part, (own, scores) in zip(self.problem.residuals, equations.reduced(), strict=True):
+        for kind, part in enumerate(self.problem.residuals):
             if isinstance(part, PointResiduals):
+                own, scores = equations.reduced(kind)
                 scatter += scores.T @ scores - self.variance * own
                 information += (part.curvature(self.turntable) - 1.0) * own
         if self.problem.free.known_focal is not None:
             sigma = self.problem.free.known_focal[1]
-            scatter[0, 0] += 1.0 / (_HELD**2 * sigma) ** 2 - self.variance / (_HELD * sigma) ** 2
+            scatter[0, 0] += 1.0 / (_PRIOR_SCALE**2 * sigma) ** 2 - self.variance / (_PRIOR_SCALE * sigma) ** 2
         shown = np.setdiff1d(np.arange(len(information)), hidden)
         inverse = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True)
         response = inverse @ information[np.ix_(shown, hidden)]
@@ -315,10 +348,3 @@ class Adjusted:
         angles = np.pad(covariance, ((0, 1), (0, 1)))[np.ix_(self.problem.layout.angle, self.problem.layout.angle)]
         variance = angles.diagonal() - 2.0 * angles.mean(axis=0) + angles.mean()
         return np.rad2deg(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _summed(values, index, size):
-    """Sums of the values (n, ...) of equal index."""
-    columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-    sums = [np.bincount(index, c, size) for c in columns]
-    return np.array(sums).reshape(len(columns), size).T.reshape(size, *values.shape[1:])

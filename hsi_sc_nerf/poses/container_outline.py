@@ -28,16 +28,16 @@ _LIDS = (-1.0, 0.1)
 # sought along this part of its circle, from the camera's side.
 _HEIGHTS = np.linspace(0.15, 0.7, 24)
 _AZIMUTHS = np.deg2rad(np.linspace(-60.0, 60.0, 24))
-# From one place that is tried to the next, and standard deviation of the Gaussian over them.
+# From one tried radius or height to the next, and standard deviation of the Gaussian over them.
 _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
-# An edge changes the brightness by this from one pixel to the next, gray levels, but for so many places in a hundred;
+# An edge changes the brightness by this from one pixel to the next, gray levels, but for so many points in a hundred;
 # frames agree to this fraction of the radius.
 _LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
-# Places that are tried at least. Poses that are wrong can leave an object of a pixel, or one that holds the camera.
+# Radii or heights that are tried at least: wrong poses can leave an object of a pixel, or one that holds the camera.
 _FEWEST_TRIED = 3
-# Standard deviation of an edge's place, alike in all frames: it lies somewhere in the pixel of the steepest change.
+# Standard deviation of an edge's position, alike in all frames: it is somewhere in the pixel of the steepest change.
 _EDGE_PX = 1.0 / np.sqrt(12.0)
 
 
@@ -47,9 +47,9 @@ class ContainerOutline:
 
     radius: float
     radius_sigma: float
-    """As a fraction of the radius."""
+    """Standard deviation of the radius, as a fraction of it."""
     foot: float
-    """Its height in the turntable frame, which is that of the disc."""
+    """Height of the container's foot, which stands on the disc, in the turntable frame."""
     foot_sigma: float
 
 
@@ -147,9 +147,9 @@ def _arcs(radius: float, feet: Float[np.ndarray, "z"]) -> Float[np.ndarray, "1 a
 
 
 def _slopes(
-    image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k places n 3"]
+    image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k points n 3"]
 ) -> Float[np.ndarray, "k n"]:
-    """How much the brightness changes from pixel to pixel across each of n lines, at least in most of its places.
+    """How much the brightness changes from pixel to pixel across each of n lines, at least at most of its points.
 
     An edge of the container goes all along its height, before the disc and before the wall; patterns of the wall do
     not. 0 outside of the image.
@@ -164,7 +164,7 @@ def _slopes(
 
 
 def _peak(tried: Float[np.ndarray, "n"], slopes: Float[np.ndarray, "n"]) -> float:
-    """The place of the largest slope, between those that were tried, by a parabola."""
+    """The radius or height of the largest slope, between those that were tried, by a parabola."""
     k = int(np.clip(np.argmax(slopes), 1, len(slopes) - 2))
     before, at, after = slopes[k - 1 : k + 2]
     bend = before - 2.0 * at + after

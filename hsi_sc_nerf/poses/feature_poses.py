@@ -29,7 +29,7 @@ from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import (
     AdjustedTracks,
-    adjust_either_way,
+    adjust_either_depth,
     adjust_together,
     adjust_tracks,
     with_lost_frames,
@@ -38,14 +38,14 @@ from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 
 _FOCAL_SIGMA = 0.002
-"""Of an earlier session's focal length, as a fraction."""
+"""Standard deviation of an earlier session's focal length, as a fraction."""
 _LEAST_ANGLE_SIGMA_RAD = 1e-3
-"""Of a turntable's known angles."""
+"""Least standard deviation of a turntable's known angles."""
 _SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
 """An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis or this fraction of
 the focal length."""
 MOST_CONTRADICTING = 1 / 3
-"""Of COLMAP's poses; where a larger fraction contradicts one turntable, it is not known which are right."""
+"""Largest fraction of COLMAP's poses that may contradict one turntable: of more it is not known which are right."""
 
 Images = Sequence[UInt8[np.ndarray, "h w"]]
 """One image per frame, or ``SessionPictures``."""
@@ -64,7 +64,7 @@ class KnownCamera:
 
     @property
     def distance_m(self) -> float:
-        """From the turntable's axis."""
+        """The camera's distance from the turntable's axis."""
         return float(np.hypot(self.camera_to_world[0, 3], self.camera_to_world[1, 3]))
 
     def check_size(self, size_px: tuple[int, int]) -> None:
@@ -178,7 +178,7 @@ def poses_from_features(
             f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
-    found = adjust_either_way(start, free.tracks)
+    found = adjust_either_depth(start, free.tracks)
     found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
     known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(
@@ -188,7 +188,7 @@ def poses_from_features(
     )
     if hold_angles and known_angles is not None:
         held = replace(found.turntable, angles_rad=known_angles[0])
-        found = adjust_tracks(held, free.tracks, free=parameters)
+        found = adjust_tracks(held, free.tracks, free_angles=False)
     if camera is not None and info.camera_distance_m is None:
         info = replace(info, camera_distance_m=camera.distance_m)
     return _posed(found, images, names, info, parameters, camera)

@@ -46,7 +46,7 @@ def initialise(
     )
     start = _Circles(observations, float(np.exp(finer.x)), centre_px, side_m).turntable()
     unweighted = np.tile(np.eye(8), (len(observations), 1, 1))
-    return Problem(start, MarkerResiduals(start, observations, 1.0, unweighted)).minimise(start)
+    return Problem(MarkerResiduals(start, observations, 1.0, unweighted)).minimise(start)
 
 
 class _Circles:

@@ -1,18 +1,15 @@
 """Markers of all frames: detection, refinement, and a second search where the adjusted turntable expects them.
 
-A frame may have several pictures (``SessionPictures``). The best one is searched first. A marker that is missing
-there is taken from the next picture that shows it, unless the best one is well exposed at the marker, which then is
-hidden.
+A frame may have several pictures (``SessionPictures``). The best one is searched, and the others where it shows few
+markers.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.optimize import minimize_scalar
@@ -39,8 +36,6 @@ _FEW_MARKERS = 4
 # A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
-# The best picture is ill exposed at a marker if more than this fraction of its pixels is black, clipped or flagged.
-_MOST_ILL_EXPOSED = 0.05
 
 
 @dataclass(frozen=True)
@@ -148,63 +143,27 @@ def observe_expected(
     """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones.
 
     Args:
-        images: of all frames.
+        images: of all frames; of ``SessionPictures`` the best ones.
         dictionary: of the markers.
         turntable: adjusted to the seen markers.
         seen: markers so far.
-        blur_px: of each frame's best picture; what the other pictures' is, is found.
+        blur_px: of each frame's image.
     """
-    session = SessionPictures.of(images)
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
     missing = [pair for pair in _facing(turntable) if pair not in have]
     if not missing:
         return seen
     frame, marker = np.array(missing).T
     blank = MarkerObservations(frame, marker, np.zeros((len(frame), 4, 2)), np.zeros((len(frame), 8, 8)))
-    expected = dict(zip(missing, turntable.reproject(blank), strict=True))
-    found: dict[tuple[int, int], FittedMarker] = {}
-    blurs_px: dict[str, float] = {}
-    for rank in range(max(len(frame.ranking) for frame in session.frames)):
-        missing = [(i, m) for i, m in missing if (i, m) not in found and rank < len(session.frames[i].ranking)]
-        if rank == 1:
-            # Where the best picture is well exposed the marker is hidden, and no other picture shows it.
-            shown = Counter(i for i, _ in [*have, *found])
-            missing = [
-                (i, m)
-                for i, m in missing
-                if shown[i] < _FEW_MARKERS or _ill_exposed(session.frames[i], expected[i, m])
-            ]
-        names = {i: session.frames[i].ranking[rank] for i, _ in missing}
-        if rank > 0:
-            for name in sorted(set(names.values()) - blurs_px.keys()):
-                blurs_px[name] = find_blur(session.named(name), dictionary, _by_frame(seen, len(session)))
 
-        def fit(pair: tuple[int, int], rank=rank, names=names) -> FittedMarker | None:
-            i, marker = pair
-            image = session.frames[i].picture(names[i]).astype(float)
-            blur = float(blur_px[i]) if rank == 0 else blurs_px[names[i]]
-            return fit_marker(image, dictionary, marker, expected[pair], blur, _FARTHEST_FROM_EXPECTED_PX)
+    def fit(pair: tuple[int, int], corners_px: Float[np.ndarray, "4 2"]) -> FittedMarker | None:
+        i, marker = pair
+        image, blur = images[i].astype(float), float(blur_px[i])
+        return fit_marker(image, dictionary, marker, corners_px, blur, _FARTHEST_FROM_EXPECTED_PX)
 
-        with ThreadPoolExecutor(_WORKERS) as pool:
-            fitted = zip(missing, pool.map(fit, missing), strict=True)
-            found |= {pair: marker for pair, marker in fitted if marker is not None}
-    more = _observations([(*pair, found[pair]) for pair in expected if pair in found])
-    return seen.append(more)
-
-
-def _ill_exposed(frame: FramePictures, corners_px: Float[np.ndarray, "4 2"]) -> bool:
-    """Whether too many pixels of the best picture inside the corners are black, clipped or flagged."""
-    ill = frame.ill_exposed
-    # OpenCV's (0, 0) is the first pixel's centre.
-    inside = cv2.fillConvexPoly(np.zeros(ill.shape, np.uint8), np.rint(corners_px - 0.5).astype(np.int32), 1) > 0
-    return bool(inside.any()) and float(ill[inside].mean()) > _MOST_ILL_EXPOSED
-
-
-def _by_frame(seen: MarkerObservations, frames: int) -> list[Detections]:
-    by_frame: list[Detections] = [{} for _ in range(frames)]
-    for i, marker, corners in zip(seen.frame.tolist(), seen.marker.tolist(), seen.corners_px, strict=True):
-        by_frame[i][marker] = corners
-    return by_frame
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        fitted = zip(missing, pool.map(fit, missing, turntable.reproject(blank)), strict=True)
+        return seen.append(_observations([(*pair, found) for pair, found in fitted if found is not None]))
 
 
 def _facing(turntable: Turntable) -> list[tuple[int, int]]:

@@ -240,7 +240,7 @@ def frame_motions(
 
     def fitted(start: Turntable, rows: np.ndarray, free: FreeParameters) -> Turntable:
         residuals = MarkerResiduals(start, seen.select(rows), LOSS_SIGMAS, free=False)
-        return Problem(start, residuals, free=free).minimise(start)
+        return Problem(residuals, free=free).minimise(start)
 
     everything = MarkerResiduals(turntable, seen, LOSS_SIGMAS, free=False)
     moved = fitted(turntable, np.ones(len(seen), bool), moving)
@@ -270,7 +270,7 @@ def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np
 
 
 def _solve(observations: MarkerObservations, turntable: Turntable, free: FreeParameters) -> Adjusted:
-    problem = Problem(turntable, MarkerResiduals(turntable, observations, LOSS_SIGMAS), free=free)
+    problem = Problem(MarkerResiduals(turntable, observations, LOSS_SIGMAS), free=free)
     return Adjusted(problem.minimise(turntable), problem)
 
 
@@ -325,7 +325,7 @@ def _motion_spread(turntable: Turntable) -> tuple[float, float]:
 
 
 def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
-    """With as many terms of radial distortion as the corners call for, one after the other."""
+    """The model with as many terms of radial distortion as the corners call for, one after the other."""
     evidence = {**plain.evidence, "lens_distortion": 0.0}
     for terms in (1, 2):
         distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))

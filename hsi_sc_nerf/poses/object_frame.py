@@ -128,10 +128,11 @@ def apparent_sides(
     """
     residuals = MarkerResiduals(turntable, seen, LOSS_SIGMAS, free_sides=True)
     held = FreeParameters(camera=False, angles=False)
-    (markers,) = Problem(turntable, residuals, free=held).normal_equations(turntable).landmarks
-    inverse = np.linalg.pinv(markers.normal, hermitian=True)
-    logs = -np.einsum("lij,lj->li", inverse, markers.gradient)[:, 6]
-    return np.exp(logs - logs.mean()), np.sqrt(inverse[:, 6, 6])
+    problem = Problem(residuals, free=held)
+    equations, sides = problem.normal_equations(turntable), problem.layout.landmarks[0][:, 6]
+    inverse = np.linalg.pinv(equations.landmarks.toarray(), hermitian=True)
+    logs = -(inverse @ equations.gradient)[sides]
+    return np.exp(logs - logs.mean()), np.sqrt(inverse.diagonal()[sides])
 
 
 def scale_of(

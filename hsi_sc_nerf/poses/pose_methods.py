@@ -18,7 +18,8 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 PoseMethod: TypeAlias = Literal["auto", "markers", "colmap", "angles"]
 
 FIELD_OF_VIEW_DEG = (4.0, 100.0)
-"""Over the image's width, from a long tele lens to a very wide one. Features that give another camera are too few."""
+"""Fields of view over the image's width, from a long tele lens to a very wide one: features that give another camera
+are too few."""
 # In the order in which they are tried.
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
 
@@ -42,8 +43,8 @@ def find_poses(
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
-        from_markers: the function behind the method.
-        from_features: likewise.
+        from_markers: called like `poses_from_markers`.
+        from_features: called like `poses_from_features`.
 
     Raises:
         InputError: the method, or every method, fails; says why.

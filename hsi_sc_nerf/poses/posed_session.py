@@ -30,9 +30,10 @@ from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, project, 
 _FIELD_PX = 0.007
 """Standard deviation of each field's amplitude for corners: print, lens and pixels are that far from the model's."""
 _FEATURE_FIELD_PX = 0.03
-"""The same for features, which creep over a skin as its light and its slope change (docs/validation/poses.md)."""
+"""Standard deviation of each field's amplitude for features: they creep over a skin as its light and its slope change
+(docs/validation/poses.md)."""
 _DRAWS = 2000
-"""Of errors by the covariance; the largest of all frames has no closed form."""
+"""Errors that are drawn by the covariance, for the largest of all frames has no closed form."""
 
 
 def in_object_frame(
@@ -130,15 +131,15 @@ def pose_uncertainty(
     camera = np.zeros((_DRAWS, 5))
     camera[:, : len(layout.camera)] = drawn[:, layout.camera]
     turns = camera[:, None, 1:4] + angles[..., None] * turntable.camera_rotation[:, 2]
-    # The camera over the disc: its distance from the axis, its height, and its way along the circle from the first
+    # The camera over the disc: its distance from the axis, its height, and its arc along the circle from the first
     # frame's. And the size of what turns.
     height, size = _landmark_gradients(adjusted)
     radius, radius_variance = np.zeros_like(size), 0.0
     if outline is not None:
         height, radius_variance = _foot_gradient(adjusted, outline), outline.radius_sigma**2
         radius[layout.camera] = radius_by_camera(outline, turntable)[: len(layout.camera)]
-    place = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
-    position = place[:, None] + (turntable.distance * angles) ** 2
+    upright_plane = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
+    position = upright_plane[:, None] + (turntable.distance * angles) ** 2
     variance = (metres**2) * position.max(axis=1).mean()
     distance = float(sigmas[4]) ** 2 if 4 in layout.camera else 0.0
     if outline is not None:
@@ -174,14 +175,15 @@ def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Flo
     By camera, angles and the rest, with all landmarks following. Markers count where there are any.
     """
     turntable = adjusted.turntable
-    equations = adjusted.problem.normal_equations(turntable)
     # The markers' residuals come last, where there are any.
-    response, residuals = equations.landmark_responses()[-1], adjusted.problem.residuals[-1]
+    residuals, layout = adjusted.problem.residuals[-1], adjusted.problem.layout
+    response = adjusted.problem.normal_equations(turntable).landmark_responses()
+    response = response[layout.landmarks[-1] - layout.motion_size]
     if isinstance(residuals, PointResiduals):
-        shifts, places = response, turntable.points_3d
+        shifts, points_3d = response, turntable.points_3d
     else:
-        shifts, places = response[:, 3:6], turntable.marker_poses[:, :3, 3]
-    weight = places[:, :2] / (places[:, :2] ** 2).sum()
+        shifts, points_3d = response[:, 3:6], turntable.marker_poses[:, :3, 3]
+    weight = points_3d[:, :2] / (points_3d[:, :2] ** 2).sum()
     size = np.einsum("lk,lkp->p", weight, shifts[:, :2])
     return shifts[lowest_landmarks(turntable), 2].mean(axis=0), size
 
@@ -199,14 +201,14 @@ def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
         )
         for part in problem.residuals
     ]
-    counted = Problem(turntable, *parts, free=problem.free)
+    counted = Problem(*parts, free=problem.free)
     larger = [
         part.with_hidden(part.hidden * np.sqrt(max(1.0, _shown_variance(counted, turntable, k))))
         if isinstance(part, PointResiduals) and part.hidden is not None
         else part
         for k, part in enumerate(parts)
     ]
-    return replace(adjusted, problem=Problem(turntable, *larger, free=problem.free))
+    return replace(adjusted, problem=Problem(*larger, free=problem.free))
 
 
 def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
@@ -216,7 +218,7 @@ def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
     their information, and the noise is the scatter from point to point.
     """
     equations, hidden = problem.normal_equations(turntable), problem.layout.hidden[kind]
-    information, (_, scores) = equations.information(), equations.reduced()[kind]
+    information, (_, scores) = equations.information(), equations.reduced(kind)
     shown = np.setdiff1d(np.arange(len(information)), np.concatenate(problem.layout.hidden))
     response = np.linalg.pinv(information[np.ix_(shown, shown)], hermitian=True) @ information[np.ix_(shown, hidden)]
     left = information[np.ix_(hidden, hidden)] - information[np.ix_(hidden, shown)] @ response
@@ -226,9 +228,9 @@ def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
 
 
 def smooth_fields(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 k"]:
-    """Polynomials of the place up to the third degree along x and along y, each with a root mean square of 1 px."""
-    place = pixels - np.median(pixels, axis=0)
-    x, y = (place / np.abs(place).max()).T
+    """Polynomials of the pixel coordinates, up to the third degree, along x and along y, each of 1 px RMS."""
+    centred = pixels - np.median(pixels, axis=0)
+    x, y = (centred / np.abs(centred).max()).T
     shapes = np.stack([x**i * y ** (n - i) for n in (1, 2, 3) for i in range(n + 1)], axis=-1)
     shapes /= np.sqrt((shapes**2).mean(axis=0))
     nothing = np.zeros_like(shapes)

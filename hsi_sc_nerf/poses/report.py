@@ -256,7 +256,7 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
     if poses.uncertainty is not None:
         parts.append(f"poses ± {poses.uncertainty.rotation_deg:.2g}°")
     if poses.outliers:
-        parts.append(f"{len(poses.outliers)} sightings of markers thrown out")
+        parts.append(f"{len(poses.outliers)} observations of markers left out")
     return parts
 
 

@@ -1,6 +1,6 @@
 """Residuals of a turntable's landmarks, markers or points, and their derivatives.
 
-Symbols: n sightings with g residuals of r numbers each, of l landmarks with d parameters.
+Symbols: n observations with g residuals of r numbers each, of l landmarks with d parameters.
 """
 
 from __future__ import annotations
@@ -15,51 +15,57 @@ from scipy.spatial.transform import Rotation
 from typing_extensions import Self
 
 from hsi_sc_nerf.geometry.camera import cross_matrix
-from hsi_sc_nerf.poses.turntable import (
-    Jacobian,
-    MarkerObservations,
-    Tracks,
-    Turntable,
-    project,
-    projection_jacobian,
-)
-
-# Points nearer to the camera's plane than this, in distances of the camera, are behind it.
-_NEAREST_DEPTH = 1e-3
+from hsi_sc_nerf.poses.turntable import Jacobian, MarkerObservations, Tracks, Turntable, projection_jacobian
 
 
 class Residuals(ABC):
-    """Projections less sightings.
+    """Projections less observations, in standard deviations.
 
     The loss of a residual of length r is soft L1, rho = 2 s^2 (sqrt(1 + r^2 / s^2) - 1) with the scale s: r^2 where
     it is small, 2 s r where it is large.
     """
 
-    numbers: int
-    """Of all residuals: n g r."""
-    pixels: Float[np.ndarray, "m 2"]
-    """All that was seen: corners or points."""
+    shape: tuple[int, int]
+    """Residuals of an observation and numbers of each: g, r."""
+    nearest: float
+    """A residual is infinite if its point is nearer to the camera's plane than this, in distances of the camera."""
     hidden: Float[np.ndarray, "m 2 k"] | None = None
-    """Displacements of these, px, that count in the covariance alone."""
+    """Displacements of the pixels, px, that count in the covariance alone."""
 
     def __init__(self, turntable: Turntable, seen: MarkerObservations | Tracks, loss_scale: float, d: int) -> None:
         """Args:
-        turntable: one that has the frames and landmarks of the sightings.
-        seen: sightings.
+        turntable: one that has the frames and landmarks of the observations.
+        seen: observations.
         loss_scale: residuals well above this count by their size, not its square.
         d: number of parameters of a landmark; 0 where landmarks are held.
         """
-        self.frame, self.landmark = turntable.rows(seen)
-        self.loss_scale, self.d = loss_scale, d
+        self.frames, (self.frame, self.landmark) = len(turntable.frames), turntable.rows(seen)
+        self.seen, self.loss_scale, self.d = seen, loss_scale, d
+        self.pixels = (seen.pixels if isinstance(seen, Tracks) else seen.corners_px).reshape(-1, 2)
         self.size = len(turntable.points if isinstance(seen, Tracks) else turntable.markers)
+        self.numbers = self.pixels.size
 
-    @abstractmethod
     def values(self, turntable: Turntable) -> Float[np.ndarray, "n g r"]:
-        """In pixels or in standard deviations."""
+        """Projections less observations, in standard deviations."""
+        projection = turntable.project(self.seen)
+        behind = projection.in_camera[:, 2:] <= self.nearest * turntable.distance
+        away = np.where(behind, np.inf, projection.pixels - self.pixels)
+        return self.scaled(away[..., None]).reshape(len(self.seen), *self.shape)
 
-    @abstractmethod
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n g*r d"]]:
         """Derivatives by camera and motion, and by the parameters of the row's own landmark."""
+        projection = turntable.project(self.seen)
+        frame = np.repeat(self.frame, len(self.pixels) // len(self.frame))
+        pixel = replace(projection_jacobian(turntable, frame, projection), hidden=self.hidden)
+        return pixel.mapped(self.scaled), self.scaled(self.by_landmark(turntable, pixel.point))
+
+    @abstractmethod
+    def scaled(self, pixels: Float[np.ndarray, "m 2 k"]) -> Float[np.ndarray, "n g*r k"]:
+        """Displacements of the pixels in standard deviations."""
+
+    @abstractmethod
+    def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "m 2 3"]) -> Float[np.ndarray, "m 2 d"]:
+        """Derivatives of the pixels by the landmark's parameters, from those by its points."""
 
     @abstractmethod
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "l d"]) -> Turntable:
@@ -72,18 +78,20 @@ class Residuals(ABC):
         return other
 
     def losses(self, turntable: Turntable) -> Float[np.ndarray, "n"]:
-        """The loss of each sighting."""
+        """The loss of each observation."""
         r = np.linalg.norm(self.values(turntable), axis=-1)
         return (2.0 * self.loss_scale**2 * (np.sqrt(1.0 + (r / self.loss_scale) ** 2) - 1.0)).sum(axis=-1)
 
     def weights(self, residual: Float[np.ndarray, "n g r"]) -> Float[np.ndarray, "n g r"]:
-        """Of each number, by the loss of its residual: 1 / sqrt(1 + r^2 / s^2)."""
+        """Weight of each number by the loss of its residual: 1 / sqrt(1 + r^2 / s^2)."""
         r = np.linalg.norm(residual, axis=-1, keepdims=True)
         return np.broadcast_to(1.0 / np.sqrt(1.0 + (r / self.loss_scale) ** 2), residual.shape)
 
 
 class MarkerResiduals(Residuals):
     """Corners of markers, whitened. Each number has its own loss."""
+
+    shape, nearest = (8, 1), -np.inf
 
     def __init__(
         self,
@@ -102,29 +110,21 @@ class MarkerResiduals(Residuals):
         weights: multiply the residuals (x0, y0, x1, ...) of an observation; by default they whiten its covariance.
         free: whether the markers' poses are adjusted.
         free_sides: whether the log of each marker's side is adjusted.
-        hidden: displacements of the corners, px, that are not adjusted but count in the covariance.
         """
         super().__init__(turntable, observations, loss_scale, 6 * free + free_sides)
         self.free, self.free_sides = free, free_sides
-        self.numbers, self.pixels = 8 * len(observations), observations.corners_px.reshape(-1, 2)
-        self.corners_px = observations.corners_px.reshape(-1, 8, 1)
         self.whitening = whitening(observations.covariance_px2) if weights is None else weights
 
-    def values(self, turntable: Turntable) -> Float[np.ndarray, "n 8 1"]:
-        """Whitened reprojection errors."""
-        return self.whitening @ (self._project(turntable).pixels.reshape(-1, 8, 1) - self.corners_px)
+    def scaled(self, pixels: Float[np.ndarray, "4*n 2 k"]) -> Float[np.ndarray, "n 8 k"]:
+        """Displacements, whitened."""
+        return self.whitening @ pixels.reshape(len(self.frame), 8, pixels.shape[-1])
 
-    def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 8 d"]]:
-        """By a marker's parameters: a small rotation in the object's axes, a shift, and the log of its side."""
-        pixel = projection_jacobian(turntable, np.repeat(self.frame, 4), self._project(turntable))
-        pixel = replace(pixel, hidden=self.hidden)
+    def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "m 2 3"]) -> Float[np.ndarray, "m 2 d"]:
+        """Derivatives by a small rotation of the marker in the object's axes, its shift, and the log of its side."""
         offset = turntable.corner_offsets()[self.landmark].reshape(-1, 3)
-        parts = [np.zeros((len(offset), 2, 0))]
-        if self.free:
-            parts += [pixel.point @ -cross_matrix(offset), pixel.point]
-        if self.free_sides:
-            parts.append(pixel.point @ offset[:, :, None])
-        return pixel.mapped(self._whiten), self._whiten(np.concatenate(parts, axis=-1))
+        parts = [by_point @ -cross_matrix(offset), by_point] * self.free
+        parts += [by_point @ offset[:, :, None]] * self.free_sides
+        return np.concatenate([np.zeros((len(offset), 2, 0)), *parts], axis=-1)
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "m d"]) -> Turntable:
         """The turntable with its markers turned and shifted."""
@@ -133,47 +133,30 @@ class MarkerResiduals(Residuals):
         poses[:, :3, 3] += step[:, 3:6]
         return replace(turntable, marker_poses=poses)
 
-    def _project(self, turntable):
-        return project(turntable, np.repeat(self.frame, 4), turntable.corners()[self.landmark].reshape(-1, 3))
-
-    def _whiten(self, values: Float[np.ndarray, "4*n 2 k"]) -> Float[np.ndarray, "n 8 k"]:
-        return self.whitening @ values.reshape(len(self.frame), 8, values.shape[-1])
-
 
 class PointResiduals(Residuals):
     """Points of the object, over their standard deviation. The loss is that of a residual's length."""
 
-    def __init__(
-        self,
-        turntable: Turntable,
-        tracks: Tracks,
-        loss_scale: float,
-        sigma_px: float = 1.0,
-    ) -> None:
+    shape, nearest = (1, 2), 1e-3
+
+    def __init__(self, turntable: Turntable, tracks: Tracks, loss_scale: float, sigma_px: float = 1.0) -> None:
         super().__init__(turntable, tracks, loss_scale, 3)
-        self.numbers = 2 * len(tracks)
-        self.pixels, self.sigma_px = tracks.pixels, sigma_px
+        self.sigma_px = sigma_px
 
-    def values(self, turntable: Turntable) -> Float[np.ndarray, "n 1 2"]:
-        """Reprojection errors, infinite for a point behind the camera."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        behind = projection.in_camera[:, 2:] <= _NEAREST_DEPTH * turntable.distance
-        return np.where(behind, np.inf, (projection.pixels - self.pixels) / self.sigma_px)[:, None]
+    def scaled(self, pixels: Float[np.ndarray, "n 2 k"]) -> Float[np.ndarray, "n 2 k"]:
+        """Displacements over the standard deviation."""
+        return pixels / self.sigma_px
 
-    def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n 2 3"]]:
-        """By the point's coordinates."""
-        projection = project(turntable, self.frame, turntable.points_3d[self.landmark])
-        pixel = replace(projection_jacobian(turntable, self.frame, projection), hidden=self.hidden)
-        scaled = pixel.mapped(lambda by: by / self.sigma_px)
-        return scaled, scaled.point
+    def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 3"]:
+        """Derivatives by the point's coordinates."""
+        return by_point
 
     def curvature(self, turntable: Turntable) -> float:
         """Second derivatives of the losses over what ``weights`` takes for them, in the mean of all directions.
 
         The second derivative is 1 / (1 + r^2 / s^2) of the weight along the residual, and the weight across it.
         """
-        values = self.values(turntable)
-        weight = self.weights(values)[..., 0]
+        weight = self.weights(self.values(turntable))[..., 0]
         return float(np.average((1.0 + weight**2) / 2.0, weights=weight))
 
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "p 3"]) -> Turntable:

@@ -37,7 +37,7 @@ class Scale:
     source: ScaleSource
     """The markers' side, the container that carries markers, its outline, or the given distance of the camera."""
     marker_side_m: float | None
-    """As given, or as measured; None without markers."""
+    """Side of a marker's black square, given or measured; None without markers."""
     uncertainty: float
     """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
     marker_sides: dict[int, float]
@@ -45,16 +45,16 @@ class Scale:
     marker_side_sigmas: dict[int, float]
     """Standard deviations of these."""
     container_diameter_m: float | None
-    """As given."""
+    """Diameter of the container as given."""
     measured_container_diameter_m: float | None
-    """Of the circle that the upright markers' planes touch; None where there are none.
+    """Diameter of the circle that the upright markers' planes touch; None where there are none.
 
     A plaque stands off the wall and makes it wider than the container by twice that.
     """
 
     @property
     def disagreement_percent(self) -> float | None:
-        """By how much the container is wider by the markers than as given; None where one is not known."""
+        """Percentage by which the container is wider by the markers than as given; None where one is not known."""
         if self.container_diameter_m is None or self.measured_container_diameter_m is None:
             return None
         return 100.0 * (self.measured_container_diameter_m / self.container_diameter_m - 1.0)
@@ -68,17 +68,17 @@ class Uncertainty:
     """
 
     focal: float
-    """Of the focal length, as a fraction of it."""
+    """Standard deviation of the focal length, as a fraction of it."""
     distance: float
-    """Of the camera's distance from the axis, as a fraction of it."""
+    """Standard deviation of the camera's distance from the axis, as a fraction of it."""
     size: float
-    """Of lengths on the turntable, as a fraction."""
+    """Standard deviation of lengths on the turntable, as a fraction."""
     angle_deg: Float[np.ndarray, "n"]
-    """Of each frame's angle, relative to the mean of all; nan where a frame is not used."""
+    """Standard deviation of each frame's angle relative to the mean of all; nan where a frame is not used."""
     rotation_deg: float
-    """Of the rotation in the object frame: root mean square of the largest error of all frames."""
+    """Root mean square of the largest rotation error of all frames, object frame."""
     position_m: float
-    """Likewise, of the camera's position in the object frame."""
+    """Root mean square of the largest position error of the camera in all frames, object frame."""
 
 
 @dataclass(frozen=True)

@@ -60,24 +60,15 @@ class FramePictures:
     Attributes:
         picture: the picture of a name.
         scores: by the names of those in which markers are looked for, best first (``edge_precision``).
-        flagged: pixels with so many flagged values that the best picture does not measure them well; None if all are.
     """
 
     picture: Callable[[str], UInt8[np.ndarray, "h w"]]
     scores: Mapping[str, float]
-    flagged: Bool[np.ndarray, "h w"] | None = None
 
     @property
     def ranking(self) -> tuple[str, ...]:
         """Names of the pictures in which markers are looked for, best first."""
         return tuple(self.scores)
-
-    @property
-    def ill_exposed(self) -> Bool[np.ndarray, "h w"]:
-        """Pixels of the best picture that are black, clipped or flagged."""
-        best = self.picture(self.ranking[0])
-        clipped = (best == 0) | (best == 255)
-        return clipped if self.flagged is None else clipped | self.flagged
 
 
 class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
@@ -158,10 +149,7 @@ def frame_pictures(
     def picture(name: str) -> UInt8[np.ndarray, "h w"]:
         return gray if name == GRAY else _picture(cube.memmap(), flags_path, members[name])
 
-    best_well = well[best_first[0]]
-    return FramePictures(
-        picture, {name: scores[name] for name in best_first}, None if best_well.all() else ~best_well
-    )
+    return FramePictures(picture, {name: scores[name] for name in best_first})
 
 
 def _evenly_spread(inside: Bool[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands"]:
@@ -253,12 +241,16 @@ def edge_precision(
     if not whole.any():
         return 0.0
     picture = np.asarray(reflectance, np.float32)
-    across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
-    slope = np.where(whole, cv2.magnitude(across, down), 0.0)
-    strongest = max(1, round(_EDGE_FRACTION * slope.size))
-    # Of the negative slopes the first: the many zeros at the other end make partition slow.
-    edges = -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())
     bright = whole & (picture >= np.median(picture[whole]))
     curvature = np.abs(cv2.filter2D(picture, cv2.CV_32F, _NOISE_MASK)[bright])
     noise = float(np.median(curvature)) / (_NOISE_GAIN * _MEDIAN_OF_NORMAL * np.sqrt(bands))
-    return edges / float(np.hypot(noise, _ROUNDING))
+    return edge_slope(picture, whole) / float(np.hypot(noise, _ROUNDING))
+
+
+def edge_slope(picture: Float[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | bool = True) -> float:
+    """Mean slope, per px, of a picture's strongest edges among ``counted`` pixels; 32 bit."""
+    across, down = (cv2.Sobel(picture, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
+    slope = np.where(counted, cv2.magnitude(across, down), 0.0)
+    strongest = max(1, round(_EDGE_FRACTION * slope.size))
+    # Of the negative slopes the first: the many zeros at the other end make partition slow.
+    return -float(np.partition(-slope.ravel(), strongest - 1)[:strongest].mean())

@@ -12,15 +12,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, pixel_rays
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.posed_session import with_hidden_errors
-from hsi_sc_nerf.poses.residuals import (
-    MarkerResiduals,
-    PointResiduals,
-    loop_closure_deg,
-)
+from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Tracks, Turntable, project
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
@@ -76,21 +72,21 @@ class AdjustedTracks:
         return loop_closure_deg(PointResiduals(self.turntable, self.tracks, _LOSS_PX), self.turntable)
 
 
-def adjust_tracks(start: Turntable, tracks: Tracks, *, free: FreeParameters | None = None) -> AdjustedTracks:
+def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True) -> AdjustedTracks:
     """Adjust camera, angles and points to the tracks, reject outliers, and adjust again.
 
     Args:
         start: where to start. Tracks of frames or points that it lacks count as outliers.
         tracks: points seen in frames.
-        free: whether angles are adjusted, which they are by default.
+        free_angles: whether the angles are adjusted.
 
     Raises:
         InputError: too few tracks fit to determine an axis.
     """
-    return _refined(_roughly_adjusted(start, tracks, free), tracks, free)
+    return _refined(_roughly_adjusted(start, tracks, free_angles), tracks, free_angles)
 
 
-def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
+def adjust_either_depth(start: Turntable, tracks: Tracks) -> AdjustedTracks:
     """``adjust_tracks`` from a start and from its reversal in depth: the one that fits the tracks better.
 
     Raises:
@@ -104,11 +100,11 @@ def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
             rough.append(_roughly_adjusted(turned, tracks))
         except InputError as error:
             refused = refused or error
-    best_px = min((way.misfit_px for way in rough), default=0.0)
-    for way in rough:
+    best_px = min((candidate.misfit_px for candidate in rough), default=0.0)
+    for candidate in rough:
         try:
-            if way.misfit_px < _CLEARLY_WORSE * best_px:
-                found.append(_refined(way, tracks))
+            if candidate.misfit_px < _CLEARLY_WORSE * best_px:
+                found.append(_refined(candidate, tracks))
         except InputError as error:
             refused = refused or error
     if refused is not None and not found:
@@ -116,17 +112,17 @@ def adjust_either_way(start: Turntable, tracks: Tracks) -> AdjustedTracks:
     return min(found, key=lambda adjusted: adjusted.misfit_px)
 
 
-def _roughly_adjusted(start: Turntable, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+def _roughly_adjusted(start: Turntable, tracks: Tracks, free_angles: bool = True) -> AdjustedTracks:
     good = _enough(tracks, start.knows(tracks))
     kept = tracks.select(good)
-    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free), kept, ~good)
+    return AdjustedTracks(_adjusted(start, kept, _FIRST_LOSS_PX, free_angles), kept, ~good)
 
 
-def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None = None) -> AdjustedTracks:
+def _refined(rough: AdjustedTracks, tracks: Tracks, free_angles: bool = True) -> AdjustedTracks:
     turntable, good = rough.turntable, ~rough.outliers
     for last in [False] * _OUTLIER_ROUNDS + [True]:
         kept = tracks.select(good)
-        turntable = _adjusted(turntable, kept, _LOSS_PX, free)
+        turntable = _adjusted(turntable, kept, _LOSS_PX, free_angles)
         size_px = turntable.errors_px(kept)
         outlier = size_px > max(_OUTLIER_SIGMAS * float(np.median(size_px)) / _RAYLEIGH_MEDIAN, _LEAST_OUTLIER_PX)
         if last or not outlier.any():
@@ -137,11 +133,10 @@ def _refined(rough: AdjustedTracks, tracks: Tracks, free: FreeParameters | None 
     return AdjustedTracks(turntable, kept, ~good)
 
 
-def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free: FreeParameters | None) -> Turntable:
+def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free_angles: bool) -> Turntable:
     turntable = turntable.restricted(kept)
-    parameters = FreeParameters(distance=False, angles=free is None or free.angles)
-    problem = Problem(turntable, PointResiduals(turntable, kept, loss_px), free=parameters)
-    return problem.minimise(turntable, _SMALLEST_GAIN)
+    free = FreeParameters(distance=False, angles=free_angles)
+    return Problem(PointResiduals(turntable, kept, loss_px), free=free).minimise(turntable, _SMALLEST_GAIN)
 
 
 def adjust_together(
@@ -155,7 +150,7 @@ def adjust_together(
         free: whether angles are adjusted, and prior knowledge.
 
     Returns:
-        The turntable, with markers if they determine their places; and the markers that it was adjusted to.
+        The turntable, with markers if they determine their poses; and the markers that it was adjusted to.
     """
     start = found.turntable
     sigma_px = max(float(np.median(start.errors_px(found.tracks))) / _RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
@@ -166,13 +161,13 @@ def adjust_together(
     sigma_px *= 1.0 if alone else _BESIDE_MARKERS
     points = partial(PointResiduals, tracks=found.tracks, loss_scale=_LOSS_PX / sigma_px, sigma_px=sigma_px)
     if markers is None or alone:
-        problem = Problem(start, points(start), free=replace(free, distance=False))
+        problem = Problem(points(start), free=replace(free, distance=False))
         return with_hidden_errors(Adjusted(problem.minimise(start, _SMALLEST_GAIN), problem)), None
     for last in (False, True):
-        problem = Problem(start, points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
+        problem = Problem(points(start), MarkerResiduals(start, markers, LOSS_SIGMAS), free=free)
         start = problem.minimise(start, _SMALLEST_GAIN)
-        away_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
-        fits = away_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(away_px)))
+        error_px = np.linalg.norm(start.reproject(markers) - markers.corners_px, axis=-1).max(axis=1)
+        fits = error_px < max(_LEAST_MARKER_OUTLIER_PX, _OUTLIER_SIGMAS * float(np.median(error_px)))
         if last or fits.all():
             break
         markers = markers.select(fits)
@@ -198,21 +193,14 @@ def with_lost_frames(turntable: Turntable, tracks: Tracks) -> Turntable:
 
 def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     """The turntable with the markers that its rays determine, in its unit of length, all of one side."""
-    poses, marker_corners = turntable.camera_to_world(), {}
-    width, height = (int(2.0 * centre) for centre in turntable.centre_px)
-    camera = PinholeIntrinsics(width, height, turntable.focal_px, turntable.focal_px, *turntable.centre_px)
-    for marker in np.unique(seen.marker).tolist():
-        rows = np.flatnonzero((seen.marker == marker) & np.isin(seen.frame, turntable.frames))
-        frames = np.searchsorted(turntable.frames, seen.frame[rows])
-        rays = [pixel_rays(camera, poses[f], seen.corners_px[r]) for f, r in zip(frames, rows, strict=True)]
-        if len(rays) < 2:
-            continue
-        origins, directions = (np.stack(part) for part in zip(*rays, strict=True))
-        corner = np.tile(np.arange(4), (len(rows), 1))
-        corners, eigenvalue = closest_point_to_rays(np.repeat(origins[:, None], 4, axis=1), directions, corner)
-        if eigenvalue.min() > _LEAST_EIGENVALUE * len(rows):
-            marker_corners[marker] = corners
-    faces = np.array(list(marker_corners.values())).reshape(-1, 4, 3)
+    seen = seen.select(np.isin(seen.frame, turntable.frames))
+    markers, marker, views = np.unique(seen.marker, return_inverse=True, return_counts=True)
+    poses = turntable.camera_to_world()[np.searchsorted(turntable.frames, seen.frame)] @ OPENCV_TO_OPENGL
+    in_camera = np.insert((seen.corners_px - turntable.centre_px) / turntable.focal_px, 2, 1.0, axis=-1)
+    directions = in_camera / np.linalg.norm(in_camera, axis=-1, keepdims=True) @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    corners, eigenvalue = closest_point_to_rays(poses[:, None, :3, 3], directions, 4 * marker[:, None] + np.arange(4))
+    placed = eigenvalue.reshape(-1, 4).min(axis=1) > _LEAST_EIGENVALUE * views
+    faces = corners.reshape(-1, 4, 3)[placed]
     right, up = faces[:, 1] + faces[:, 2] - faces[:, 0] - faces[:, 3], faces[:, 0] - faces[:, 3]
     normal = np.cross(right, up)
     marker_poses = np.tile(np.eye(4), (len(faces), 1, 1))
@@ -221,7 +209,7 @@ def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     marker_poses[:, :3, 3] = faces.mean(axis=1)
     sides = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=-1)
     side = float(np.median(sides)) if len(faces) else 1.0
-    return replace(turntable, side=side, markers=np.array(list(marker_corners), int), marker_poses=marker_poses)
+    return replace(turntable, side=side, markers=markers[placed], marker_poses=marker_poses)
 
 
 def _search_angle(turntable: Turntable, seen: Tracks) -> float | None:
@@ -251,7 +239,7 @@ def _search_angle(turntable: Turntable, seen: Tracks) -> float | None:
 
 
 def _enough(tracks: Tracks, good: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Of the good rows those of points in enough frames and of frames with enough points."""
+    """The good rows of points that are seen in enough frames, in frames that show enough points."""
     while True:
         views = np.bincount(tracks.point[good], minlength=tracks.point.max(initial=0) + 1)
         good = good & (views[tracks.point] >= _FEWEST_VIEWS)

@@ -24,7 +24,8 @@ from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, cross_matrix
 FEWEST_FRAMES = 3
 """Fewer frames do not determine a turntable's axis."""
 _LEAST_DISTANCE = 0.02
-"""Of the camera from the axis, in distances of the object: nearer, all frames see it from within two degrees."""
+"""Least distance of the camera from the axis, over its distance from the object: where it is smaller, all frames see
+the object from within two degrees."""
 
 
 def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) -> None:
@@ -44,8 +45,8 @@ def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) 
         )
 
 
-class _Sightings:
-    """Arrays with one row for each sighting of a landmark in a frame: the frame, the landmark's number, the rest."""
+class _Observations:
+    """Arrays with one row an observation of a landmark in a frame: the frame, the landmark's number, the rest."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
@@ -56,7 +57,7 @@ class _Sightings:
 
 
 @dataclass(frozen=True)
-class MarkerObservations(_Sightings):
+class MarkerObservations(_Observations):
     """Corners of markers in frames. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
@@ -75,8 +76,8 @@ class MarkerObservations(_Sightings):
 
 
 @dataclass(frozen=True)
-class Tracks(_Sightings):
-    """Points of the object in frames. Pixel origin as above."""
+class Tracks(_Observations):
+    """Points of the object in frames. Pixel origin: the image's upper left corner."""
 
     frame: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
@@ -101,16 +102,16 @@ class Turntable:
     radial: tuple[float, float] = (0.0, 0.0)
     """Lens distortion: OpenCV's k1 and k2."""
     camera_rotation: Float[np.ndarray, "3 3"]
-    """From the turntable frame to OpenCV camera axes."""
+    """Rotation from the turntable frame to OpenCV camera axes."""
     distance: float = 1.0
-    """Of the camera from the axis."""
+    """Distance of the camera from the axis."""
     frames: Int[np.ndarray, "f"]
     angles_rad: Float[np.ndarray, "f"]
     """Counter-clockwise seen from above."""
     motion: Float[np.ndarray, "f 5"] | None = None
     """Rotation vectors (x, y, 0; rad) and shifts (3) of a wobbling table; None for a table that does not wobble."""
     side: float = 1.0
-    """Of the markers' black square."""
+    """Side of the markers' black square."""
     markers: Int[np.ndarray, "m"] = field(default_factory=_no_numbers)
     """Ids, ascending."""
     marker_poses: Float[np.ndarray, "m 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -151,25 +152,23 @@ class Turntable:
         return rows
 
     def rows(self, seen: MarkerObservations | Tracks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of ``frames``, and of ``markers`` or ``points``, that the sightings belong to."""
-        known, landmark = self._landmarks(seen)
+        """Rows of ``frames``, and of ``markers`` or ``points``, that the observations belong to."""
+        known, landmark, _, _ = self._landmarks(seen)
         return np.searchsorted(self.frames, seen.frame), np.searchsorted(known, landmark)
 
     def knows(self, seen: MarkerObservations | Tracks) -> np.ndarray:
-        """Mask of the sightings whose frame and landmark the turntable has."""
-        known, landmark = self._landmarks(seen)
+        """Mask of the observations whose frame and landmark the turntable has."""
+        known, landmark, _, _ = self._landmarks(seen)
         return np.isin(seen.frame, self.frames) & np.isin(landmark, known)
 
     def restricted(self, *seen: MarkerObservations | Tracks) -> Turntable:
         """The turntable with only the frames and landmarks that are seen; angles keep their zero."""
-        keep = np.isin(self.frames, np.concatenate([sightings.frame for sightings in seen]))
-        of_kind = [
-            [self._landmarks(s)[1] for s in seen if isinstance(s, kind)] for kind in (MarkerObservations, Tracks)
+        keep = np.isin(self.frames, np.concatenate([part.frame for part in seen]))
+        numbers = [
+            np.concatenate([_no_numbers(), *(self._landmarks(s)[1] for s in seen if isinstance(s, kind))])
+            for kind in (MarkerObservations, Tracks)
         ]
-        markers, points = (
-            np.isin(known, np.concatenate([_no_numbers(), *found]))
-            for known, found in zip((self.markers, self.points), of_kind, strict=True)
-        )
+        markers, points = np.isin(self.markers, numbers[0]), np.isin(self.points, numbers[1])
         return replace(
             self,
             frames=self.frames[keep],
@@ -190,20 +189,22 @@ class Turntable:
         return np.einsum("mij,kj->mki", self.marker_poses[:, :3, :3], square_corners(self.side))
 
     def reproject(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n *corners 2"]:
-        """Pixels of each sighting: of a marker's four corners, or of a point."""
+        """Pixels of each observation: of a marker's four corners, or of a point."""
+        return self.project(seen).pixels.reshape(self._landmarks(seen)[3].shape)
+
+    def project(self, seen: MarkerObservations | Tracks) -> Projection:
+        """Projections of each observation's corners, one after the other, or of its point."""
         frame, landmark = self.rows(seen)
-        if isinstance(seen, Tracks):
-            return project(self, frame, self.points_3d[landmark]).pixels
-        corners = self.corners()[landmark].reshape(-1, 3)
-        return project(self, np.repeat(frame, 4), corners).pixels.reshape(-1, 4, 2)
+        points = self._landmarks(seen)[2][landmark]
+        return project(self, np.repeat(frame, points.shape[1]), points.reshape(-1, 3))
 
     def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
-        """Distance of each sighting from its projection; of a marker the root mean square over its corners."""
-        away = self.reproject(seen) - (seen.pixels if isinstance(seen, Tracks) else seen.corners_px)
+        """Distance of each observation from its projection; of a marker the root mean square over its corners."""
+        away = self.reproject(seen) - self._landmarks(seen)[3]
         return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
 
     def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
-        """Root mean square error in each of the session's ``size`` frames, nan without sightings; and in all."""
+        """Root mean square error in each of the session's ``size`` frames, nan without observations; and in all."""
         squared = self.errors_px(seen) ** 2
         with np.errstate(invalid="ignore"):
             of_frames = np.bincount(seen.frame, squared, size) / np.bincount(seen.frame, minlength=size)
@@ -223,8 +224,10 @@ class Turntable:
         )
 
     def _landmarks(self, seen):
-        """The turntable's landmarks of this kind, and those that are seen."""
-        return (self.points, seen.point) if isinstance(seen, Tracks) else (self.markers, seen.marker)
+        """Numbers of this kind's landmarks, of the seen ones; points (l, c, 3) of the former, the latter's pixels."""
+        if isinstance(seen, Tracks):
+            return self.points, seen.point, self.points_3d[:, None], seen.pixels
+        return self.markers, seen.marker, self.corners(), seen.corners_px
 
 
 @dataclass(frozen=True)
@@ -246,17 +249,17 @@ class Jacobian:
     """Derivatives of the pixels."""
 
     camera: Float[np.ndarray, "n 2 5"]
-    """By the log of the focal length, a small rotation of the camera (3, rad), the log of its distance."""
+    """Derivatives by the log of the focal length, a small camera rotation (3, rad), the log of the distance."""
     radial: Float[np.ndarray, "n 2 2"]
-    """By k1 and k2."""
+    """Derivatives by k1 and k2."""
     angle: Float[np.ndarray, "n 2 1"]
-    """By the frame's angle, rad."""
+    """Derivatives by the frame's angle, rad."""
     motion: Float[np.ndarray, "n 2 5"] | None
-    """By the frame's tilt (2, rad) and shift (3); None for a turntable without."""
+    """Derivatives by the frame's tilt (2, rad) and shift (3); None for a turntable without motions."""
     point: Float[np.ndarray, "n 2 3"]
-    """By the point, in the object's axes."""
+    """Derivatives by the point, in the object's axes."""
     hidden: Float[np.ndarray, "n 2 k"] | None = None
-    """By the amplitudes of displacements that the residuals hardly show."""
+    """Derivatives by the amplitudes of displacements that the residuals hardly show."""
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Jacobian:
         """The derivatives after ``function``, which acts on the pixels' axes."""

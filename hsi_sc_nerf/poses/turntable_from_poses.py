@@ -17,12 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import (
-    closest_point_to_rays,
-    cross_matrix,
-    rotation_about_z,
-    rotation_angle_deg,
-)
+from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable, require_parallax
 
 # A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
@@ -69,7 +64,8 @@ def turntable_from_poses(
         axis, base, angles = _about_one_axis(rotations, good)
         on_axis, before_camera = _axis_position(rotations, shifts, axis, good)
         distance = float(np.linalg.norm(_perpendicular(base.T @ before_camera, axis)))
-        misfit_deg = rotation_angle_deg(rotations, base @ _rotations_about(axis, angles))
+        turns = Rotation.from_rotvec(np.outer(angles, axis)).as_matrix()
+        misfit_deg = rotation_angle_deg(rotations, base @ turns)
         misfit = np.linalg.norm(rotations @ on_axis + shifts - before_camera, axis=-1) / max(distance, 1e-12)
         wrong = _is_outlier(misfit_deg, good, _CONTRADICTS_DEG) | _is_outlier(misfit, good, _CONTRADICTS_DISTANCES)
         if not wrong[good].any():
@@ -163,7 +159,8 @@ def _about_one_axis(rotations, good):
         cosine = np.trace(relative, axis1=1, axis2=2) - axis @ relative @ axis
         sine = np.einsum("nij,ij->n", relative, cross)
         angles = np.arctan2(sine, cosine)
-        base = _nearest_rotation((rotations @ np.swapaxes(_rotations_about(axis, angles), -1, -2))[good].sum(axis=0))
+        back = Rotation.from_rotvec(-np.outer(angles[good], axis))
+        base = (Rotation.from_matrix(rotations[good]) * back).mean().as_matrix()
     return axis, base, angles
 
 
@@ -193,14 +190,5 @@ def _is_outlier(misfit, good, least):
     return misfit > max(least, _CONTRADICTS_MEDIANS * float(np.median(misfit[good])))
 
 
-def _rotations_about(axis, angles):
-    return Rotation.from_rotvec(np.outer(angles, axis)).as_matrix()
-
-
 def _perpendicular(vector, axis):
     return vector - (vector @ axis) * axis
-
-
-def _nearest_rotation(matrix):
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

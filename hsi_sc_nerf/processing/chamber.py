@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi import open_cube
+from hsi_sc_nerf.geometry.camera import project_distorted
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
-from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of, through_lens
+from hsi_sc_nerf.processing.view_changes import Change, change_of, colours_of
 
 MAX_FRAMES = 16
 """Frames that are compared, evenly spread over the session."""
@@ -59,7 +60,7 @@ def background_pixels(
     return np.stack(spectra), np.stack(free)
 
 
-def picture_of_chamber(
+def gain_of_background_image(
     spectra: Float[np.ndarray, "frames pixels colours"], free: Bool[np.ndarray, "frames pixels"]
 ) -> Change | None:
     """What the other frames' medians at a pixel predict better than the median of all, root mean square reflectance.
@@ -90,7 +91,7 @@ def turntable_silhouette(
     """Pixels of a camera that show the turntable's disc or the container (`turntable_cylinders`)."""
     silhouette = np.zeros((dataset.intrinsics.h, dataset.intrinsics.w), np.uint8)
     for points in turntable_cylinders(dataset):
-        pixels = through_lens(points, camera_to_world, dataset.intrinsics, dataset.distortion)
+        pixels = project_distorted(points, camera_to_world, dataset.intrinsics, dataset.distortion)
         # OpenCV draws in coordinates whose origin is the first pixel's centre.
         cv2.fillConvexPoly(silhouette, cv2.convexHull(np.rint(pixels - 0.5).astype(np.int32)), 1)
     return silhouette > 0

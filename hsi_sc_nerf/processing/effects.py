@@ -20,14 +20,14 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting import new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.chamber import background_pixels, picture_of_chamber
+from hsi_sc_nerf.processing.chamber import background_pixels, gain_of_background_image
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 from hsi_sc_nerf.processing.view_changes import (
     Change,
-    Sightings,
+    PointViews,
     change_with_direction,
     change_with_height,
-    sightings,
+    point_views,
 )
 from hsi_sc_nerf.processing.voted_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
@@ -40,7 +40,7 @@ LEAST_HEIGHT_CHANGE_PERCENT = 2.0
 """A colour that goes with the height, as an apple's, leaves a tenth of that in even light."""
 LEAST_POSE_ERROR_PX = 0.1
 """What training corrects poses to at best; better ones it makes worse (docs/notes/dead_ends.md)."""
-FEWEST_SIGHTINGS = 500
+FEWEST_POINT_VIEWS = 500
 LARGEST_DRAWN = 100.0
 _LOG_P_NOISE = 0.43
 """Standard deviation of -log10 of a probability that is evenly distributed."""
@@ -66,11 +66,11 @@ def measure_effects(
     """
     seen = None
     if len(hull.core) > 0:
-        seen = sightings(bins, masks, dataset.camera_to_worlds, dataset.intrinsics, dataset.distortion, hull)
-        seen = seen if len(seen.point) >= FEWEST_SIGHTINGS else None
+        seen = point_views(bins, masks, dataset.camera_to_worlds, dataset.intrinsics, dataset.distortion, hull)
+        seen = seen if len(seen.point) >= FEWEST_POINT_VIEWS else None
     return (
         view_dependence(None if seen is None else change_with_direction(seen)),
-        still_chamber(picture_of_chamber(*background_pixels(dataset, bins, masks))),
+        still_chamber(gain_of_background_image(*background_pixels(dataset, bins, masks))),
         pose_refinement(poses, dataset.object_box_m),
         lamp_drift(*drift),
         lens_distortion(poses),
@@ -181,7 +181,7 @@ def spectral_rank(dataset: PackedDataset) -> Effect:
     return Effect("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
 
 
-def uneven_light(seen: Sightings | None) -> Effect:
+def uneven_light(seen: PointViews | None) -> Effect:
     """A hint only: `hsi-sc-nerf material` decides it after training, when the surface is known."""
     if seen is None:
         sentence = "Too little of the object is seen to tell; `material` decides after training."

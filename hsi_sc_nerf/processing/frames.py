@@ -69,13 +69,11 @@ class FrameCache:
     """What poses, masks and the report need of a frame; images are upright.
 
     Attributes:
-        fingerprint: of the files and settings that the frame was made from.
         gray: mean over the marker bands, in which markers are detected.
         bins: smoothed spectra (`smoothed_bins`), read from disk where they are used.
         pixel_counts: numbers of clipped and flagged values by kept band.
     """
 
-    fingerprint: str
     gray: UInt8[np.ndarray, "lines samples"]
     bins: Float16[np.ndarray, "bins lines samples"]
     pixel_counts: PixelCounts
@@ -197,7 +195,7 @@ def process_frame(
     np.savez(note, fingerprint=fingerprint, gray=gray, shape_of_bins=bins.shape, **vars(frame.pixel_counts))
     with atomic_write(paths.cache) as (temporary,):
         temporary.write_bytes(hashlib.sha256(note.getvalue()).digest() + note.getvalue())
-    return FrameCache(fingerprint, gray, _mapped(paths.bins, bins.shape), frame.pixel_counts)
+    return FrameCache(gray, _mapped(paths.bins, bins.shape), frame.pixel_counts)
 
 
 def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
@@ -209,14 +207,14 @@ def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
         if hashlib.sha256(note).digest() != digest:
             return None
         with np.load(io.BytesIO(note)) as stored:
+            if str(stored["fingerprint"]) != fingerprint:
+                return None
             pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
-            bins = _mapped(paths.bins, tuple(stored["shape_of_bins"]))
-            cache = FrameCache(str(stored["fingerprint"]), stored["gray"], bins, pixel_counts)
+            cache = FrameCache(stored["gray"], _mapped(paths.bins, tuple(stored["shape_of_bins"])), pixel_counts)
         open_cube(paths.cube)
     except (OSError, ValueError, KeyError, InputError):
         return None
-    complete = paths.image.is_file() and paths.flags.is_file()
-    return cache if complete and cache.fingerprint == fingerprint else None
+    return cache if paths.image.is_file() and paths.flags.is_file() else None
 
 
 def _mapped(path: Path, shape: tuple[int, ...]) -> Float16[np.ndarray, "bins lines samples"]:
@@ -263,7 +261,7 @@ def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
 
 
 def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, int]]:
-    """The same of the files that belong to one capture."""
+    """Name, size and time of last change of the files that belong to one capture."""
     paths = [path for cube in capture.cubes for path in (cube.header_path, cube.data_path)]
     if capture.metadata is not None:
         paths.append(capture.metadata.path)
@@ -271,7 +269,7 @@ def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, in
 
 
 def shared_files(session: Session) -> list[tuple[str, int, int]]:
-    """The same of the files that every frame's reflectance depends on.
+    """Name, size and time of last change of the files that every frame's reflectance depends on.
 
     These are ``session.json``, the files it names, and the tarp.
     """

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MAX_EMPTY_FRACTION = 0.05
@@ -58,16 +58,12 @@ def check_masks(
     found = []
     if empty.any():
         without = [name for name, is_empty in zip(names, empty, strict=True) if is_empty]
-        too_many = empty.mean() > MAX_EMPTY_FRACTION
-        found.append(
-            Finding(
-                "masks-empty",
-                "red" if too_many else "amber",
-                f"Nothing of the object was found in {names_in_short(without)}; look at report/masks.png and "
-                f"leave these frames out with {leave_out(without)}.",
-                {"frames": without},
-            )
+        level: Level = "red" if empty.mean() > MAX_EMPTY_FRACTION else "amber"
+        sentence = (
+            f"Nothing of the object was found in {names_in_short(without)}; look at report/masks.png and leave these "
+            f"frames out with {leave_out(without)}."
         )
+        found.append(Finding("masks-empty", level, sentence, {"frames": without}))
     if empty.all():
         return found
     return [
@@ -85,29 +81,22 @@ def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"]
     inner[1:-1, 1:-1] = True
     touching = (masks & ~inner).any(axis=(1, 2))
     if touching.any():
-        found.append(
-            Finding(
-                "masks-border",
-                "red" if touching.mean() > 0.5 else "amber",
-                f"The masks touch the image's border in {touching.sum()} of {len(masks)} frames: the object leaves "
-                "the image, or they are the wall's; look at report/masks.png.",
-                {"frames": int(touching.sum())},
-            )
+        level: Level = "red" if touching.mean() > 0.5 else "amber"
+        sentence = (
+            f"The masks touch the image's border in {touching.sum()} of {len(masks)} frames: the object leaves the "
+            "image, or they are the wall's; look at report/masks.png."
         )
+        found.append(Finding("masks-border", level, sentence, {"frames": int(touching.sum())}))
     if regions is not None:
         sides = regions & ~binary_erosion(regions, np.ones((1, 1, 3), bool), border_value=1)
         cut = (masks & sides).any(axis=2).sum(axis=1) / masks.any(axis=2).sum(axis=1)
         if np.median(cut) > MAX_CUT_FRACTION:
-            found.append(
-                Finding(
-                    "masks-cut",
-                    "red",
-                    f"The masks end at the side of the space above the lid in {100 * np.median(cut):.0f} % of their "
-                    "lines: they are the wall's, or the object is wider than --masks.overhang allows; look at "
-                    "report/masks.png.",
-                    {"lines_fraction": float(np.median(cut))},
-                )
+            sentence = (
+                f"The masks end at the side of the space above the lid in {100 * np.median(cut):.0f} % of their "
+                "lines: they are the wall's, or the object is wider than --masks.overhang allows; look at "
+                "report/masks.png."
             )
+            found.append(Finding("masks-cut", "red", sentence, {"lines_fraction": float(np.median(cut))}))
     return found
 
 
@@ -133,16 +122,12 @@ def _still(
     still = float((change[edge] <= 2.0 * np.median(change[~all_of_them])).mean())
     if still < STILL_FRACTION:
         return []
-    return [
-        Finding(
-            "masks-static",
-            "red",
-            "The masks and what they show at their edge stand still while the table turns, so they are "
-            "probably the wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body "
-            "of revolution on no known container.",
-            {"overlap": float(overlap), "still_fraction": still},
-        )
-    ]
+    sentence = (
+        "The masks and what they show at their edge stand still while the table turns, so they are probably the "
+        "wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body of revolution on "
+        "no known container."
+    )
+    return [Finding("masks-static", "red", sentence, {"overlap": float(overlap), "still_fraction": still})]
 
 
 def _hull(
@@ -169,15 +154,11 @@ def _hull(
     others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
     if not others:
         return []
-    return [
-        Finding(
-            "frames-hull",
-            "red",
-            f"The object in {names_in_short([*others])} has another shape than in the other frames: it is another "
-            f"object, or it was moved; leave these frames out with {leave_out([*others])}.",
-            {"frames": others},
-        )
-    ]
+    sentence = (
+        f"The object in {names_in_short([*others])} has another shape than in the other frames: it is another "
+        f"object, or it was moved; leave these frames out with {leave_out([*others])}."
+    )
+    return [Finding("frames-hull", "red", sentence, {"frames": others})]
 
 
 def _background(

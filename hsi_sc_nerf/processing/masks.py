@@ -21,15 +21,8 @@ from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays, project
-from hsi_sc_nerf.morphology import (
-    dilate,
-    draw_outline,
-    ellipse_close_open,
-    fill_holes,
-    largest_component,
-    touching,
-)
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
+from hsi_sc_nerf.morphology import dilate, draw_outline, ellipse_close_open, fill_holes, largest_component, touching
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 
@@ -43,7 +36,7 @@ CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
 
 COLUMNS, TILE_PX = 6, 240
-"""Of the contact sheet: frames in a row, and the width of each."""
+"""Frames in a row of the contact sheet, and the width of each."""
 NEARBY_PX = 2.0
 """Standard deviation of the Gaussian weights with which what is next to a pixel is averaged."""
 HALF_COVERED = 0.5
@@ -76,7 +69,7 @@ class MaskConfig:
 def foreground_masks(
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     config: MaskConfig,
-    regions: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    regions: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> Bool[np.ndarray, "frames h w"]:
     """Masks of the object in all frames, with one threshold.
 
@@ -199,12 +192,7 @@ def lid_middle(
     ticks = np.linspace(-1.0, 1.0, 41) * LID_MIDDLE * container.diameter_m / 2.0
     x, y = (coordinate.ravel() for coordinate in np.meshgrid(ticks, ticks))
     points = np.stack([x, y, np.full_like(x, container.height_m)], axis=-1)[np.hypot(x, y) <= ticks[-1]]
-    pixels, depth = project(points, camera_to_world, intrinsics)
-    inside = (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=1)
-    column, row = pixels[inside].astype(int).T
-    seen = np.zeros((intrinsics.h, intrinsics.w), bool)
-    seen[row, column] = True
-    return seen
+    return image_of(points, camera_to_world, intrinsics)
 
 
 def mask_picture(

@@ -14,12 +14,7 @@ from rich.console import Console
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
-from hsi_sc_nerf.calibration.report import (
-    REPORT_NAME,
-    describe_calibration,
-    draw_calibration,
-    write_calibration,
-)
+from hsi_sc_nerf.calibration.report import REPORT_NAME, describe_calibration, draw_calibration, write_calibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
@@ -43,13 +38,7 @@ from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_e
 from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
-from hsi_sc_nerf.processing.posed_frames import (
-    PoseFunction,
-    container_under,
-    known_camera,
-    pose_frames,
-    posed_frames,
-)
+from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.voted_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
@@ -279,21 +268,16 @@ def _write_masks(
         InputError: a finding is red and not accepted.
     """
     regions = lid_middles = None
+    camera_to_worlds, lens = np.stack([frame.camera_to_world for frame in frames]), poses.intrinsics
     if container is not None:
-        distortion = np.array(poses.distortion, dtype=float)
-        regions = np.stack(
-            [
-                above_lid(poses.intrinsics, distortion, frame.camera_to_world, container, config.overhang)
-                for frame in frames
-            ]
-        )
-        lid_middles = np.stack([lid_middle(poses.intrinsics, frame.camera_to_world, container) for frame in frames])
-    masks = foreground_masks([cache.bins for cache in caches], config, None if regions is None else list(regions))
-    camera_to_worlds = np.stack([frame.camera_to_world for frame in frames])
+        distortion, overhang = np.array(poses.distortion, dtype=float), config.overhang
+        regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
+        lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
+    masks = foreground_masks([cache.bins for cache in caches], config, regions)
     brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
-    hull = voted_hull(masks, camera_to_worlds, poses.intrinsics, lid_z_m)
+    hull = voted_hull(masks, camera_to_worlds, lens, lid_z_m)
     findings = check_masks(masks, names, hull.silhouettes, brightness, regions, lid_middles)
     if all(finding.level != "red" for finding in findings):
         masks = hull.trim(masks)

@@ -15,7 +15,7 @@ from hsi_sc_nerf.inspection.inspect import Inspection
 _log = logging.getLogger(__name__)
 
 CHECKS_PATH = Path("report") / INSPECTION_NAME
-"""In the dataset; the inspection's content and the findings of all later steps."""
+"""File in the dataset with the inspection's content and the findings of all later steps."""
 MAY_BE_RED = (
     *("angles", "binning", "copies", "damaged", "dates", "exposure", "other-object", "scale", "turn"),
     *("white", "white-clipped", "clipped", "drift", "noise"),

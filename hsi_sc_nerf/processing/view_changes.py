@@ -12,13 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics, project
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.processing.voted_hull import VotedHull
 
@@ -51,56 +50,54 @@ class Change:
     noise: float
 
 
-def change_with_direction(sightings: Sightings) -> Change:
+def change_with_direction(views: PointViews) -> Change:
     """Change of points' spectra with the direction that they face, relative to their brightness.
 
     Example:
-        >>> seen = sightings(bins, masks, camera_to_worlds, intrinsics, hull)
+        >>> seen = point_views(bins, masks, camera_to_worlds, intrinsics, hull)
         >>> change_with_direction(seen).rms
         0.083
     """
-    s = sightings
-    count, colours = len(s.positions_m), s.reflectance.shape[1]
-    brightness = _mean_of(s.reflectance.mean(axis=1), s.point, count)
-    scale = np.maximum(brightness, 1e-3)[s.point]
-    kinds = [_indicators(_facing(s)), _indicators(s.frame)]
+    count, colours = len(views.positions_m), views.reflectance.shape[1]
+    brightness = _mean_of(views.reflectance.mean(axis=1), views.point, count)
+    scale = np.maximum(brightness, 1e-3)[views.point]
+    kinds = [_indicators(_facing(views)), _indicators(views.frame)]
     cells = kinds[0].shape[1]
     shared = np.concatenate(kinds, axis=1)
-    shared -= _mean_of(shared, s.point, count)[s.point]
+    shared -= _mean_of(shared, views.point, count)[views.point]
     products = []
     for colour in range(colours):
-        response = s.reflectance[:, colour] / scale
-        response -= _mean_of(response, s.point, count)[s.point]
+        response = views.reflectance[:, colour] / scale
+        response -= _mean_of(response, views.point, count)[views.point]
         response = response.clip(-MOST_CHANGE, MOST_CHANGE)
-        products.append([_products(shared[rows], response[rows]) for rows in _rows_of(s.sector[s.point])])
+        products.append([_products(shared[rows], response[rows]) for rows in _rows_of(views.sector[views.point])])
     return _predicted(products, cells)
 
 
-def change_with_height(sightings: Sightings) -> Change:
+def change_with_height(views: PointViews) -> Change:
     """Relative change of brightness with height and slope among points of like spectra.
 
     Light from the chamber's walls and the lid's shade show here, and so does a material whose brightness alone
     changes with height.
     """
-    s = sightings
-    count = len(s.positions_m)
-    spectra = _mean_of(s.reflectance, s.point, count)
-    seen = np.unique(s.point)
+    count = len(views.positions_m)
+    spectra = _mean_of(views.reflectance, views.point, count)
+    seen = np.unique(views.point)
     spectra = np.maximum(spectra[seen], 1e-4)
     brightness = np.log(spectra.mean(axis=1))
     shapes = spectra / np.linalg.norm(spectra, axis=1, keepdims=True)
     _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
-    height, slope = (_tertile(values[seen]) for values in (s.positions_m[:, 2], s.normals[:, 2]))
+    height, slope = (_tertile(values[seen]) for values in (views.positions_m[:, 2], views.normals[:, 2]))
     causes = _indicators(3 * height + slope)
     causes = causes - causes[alike].mean(axis=1)
     response = brightness - brightness[alike].mean(axis=1)
-    rows = _rows_of(s.sector[seen])
+    rows = _rows_of(views.sector[seen])
     return _predicted([[_products(causes[part], response[part]) for part in rows]], causes.shape[1])
 
 
-def _facing(sightings: Sightings) -> Int[np.ndarray, "n"]:
+def _facing(views: PointViews) -> Int[np.ndarray, "n"]:
     """Cell of the normal's direction in the camera's frame."""
-    cell = ((sightings.normal[:, :2] + 1.0) / 2.0 * NORMAL_CELLS).astype(int).clip(0, NORMAL_CELLS - 1)
+    cell = ((views.normal[:, :2] + 1.0) / 2.0 * NORMAL_CELLS).astype(int).clip(0, NORMAL_CELLS - 1)
     return cell[:, 0] * NORMAL_CELLS + cell[:, 1]
 
 
@@ -137,8 +134,8 @@ def _products(
     return causes.T @ causes, causes.T @ response, len(response)
 
 
-def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]], wanted: int) -> Change:
-    """What the first ``wanted`` causes explain in each sector as the other sectors say, over all colours."""
+def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]], first: int) -> Change:
+    """What the first causes, so many, explain in each sector as the other sectors say, over all colours."""
     explained, sizes = [], []
     for held in range(len(products[0])):
         covariance = 0.0
@@ -149,16 +146,16 @@ def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]],
             ridge = max(_RIDGE * np.trace(square) / len(square), _LEAST_RIDGE) * np.eye(len(square))
             effects = np.linalg.solve(square + ridge, right)
             own_square, own_right, size = sectors[held]
-            rest = own_right - own_square[:, wanted:] @ effects[wanted:]
-            covariance += float(effects[:wanted] @ rest[:wanted]) / max(size, 1) / len(products)
+            rest = own_right - own_square[:, first:] @ effects[first:]
+            covariance += float(effects[:first] @ rest[:first]) / max(size, 1) / len(products)
         explained.append(covariance)
         sizes.append(size)
     return change_of(explained, sizes)
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """Points of the object as the frames see them; one row a sighting.
+class PointViews:
+    """Points of the object as the frames see them; one row a view of a point.
 
     Attributes:
         point: number of the point.
@@ -183,14 +180,14 @@ class Sightings:
         return np.minimum(((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int), SECTORS - 1)
 
 
-def sightings(
+def point_views(
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     masks: Bool[np.ndarray, "frames h w"],
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
     distortion: Float[np.ndarray, "4"],
     hull: VotedHull,
-) -> Sightings:
+) -> PointViews:
     """Look the hull's points up in the frames.
 
     Args:
@@ -212,7 +209,7 @@ def sightings(
     found: list[tuple[np.ndarray, ...]] = []
     for frame in range(0, len(masks), -(-len(masks) // MAX_FRAMES)):
         pose = camera_to_worlds[frame]
-        pixels, depth = through_lens(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
+        pixels, depth = project_distorted(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
         to_eye = pose[:3, 3] - points
         facing = (normals * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
         inside = ~dilate(~masks[frame], 2 * OUTLINE_PX + 1)
@@ -227,19 +224,7 @@ def sightings(
         values = np.stack([ndimage.map_coordinates(colour, at, order=1) for colour in image], axis=-1)
         found.append((rows, np.full(len(rows), frame), normals[rows] @ pose[:3, :3], values))
     point, frames, normal, reflectance = map(np.concatenate, zip(*found, strict=True))
-    return Sightings(point, frames, normal, reflectance, points, normals)
-
-
-def through_lens(
-    points: Float[np.ndarray, "n 3"],
-    pose: Float[np.ndarray, "4 4"],
-    intrinsics: PinholeIntrinsics,
-    distortion: Float[np.ndarray, "4"],
-) -> Float[np.ndarray, "n 2"]:
-    """Pixel coordinates of points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
-    to_camera = np.linalg.inv(pose @ OPENCV_TO_OPENGL)
-    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
-    return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]
+    return PointViews(point, frames, normal, reflectance, points, normals)
 
 
 def _surface(hull: VotedHull, inwards_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

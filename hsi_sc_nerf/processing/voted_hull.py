@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, project
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, image_of
 from hsi_sc_nerf.geometry.visual_hull import visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import Container
@@ -101,12 +101,8 @@ def _silhouette(
     voxels: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics, voxel_px: int
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels that see the hull of masks that were dilated by a voxel's diameter."""
-    seen = np.zeros((intrinsics.h, intrinsics.w), bool)
-    x, y = np.floor(project(voxels, pose, intrinsics)[0]).astype(int).T
-    inside = (x >= 0) & (x < intrinsics.w) & (y >= 0) & (y < intrinsics.h)
-    seen[y[inside], x[inside]] = True
     # Dilation closes the gaps between voxels; erosion undoes it, and the dilation of the masks.
-    return ~dilate(~dilate(seen, voxel_px), 2 * voxel_px - 1)
+    return ~dilate(~dilate(image_of(voxels, pose, intrinsics), voxel_px), 2 * voxel_px - 1)
 
 
 def object_box(hull: VotedHull, min_z_m: float | None = None) -> Float[np.ndarray, "2 3"]:

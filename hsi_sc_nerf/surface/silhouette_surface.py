@@ -61,9 +61,9 @@ def move_to_silhouettes(
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
     """
     moved, touched = points, torch.ones_like(points[:, 0], dtype=torch.bool)
-    across, step = _across(normals), _NORMAL_STEP * normals
+    tangents, step = _tangents(normals), _NORMAL_STEP * normals
     for max_step in MAX_STEPS:
-        depth, touches = _least_touching_depth(density_fn, moved, across)
+        depth, touches = _least_touching_depth(density_fn, moved, tangents)
         touched &= touches
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
         folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*FOLDING)
@@ -87,13 +87,13 @@ def move_to_silhouettes(
 def _least_touching_depth(
     density_fn: Callable[[Float[Tensor, "*n 3"]], Float[Tensor, "*n 1"]],
     points: Float[Tensor, "n 3"],
-    across: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
+    tangents: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
 ) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
     """Optical depth of the ray through each point, across its normal, that collects least; whether that one touches.
 
     A ray in a hollow does not touch: it goes deeper into the density to both sides.
     """
-    first, second = across
+    first, second = tangents
     step = 2.0 * REACH / RAY_SAMPLES
     along = (torch.arange(RAY_SAMPLES, device=points.device) + 0.5) * step - REACH
     depths = []
@@ -109,7 +109,7 @@ def _density(density_fn: Callable[[Tensor], Tensor], points: Float[Tensor, "*n 3
     return density_fn(points)[..., 0].clamp_min(_LEAST_DENSITY)
 
 
-def _across(normals: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+def _tangents(normals: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Two unit vectors across each normal and each other."""
     # The axis that the normal has least of is never along it.
     axis = torch.nn.functional.one_hot(normals.abs().argmin(dim=-1), 3).to(normals)

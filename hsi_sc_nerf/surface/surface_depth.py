@@ -33,7 +33,7 @@ MIN_COSINE = 0.17
 """Smallest cosine between a ray and the surface normal: pixels smear faces seen at more than 80 degrees."""
 _MIN_RATIO_OPACITY = 1e-3
 OPAQUE = 5.0
-"""Optical depth behind which nothing is asked for: less than a hundredth of the light is left."""
+"""Optical depth behind which no density is evaluated: less than a hundredth of the light is left."""
 _STEPS_AT_ONCE = 5
 
 
@@ -158,10 +158,10 @@ def densities_along(
     depth = torch.zeros_like(middles[:, 0])
     for first in range(0, middles.shape[1], _STEPS_AT_ONCE):
         some = slice(first, first + _STEPS_AT_ONCE)
-        asked = known[:, some] & (depth < OPAQUE)[:, None]
+        evaluated = known[:, some] & (depth < OPAQUE)[:, None]
         found = torch.zeros_like(densities[:, some])
-        if asked.any():
-            found[asked] = model.field.density_fn(points[:, some][asked][:, None])[:, 0, 0]
+        if evaluated.any():
+            found[evaluated] = model.field.density_fn(points[:, some][evaluated][:, None])[:, 0, 0]
         densities[:, some] = found
         depth += (found * lengths[:, some]).sum(dim=-1)
     return densities

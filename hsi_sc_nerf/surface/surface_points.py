@@ -126,7 +126,7 @@ def sample_surface_points(
         return SurfacePoints.concatenate(parts)
 
     with progress_bar("spreading points", "points", num_points) as update:
-        triangles = mesh.triangles_near(region.bounds, 0.0)
+        triangles = mesh.triangles_in(region.bounds)
         points = even_points(mesh.vertices, triangles, num_points, keep) if len(triangles) else None
     if points is None or not len(points):
         raise InputError("no point of the object lies in the selected region; make it larger.")
@@ -219,7 +219,7 @@ def surface_mesh(
 
 
 class SurfaceMesh(Mesh):
-    """A mesh in any unit, with its normals at points and its triangles near a box."""
+    """A mesh in any unit, with its normals at points and its triangles in a box."""
 
     def normals_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Outward unit normals: area-weighted mean over the ``NORMAL_VERTICES`` nearest vertices."""
@@ -228,10 +228,10 @@ class SurfaceMesh(Mesh):
         normals = vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1)
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
-    def triangles_near(self, box: Float[np.ndarray, "2 3"], margin: float) -> Int[np.ndarray, "near 3"]:
-        """Triangles with an area whose bounding boxes come within ``margin`` of a box in each direction."""
+    def triangles_in(self, box: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, "near 3"]:
+        """Triangles with an area whose bounding boxes touch a box."""
         corners = self.vertices[self.triangles]
-        near = (corners.max(axis=1) >= box[0] - margin) & (corners.min(axis=1) <= box[1] + margin)
+        near = (corners.max(axis=1) >= box[0]) & (corners.min(axis=1) <= box[1])
         return self.triangles[near.all(axis=1) & (self.triangle_areas_m2() > 0.0)]
 
     @cached_property

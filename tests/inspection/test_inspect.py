@@ -72,7 +72,7 @@ def test_damaged_captures_are_named(session):
     (told,) = [finding for finding in left_out if finding.name == "damaged"]
     assert told.level == "amber"
     assert "fruit_04" in told.sentence
-    assert len(inspection.looks) == 11
+    assert len(inspection.quicklooks) == 11
 
 
 def test_a_copied_frame(session):

@@ -5,26 +5,24 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from exact_turntable import SIDE_M, marker_observations, marker_turntable, pose_errors
+from exact_turntable import (
+    SIDE_M,
+    adjusted,
+    in_object_frame,
+    marker_observations,
+    marker_turntable,
+    pose_errors,
+    started,
+)
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import Problem
-from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.object_frame import disc_height, to_object_frame
 from hsi_sc_nerf.poses.report import check_poses, draw_poses, pose_report
-from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.result import is_full_turn
 
 INFO = SessionInfo(marker_side_m=SIDE_M)
-
-
-def solve(scene, observations):
-    centre = (scene.size_px / 2, scene.size_px / 2)
-    start = initialise(observations, centre, scene.size_px, SIDE_M)
-    return Problem(start, MarkerResiduals(start, observations, 3.0)).minimise(start)
 
 
 @lru_cache(maxsize=8)
@@ -46,10 +44,10 @@ def estimated(**options):
 )
 def test_exact_corners_give_exact_poses(options):
     scene = MarkerScene(**options)
-    turntable = solve(scene, marker_observations(marker_turntable(scene), 0.0))
+    seen = marker_observations(marker_turntable(scene), 0.0)
+    turntable = adjusted(started(scene, seen), seen)
     assert turntable.focal_px == pytest.approx(scene.intrinsics.fl_x, rel=1e-4)
-    found = to_object_frame(turntable, disc_height(turntable)) @ turntable.camera_to_world()
-    rotation, position = pose_errors(found, scene.camera_to_world)
+    rotation, position = pose_errors(in_object_frame(turntable), scene.camera_to_world)
     assert rotation < 1e-2
     assert position < 1e-1
     turned = np.rad2deg(np.unwrap(turntable.angles_rad))
@@ -139,16 +137,3 @@ def test_frames_without_markers_are_refused_with_names_and_advice():
             scene.names()[:3],
             SessionInfo(marker_dictionary="DICT_4X4_50", marker_side_m=SIDE_M),
         )
-
-
-def test_a_single_frame_is_refused():
-    with pytest.raises(InputError, match="3 or more frames"):
-        poses_from_markers([np.zeros((8, 8), np.uint8)], ["only"], INFO)
-
-
-@pytest.mark.slow
-def test_a_camera_before_a_still_table_is_refused():
-    scene = MarkerScene(frames=18, noise=0.01)
-    still = [scene.render()[0]] * 4
-    with pytest.raises(InputError, match="share"):
-        poses_from_markers(still, list("abcd"), INFO)

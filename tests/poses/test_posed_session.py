@@ -45,7 +45,7 @@ def test_markers_that_are_shifted_together_are_covered():
         fields = smooth_fields(seen.corners_px.reshape(-1, 2))
         shift_px = fields @ (0.007 * np.random.default_rng(seed).normal(size=fields.shape[-1]))
         seen = replace(seen, corners_px=seen.corners_px + shift_px.reshape(-1, 4, 2))
-        problem = Problem(true, MarkerResiduals(true, seen, 3.0))
+        problem = Problem(MarkerResiduals(true, seen, 3.0))
         found.append(scores(with_hidden_errors(Adjusted(problem.minimise(true), problem)), true))
     found = np.abs(found)
     assert (found < 2.0).mean() > 0.9
@@ -77,7 +77,7 @@ def test_features_that_creep_are_covered(markers):
 
 
 def test_points_that_err_together_in_their_frames_are_covered_by_their_scatter():
-    """Each point is seen at a wrong place of its own, which turns as it passes; its sightings are not independent."""
+    """Each point is seen at a wrong place of its own, which turns as it passes: observations are not independent."""
     scene, found = MarkerScene(size_px=256, frames=18), []
     for seed in range(SEEDS):
         true = point_turntable(marker_turntable(scene), 150, seed)
@@ -87,14 +87,14 @@ def test_points_that_err_together_in_their_frames_are_covered_by_their_scatter()
         phase = 2.0 * true.angles_rad[tracks.frame] + rng.uniform(0.0, 2.0 * np.pi, 150)[tracks.point]
         away_px = 0.1 * np.stack([np.cos(phase), np.sin(phase)], axis=-1)
         tracks = replace(tracks, pixels=tracks.pixels + away_px)
-        problem = Problem(true, PointResiduals(true, tracks, 1e3, 0.01), free=FreeParameters(distance=False))
+        problem = Problem(PointResiduals(true, tracks, 1e3, 0.01), free=FreeParameters(distance=False))
         found.append(scores(Adjusted(problem.minimise(true), problem), true)[0:3:2])
     assert 0.6 < np.sqrt((np.array(found) ** 2).mean()) < 1.45
 
 
 def test_an_angle_that_is_not_known_moves_its_camera_along_the_circle():
     true = marker_turntable(MarkerScene(size_px=256, frames=12))
-    problem = Problem(true, MarkerResiduals(true, marker_observations(true), 3.0))
+    problem = Problem(MarkerResiduals(true, marker_observations(true), 3.0))
     covariance = np.zeros((problem.layout.motion_size,) * 2)
     column = problem.layout.angle[5]
     covariance[column, column] = 0.01**2

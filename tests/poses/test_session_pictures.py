@@ -7,14 +7,8 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from capture_factory import (
-    INTRINSICS,
-    WAVELENGTHS_NM,
-    frame_reflectance,
-    true_pose,
-    true_poses,
-    write_session,
-)
+from capture_factory import INTRINSICS, WAVELENGTHS_NM, frame_reflectance, true_pose, true_poses, write_session
+from exact_turntable import marker_turntable
 from rich.console import Console
 from scipy.special import ndtr
 from turntable_scene import MarkerScene
@@ -27,8 +21,7 @@ from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
-from hsi_sc_nerf.poses.marker_observations import observe
-from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.session_pictures import (
     BAND_GROUPS_NM,
     GRAY,
@@ -83,18 +76,15 @@ def test_scores_from_a_few_bands_are_those_of_all(many_bands, tmp_path):
     assert frame.ranking[0] == "near infrared"
 
 
-def test_what_was_not_measured_is_white_if_it_is_saturated_and_ill_exposed_anyway(many_bands, tmp_path):
+def test_what_was_not_measured_is_white_if_it_is_saturated_and_black_else(many_bands, tmp_path):
     cube, wavelengths_nm = many_bands
     cube = cube.copy()
     cube[:10, :20] = np.nan
     frame = pictures_of(cube, wavelengths_nm, tmp_path)
     assert (frame.picture("red")[:10, :20] == 255).all()
-    np.testing.assert_array_equal(np.argwhere(frame.flagged), np.argwhere(np.isnan(cube[..., 0])))
-    assert frame.ill_exposed[:10, :20].all()
     cv2.imwrite(str(tmp_path / "c.png"), np.zeros((80, 100), np.uint8))
     frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.picture(GRAY), GRAY_NM)
     assert (frame.picture("red")[:10, :20] == 0).all()
-    assert frame.ill_exposed[:10, :20].all()
 
 
 def edge(contrast=0.6, blur_px=2.0, noise=0.01):
@@ -247,27 +237,14 @@ def test_ink_that_the_best_picture_does_not_show_is_found_in_the_broad_mean():
 
 
 @pytest.mark.slow
-def test_markers_that_are_expected_are_found_in_the_next_picture(machine):
-    # In frames that show many markers only the adjusted turntable asks for the rest.
+def test_markers_that_were_not_detected_are_fitted_where_they_are_expected(machine):
     scene, images = machine
-    spot = [image.copy() for image in images]
-    for image, pose in zip(spot[:2], scene.camera_to_world, strict=False):
-        for marker in (6, 8):
-            x, y = np.rint(project(scene.corners_m[marker], pose, scene.intrinsics)[0].mean(axis=0)).astype(int)
-            image[max(0, y - 3) : y + 3, max(0, x - 3) : x + 3] = 255
-    info = SessionInfo(marker_dictionary=DICTIONARY, marker_side_m=scene.marker_side_m)
-    alone, joined = (poses_from_markers(shown, scene.names(), info) for shown in (spot, two_pictures(spot, images)))
-    more = np.subtract(joined.markers_per_frame, alone.markers_per_frame)
-    assert more[:2].min() > 0
-    assert not more[2:].any()
-    assert joined.overall_error_px < 1.2 * alone.overall_error_px
-    # Where the best picture is exposed well something hides the marker: the others are not asked.
-    hidden = two_pictures([np.where(image == 255, 128, image).astype(np.uint8) for image in spot], images)
-    ill_exposed = [replace(frame, flagged=image == 255) for frame, image in zip(hidden.frames, spot, strict=True)]
-    well, ill = (poses_from_markers(shown, scene.names(), info) for shown in (hidden, SessionPictures(ill_exposed)))
-    more = np.subtract(ill.markers_per_frame, well.markers_per_frame)
-    assert more[:2].min() > 0
-    assert not more[2:].any()
+    observed, true = observe(images, DICTIONARY), marker_turntable(scene)
+    some = observed.observations.select(np.arange(len(observed.observations)) % 4 > 0)
+    found = observe_expected(images, DICTIONARY, true, some, observed.blur_px)
+    assert len(found) >= len(observed.observations)
+    np.testing.assert_array_equal(found.corners_px[: len(some)], some.corners_px)
+    np.testing.assert_allclose(found.corners_px, true.reproject(found), atol=0.2)
 
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)

@@ -10,11 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.poses.structure_from_motion import (
-    moving_pixels,
-    neighbour_pairs,
-    structure_from_motion,
-)
+from hsi_sc_nerf.poses.structure_from_motion import moving_pixels, neighbour_pairs, structure_from_motion
 from hsi_sc_nerf.poses.track_adjustment import adjust_tracks
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 

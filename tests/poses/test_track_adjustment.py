@@ -8,12 +8,7 @@ from exact_turntable import point_tracks, point_turntable
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.track_adjustment import (
-    adjust_either_way,
-    adjust_tracks,
-    with_lost_frames,
-)
+from hsi_sc_nerf.poses.track_adjustment import adjust_either_depth, adjust_tracks, with_lost_frames
 from hsi_sc_nerf.poses.turntable import Turntable
 from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 
@@ -79,10 +74,10 @@ def test_a_turn_that_was_found_reversed_in_depth_is_set_right():
     true = narrow_machine()
     start, tracks = disturbed(reversed_in_depth(true)), point_tracks(true, noise_px=0.1)
     assert pose_error_deg(adjust_tracks(start, tracks).turntable, true) > 90.0
-    assert pose_error_deg(adjust_either_way(start, tracks).turntable, true) < 2.0
+    assert pose_error_deg(adjust_either_depth(start, tracks).turntable, true) < 2.0
 
 
-def test_wrong_sightings_are_thrown_out():
+def test_wrong_observations_are_left_out():
     true = machine(np.arange(0, 360, 18.0))
     tracks = point_tracks(true, noise_px=0.1)
     rng = np.random.default_rng(5)
@@ -112,7 +107,7 @@ def test_a_frame_with_too_few_points_is_left_out():
 def test_held_angles_stay():
     true = machine(np.arange(0, 360, 18.0))
     start = replace(disturbed(true), angles_rad=true.angles_rad)
-    found = adjust_tracks(start, point_tracks(true), free=FreeParameters(angles=False))
+    found = adjust_tracks(start, point_tracks(true), free_angles=False)
     np.testing.assert_array_equal(found.turntable.angles_rad, true.angles_rad)
     assert found.turntable.focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
     assert pose_error_deg(found.turntable, true) < 1e-3

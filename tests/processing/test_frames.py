@@ -93,7 +93,6 @@ def test_finished_reflectance_goes_the_same_way(tmp_path):
 def test_the_cache_of_a_finished_frame_is_read_again(cube, tmp_path):
     paths, cache = process(cube, tmp_path / "data")
     again = read_cache(paths, "made")
-    assert again.fingerprint == "made"
     np.testing.assert_array_equal(again.gray, cache.gray)
     np.testing.assert_array_equal(again.bins, cache.bins)
     for field in fields(PixelCounts):

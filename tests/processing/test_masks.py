@@ -3,12 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from capture_factory import (
-    INTRINSICS,
-    frame_reflectance,
-    sphere_mask,
-    true_pose,
-)
+from capture_factory import INTRINSICS, frame_reflectance, sphere_mask, true_pose
 from scipy import ndimage
 
 from hsi_sc_nerf.errors import InputError

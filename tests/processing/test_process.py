@@ -33,6 +33,7 @@ from hsi_sc_nerf.processing.posed_frames import known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
+DARK_TARP = np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16)
 
 
 def run(session, output, config=None, poses=true_poses):
@@ -137,18 +138,12 @@ def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_input_is_processed_once(session, tmp_path):
+def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_on_them(session, tmp_path):
     output = run(session, tmp_path / "data")
     before, stamp = written(output), (output / "transforms.json").stat().st_mtime_ns
     assert run(session, output, poses=no_markers) == output
     assert rewritten(output, before) == []
     assert (output / "transforms.json").stat().st_mtime_ns == stamp
-
-
-@pytest.mark.slow
-def test_other_settings_redo_what_depends_on_them(session, tmp_path):
-    output = run(session, tmp_path / "data")
-    before = written(output)
     run(session, output, ProcessConfig(masks=MaskConfig(threshold=0.1)))
     assert rewritten(output, before) == []
     run(session, output, ProcessConfig(calibration=CalibrationConfig(bounds=(0.0, 0.9))))
@@ -189,12 +184,15 @@ def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
 
 
 @pytest.mark.slow
-def test_a_changed_capture_is_done_again_alone(session, tmp_path):
+def test_a_changed_capture_is_done_again_alone_and_an_outdated_dataset_does_not_survive_a_failure(session, tmp_path):
     # All of that frame gets darker, which would be taken for the lamps.
     config = ProcessConfig(calibration=CalibrationConfig(lamp_drift="never"))
     output = run(session, tmp_path / "data", config)
     before = written(output)
     write_capture(session, "ball_3", expose(frame_reflectance(180.0) * 0.9))
+    with pytest.raises(InputError, match="no marker was found"):
+        run(session, output, config, poses=no_markers)
+    assert not (output / "transforms.json").exists()
     run(session, output, config)
     assert rewritten(output, before) == ["ball_3"]
     cube = open_packed(output).frames[2].cube()
@@ -228,15 +226,6 @@ def test_a_stopped_run_goes_on(session, tmp_path):
     output = run(session, tmp_path / "data", one_by_one)
     assert not {"ball_1", "ball_2"} & set(rewritten(output, before))
     assert len(open_packed(output).frames) == 4
-
-
-@pytest.mark.slow
-def test_an_outdated_dataset_does_not_survive_a_failure(session, tmp_path):
-    run(session, tmp_path / "data")
-    write_capture(session, "ball_1", expose(frame_reflectance(0.0) * 0.9))
-    with pytest.raises(InputError, match="no marker was found"):
-        run(session, tmp_path / "data", poses=no_markers)
-    assert not (tmp_path / "data" / "transforms.json").exists()
 
 
 @pytest.mark.slow
@@ -274,22 +263,18 @@ def test_names_are_printed_as_they_are(tmp_path, capsys):
         assert words.replace(" ", "") in printed
 
 
-def test_no_worker_is_refused(session, tmp_path):
-    with pytest.raises(InputError, match="--workers is 0"):
-        run(session, tmp_path / "data", ProcessConfig(workers=0))
-
-
-def test_marker_size_is_needed(tmp_path):
-    session = write_session(tmp_path / "session", info=None)
-    with pytest.raises(InputError, match=r"nothing gives a scale; state marker_side_m"):
-        run(session, tmp_path / "data")
-    assert not (tmp_path / "data").exists()
-
-
-def test_bad_tarp_writes_nothing(session, tmp_path):
-    write_capture(session, "white_reference", np.zeros((20, 20, len(WAVELENGTHS_NM)), np.uint16))
-    with pytest.raises(InputError, match="white_reference is dark"):
-        run(session, tmp_path / "data")
+@pytest.mark.parametrize(
+    ("spoil", "config", "message"),
+    [
+        (lambda session: None, ProcessConfig(workers=0), "--workers is 0"),
+        (lambda session: (session / "session.json").unlink(), None, "nothing gives a scale; state marker_side_m"),
+        (lambda session: write_capture(session, "white_reference", DARK_TARP), None, "white_reference is dark"),
+    ],
+)
+def test_what_cannot_be_processed_is_refused_before_anything_is_written(session, tmp_path, spoil, config, message):
+    spoil(session)
+    with pytest.raises(InputError, match=message):
+        run(session, tmp_path / "data", config)
     assert not (tmp_path / "data").exists()
 
 

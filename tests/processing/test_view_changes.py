@@ -11,12 +11,12 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
 from hsi_sc_nerf.processing.view_changes import (
     COLOURS,
     MAX_INCIDENCE_DEG,
-    Sightings,
+    PointViews,
     change_of,
     change_with_direction,
     change_with_height,
     colours_of,
-    sightings,
+    point_views,
 )
 from hsi_sc_nerf.processing.voted_hull import voted_hull
 
@@ -25,7 +25,7 @@ NOISE = 0.02
 
 
 def ball(light=lambda normal: 1.0, shade=lambda height: 1.0, drift=0.0, turn_deg=360.0, shifted=0.0, seed=0):
-    """Points on a ball with a texture, seen at less than 60 degrees, and the relative light of each sighting."""
+    """Points on a ball with a texture, seen at less than 60 degrees, and the relative light of each view."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(900, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -43,7 +43,7 @@ def ball(light=lambda normal: 1.0, shade=lambda height: 1.0, drift=0.0, turn_deg
     reflectance = albedo[point] * (lit * shade(normals[point, 2]))[:, None]
     # A wrong pose shows another part of the texture, here and there.
     reflectance *= 1.0 + shifted * rng.normal(size=(len(point), 1)) + NOISE * rng.normal(size=reflectance.shape)
-    return Sightings(point, frame, seen, reflectance, 0.04 * normals, normals), lit
+    return PointViews(point, frame, seen, reflectance, 0.04 * normals, normals), lit
 
 
 def within_points(seen, values):
@@ -112,7 +112,7 @@ def looked_up():
     images = [np.stack([facing(pose), np.full((LENS.h, LENS.w), 0.3)]) for pose in poses]
     hull = voted_hull(masks, poses, LENS)
     masks[MISSING, :, LENS.w // 2 :] = False
-    return poses, sightings(images, masks, poses, LENS, np.zeros(4), hull)
+    return poses, point_views(images, masks, poses, LENS, np.zeros(4), hull)
 
 
 def test_points_lie_on_the_sphere_with_its_normals(looked_up):

@@ -71,13 +71,13 @@ def test_the_search_ends_with_what_was_found(monkeypatch) -> None:
     assert len(even_points(VERTICES, TRIANGLES, 100, lambda p: at(p[:0]))) == 0
 
 
-def test_triangles_near_a_box_are_those_that_may_reach_it() -> None:
+def test_triangles_in_a_box_are_those_that_may_reach_it() -> None:
     flat = np.concatenate([TRIANGLES, [[4, 4, 5]]])
     mesh = SurfaceMesh(VERTICES, flat)
-    box = np.array([[1.2, 0.5, -1.0], [1.8, 1.5, 1.0]])
-    np.testing.assert_array_equal(mesh.triangles_near(EVERYWHERE.bounds, 0.1), TRIANGLES)
-    assert len(mesh.triangles_near(box, 0.19)) == 0
-    np.testing.assert_array_equal(mesh.triangles_near(box, 0.21), TRIANGLES[[0, 1, 4, 5]])
+    box, margin = np.array([[1.2, 0.5, -1.0], [1.8, 1.5, 1.0]]), np.array([[-1.0], [1.0]])
+    np.testing.assert_array_equal(mesh.triangles_in(EVERYWHERE.bounds), TRIANGLES)
+    assert len(mesh.triangles_in(box + 0.19 * margin)) == 0
+    np.testing.assert_array_equal(mesh.triangles_in(box + 0.21 * margin), TRIANGLES[[0, 1, 4, 5]])
 
 
 def test_candidates_are_in_proportion_to_the_fraction_kept() -> None:

@@ -1,4 +1,4 @@
-"""A quick look at each frame: a few bands of all lines, and all bands of a few lines."""
+"""Quicklooks: what each frame shows: a few bands of all lines, and all bands of a few lines."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from hsi_sc_nerf.calibration.detector import (
 )
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 PICTURE_NM = (640.0, 550.0, 470.0)
@@ -29,14 +30,12 @@ NEIGHBOURS = 2
 """So many neighbouring bands make one channel of a picture: they lie side by side in the file."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
-EDGE_FRACTION = 0.02
-"""The strongest edges of a picture, as a fraction of its pixels."""
 WORKERS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What a quick look at a capture shows. Pictures lie as in the file.
+class Quicklook:
+    """What a capture shows by a few of its lines and bands. Pictures lie as in the file.
 
     Attributes:
         name: of the capture.
@@ -62,15 +61,15 @@ class Look:
         return to_8_bit(self.picture.mean(axis=-1))
 
 
-def look_at_frames(session: Session) -> list[Look]:
-    """A `Look` at each frame of a session, in its order."""
+def quicklooks_of(session: Session) -> list[Quicklook]:
+    """The quicklooks of a session's frames, in its order."""
     white = white_level(session)
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(lambda capture: look_at(capture, white), session.frames))
+        return list(pool.map(lambda capture: quicklook_of(capture, white), session.frames))
 
 
-def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
-    """Look at one capture.
+def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklook:
+    """The quicklook of one capture.
 
     Args:
         capture: the capture.
@@ -93,7 +92,7 @@ def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
         axis=-1,
     )
     top = read.max()
-    return Look(
+    return Quicklook(
         name=capture.name,
         picture=picture,
         top_counts=float(top),
@@ -127,9 +126,9 @@ def reflectance_noise(session: Session) -> float:
     return float(np.median(deviation) / np.sqrt(2.0))
 
 
-def saturation_level(session: Session, looks: Sequence[Look]) -> float | None:
+def saturation_level(session: Session, quicklooks: Sequence[Quicklook]) -> float | None:
     """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
-    brightest = sorted(range(len(looks)), key=lambda index: -looks[index].top_counts)[:3]
+    brightest = sorted(range(len(quicklooks)), key=lambda index: -quicklooks[index].top_counts)[:3]
     cubes = [_some_lines(session.frames[index].cube) for index in brightest]
     return saturation_counts(cubes, np.ones(cubes[0].shape[1:], bool))
 
@@ -138,10 +137,7 @@ def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
     """Mean slope of a picture's strongest edges over its contrast (1st to 99th percentile); 0 without contrast."""
     smooth = cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), 0.7)
     low, high = np.percentile(smooth, [1.0, 99.0])
-    across, down = (cv2.Sobel(smooth, cv2.CV_32F, x, 1 - x, ksize=3, scale=1.0 / 8.0) for x in (1, 0))
-    slope = np.sort(cv2.magnitude(across, down), axis=None)
-    strongest = slope[-max(1, round(EDGE_FRACTION * slope.size)) :]
-    return float(strongest.mean() / (high - low)) if high > low else 0.0
+    return edge_slope(smooth) / float(high - low) if high > low else 0.0
 
 
 def _some_lines(cube: Cube) -> Num[np.ndarray, "some samples bands"]:
