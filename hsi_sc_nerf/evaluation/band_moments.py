@@ -35,20 +35,14 @@ def moment_scores(
     Returns:
         Numbers of these pixels, mean squared error (0 without any pixel), and SSIM (1 without any).
     """
-    bands = images[0].shape[2]
-    counts, sums = np.zeros((len(masks), bands), np.int64), np.zeros((6, len(masks), bands))
-
-    def add(kernel: Callable[..., None], *arguments: np.ndarray) -> None:
-        for part_counts, part_sums in _in_parts(kernel, images, masks, *arguments):
-            counts[:] += part_counts
-            sums[:] += part_sums
-
-    add(_add_values)
-    pixels = counts.copy()
-    means = sums[:2] / np.maximum(pixels, 1)
+    means = np.zeros((2, len(masks), images[0].shape[2]))
     # Deviations from the means keep large offsets from cancelling.
-    add(_add_deviations, means)
-    variance_p, variance_t, covariance, mse = sums[2:] / np.maximum(pixels, 1)
+    for _ in range(2):
+        parts = _in_parts(_add_deviations, images, masks, means)
+        pixels, sums = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+        moments = sums / np.maximum(pixels, 1)
+        means += moments[:2]
+    variance_p, variance_t, covariance, mse = moments[2:]
     return pixels, mse, _similarity.py_func(*means, variance_p, variance_t, covariance)
 
 
@@ -86,21 +80,8 @@ def _in_parts(
 
 
 @_compiled
-def _add_values(images, masks, first, last, counts, sums):
-    predicted, target, valid = images
-    for m in range(len(masks)):
-        for y in range(first, last):
-            for x in range(predicted.shape[1]):
-                if masks[m, y, x]:
-                    for b in range(predicted.shape[2]):
-                        if len(valid) == 0 or valid[y, x, b]:
-                            counts[m, b] += 1
-                            sums[0, m, b] += predicted[y, x, b]
-                            sums[1, m, b] += target[y, x, b]
-
-
-@_compiled
 def _add_deviations(images, masks, means, first, last, counts, sums):
+    """Add p, t, p², t², p t and the squared error, where p and t are deviations from the means."""
     predicted, target, valid = images
     for m in range(len(masks)):
         for y in range(first, last):
@@ -113,6 +94,8 @@ def _add_deviations(images, masks, means, first, last, counts, sums):
                             p -= means[0, m, b]
                             t -= means[1, m, b]
                             counts[m, b] += 1
+                            sums[0, m, b] += p
+                            sums[1, m, b] += t
                             sums[2, m, b] += p * p
                             sums[3, m, b] += t * t
                             sums[4, m, b] += p * t
