@@ -143,7 +143,8 @@ def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
     camera = assemble.first_camera(moved.camera) @ rotation_about_z(12.0)
     np.testing.assert_allclose(simulation.plan.room_camera, camera, atol=1e-12)
     shift = 0.011 * np.array([np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), 0.0])
-    parts = [assemble.object_part(moved), *assemble.support_parts(moved)]
+    centred = scene(name="pear")
+    parts = [assemble.object_part(centred), *assemble.support_parts(centred)]
     for i, angle in enumerate(simulation.plan.angles_deg):
         to_room = in_the_room((3.0, 2.5), angle)
         placed = []
