@@ -142,18 +142,27 @@ def test_dark_pattern_is_the_same_in_all_exposures():
         assert np.abs(added).max() <= 1.0 + 1e-3
 
 
-def test_bad_pixels_are_where_the_maps_say_and_nothing_else_changes():
-    simulation = Simulation(scene(size_px=40, bands=30, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.02}))
-    even, maps = quiet(40, 30), simulation.detector_maps["bad_pixels"]
-    dead, hot = maps["dead"], maps["hot"]
-    assert dead.shape == (40, 30)
-    assert (dead.sum(), hot.sum(), (dead & hot).sum()) == (12, 24, 0)
-    for capture, without in ((simulation.white(), even.white()), (simulation.frame(0), even.frame(0))):
-        for cube, reference in ((capture.counts, without.counts), (capture.dark, without.dark)):
-            assert (cube[:, dead] == DARK).all()
-            assert (cube[:, hot] == LARGEST).all()
-            kept = np.broadcast_to(reference, cube.shape)
-            np.testing.assert_array_equal(cube[:, ~dead & ~hot], kept[:, ~dead & ~hot])
+def test_bad_pixels_and_dead_bands_are_where_the_maps_say_and_nothing_else_changes():
+    fractions = {"dead_fraction": 0.01, "hot_fraction": 0.02}
+    even, single = quiet(40, 30), Simulation(scene(size_px=40, bands=30, bad_pixels=fractions))
+    banded = Simulation(scene(size_px=40, bands=30, bad_pixels={**fractions, "dead_bands": 3}))
+    maps, more = (simulation.detector_maps["bad_pixels"] for simulation in (single, banded))
+    assert maps["dead"].shape == (40, 30)
+    assert (maps["dead"].sum(), maps["hot"].sum(), (maps["dead"] & maps["hot"]).sum()) == (12, 24, 0)
+    # Dead bands come on top of the other bad pixels.
+    dead_bands = more["dead"].all(axis=0)
+    assert dead_bands.sum() == 3
+    assert not more["hot"][:, dead_bands].any()
+    for name in ("dead", "hot"):
+        np.testing.assert_array_equal(more[name][:, ~dead_bands], maps[name][:, ~dead_bands])
+    for simulation in (single, banded):
+        dead, hot = (simulation.detector_maps["bad_pixels"][name] for name in ("dead", "hot"))
+        for capture, without in ((simulation.white(), even.white()), (simulation.frame(0), even.frame(0))):
+            for cube, reference in ((capture.counts, without.counts), (capture.dark, without.dark)):
+                assert (cube[:, dead] == DARK).all()
+                assert (cube[:, hot] == LARGEST).all()
+                kept = np.broadcast_to(reference, cube.shape)
+                np.testing.assert_array_equal(cube[:, ~dead & ~hot], kept[:, ~dead & ~hot])
 
 
 @pytest.mark.slow
@@ -214,21 +223,6 @@ def test_tarp_of_its_own_integration_time():
     # Each rounded on its own.
     assert np.abs(signal - expected).max() <= 0.5 + 0.4 * 0.5 + 1e-3
     np.testing.assert_array_equal(white.dark, usual.white().dark)
-
-
-def test_dead_bands_come_on_top_of_the_other_bad_pixels():
-    strengths = {"dead_fraction": 0.05, "hot_fraction": 0.05}
-    without = Simulation(scene(bad_pixels=strengths)).detector_maps["bad_pixels"]
-    changed = Simulation(scene(bad_pixels={**strengths, "dead_bands": 3}))
-    maps = changed.detector_maps["bad_pixels"]
-    dead_bands = maps["dead"].all(axis=0)
-    assert dead_bands.sum() == 3
-    assert not maps["hot"][:, dead_bands].any()
-    for name in ("dead", "hot"):
-        np.testing.assert_array_equal(maps[name][:, ~dead_bands], without[name][:, ~dead_bands])
-    for capture in (changed.white(), changed.frame(0)):
-        assert (capture.counts[..., dead_bands] == DARK).all()
-        assert (capture.dark[..., dead_bands] == DARK).all()
 
 
 # Optics
