@@ -57,22 +57,22 @@ class ObjectLight:
         """
         of_object = np.flatnonzero(self.elements.on_object)
         right_angle_m = NORMAL_WEIGHT * self._spacing_m / np.sqrt(2.0)
-        places = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
-        distance, nearest = cKDTree(places).query(
-            np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(places))
+        features = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
+        distance, nearest = cKDTree(features).query(
+            np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(features))
         )
         distance, nearest = distance.reshape(len(points_m), -1), of_object[nearest.reshape(len(points_m), -1)]
-        share = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
-        share /= share.sum(axis=1, keepdims=True)
+        weights = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
+        weights /= weights.sum(axis=1, keepdims=True)
         result = np.empty((len(points_m), self.spectral.material.shape[1]), np.float32)
         for frame in np.unique(frames):
             rows = np.flatnonzero(frames == frame)
             light, material = self.spectral.light, self.spectral.material
             whole = self.turning.direct(light, int(frame))
             whole = whole + self.turning.bounced(light, material, int(frame))
-            result[rows] = np.einsum("nk,nkb->nb", share[rows], whole[nearest[rows]])
+            result[rows] = np.einsum("nk,nkb->nb", weights[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
-        relative = np.sqrt((share * self._relative_variance[nearest]).sum(axis=1))
+        relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))
         return result, relative * result.mean(axis=1)
 
     @property
@@ -104,9 +104,9 @@ def turning_elements(
         lift_m: rays begin so far outside of the surface.
     """
     directions = even_directions(RAY_DIRECTIONS)
-    points, normals, shares = shown_points(elements, pixel_m, lift_m)
+    points, normals, weights = shown_points(elements, pixel_m, lift_m)
     faces = elements.of_triangle, len(elements.positions)
-    seen = transfer(points, normals, elements.occluders, *faces, directions, lift_m).mean(shares)
+    seen = transfer(points, normals, elements.occluders, *faces, directions, lift_m).mean(weights)
     centre_m = elements.positions[elements.on_object].mean(axis=0)
     return TurningElements(
         elements.positions - centre_m, elements.normals, elements.on_object, seen, directions, rotations
