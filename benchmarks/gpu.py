@@ -86,7 +86,7 @@ class GpuBenchmark:
     results: Path = RESULTS
     """Folder of the CSV file to which rows are added."""
     commit: str = ""
-    """Of the code; where it is not given, git is asked."""
+    """Of the code; by default the current one of git."""
     parts: tuple[str, ...] = ("tests", "demo", "session", "train")
     """Which parts."""
     scene: str = "pear"
@@ -208,7 +208,7 @@ class GpuBenchmark:
         self._row(part="tests", note=f"{seconds:.0f} s; " + log.strip().splitlines()[-1].strip("= "))
 
     def _demo(self) -> None:
-        """The demo's steps; its iterations and scene are the command's own where nothing else is asked for."""
+        """The demo's steps; its iterations and scene are the options'."""
         folder = self.output_dir / "demo"
         words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "demo", "--output-dir", str(folder)]
         words += ["--scene", self.scene, "--iterations", str(self.demo_iterations)]
