@@ -71,12 +71,12 @@ PURE = 0.999
 
 @dataclass(frozen=True)
 class MaterialReflectance:
-    """Tell light and material of a simulated session apart, and compare with the truth."""
+    """Separate light and material of a simulated session, and compare with the truth."""
 
     session: tyro.conf.Positional[Path]
     """Folder of a simulated session."""
     name: tyro.conf.Positional[str]
-    """Of the session, in the table."""
+    """Name of the session in the table."""
     even: bool = False
     """Take even light instead of the session's own."""
     config: Path | None = None

@@ -50,13 +50,13 @@ class Case:
     """A session that is hard to pose."""
 
     effects: tuple[str, ...] = ()
-    """Of the simulator."""
+    """Effects of the simulator."""
     scene: str = "pear"
     frames: int = 24
     size: float = 1.0
-    """Of the images, as a fraction of the usual size."""
+    """Size of the images, as a fraction of the usual size."""
     changes: dict[str, dict[str, float]] = field(default_factory=dict)
-    """To parts of the scene."""
+    """Changes to parts of the scene."""
     alter: Callable[[Images], Images] | None = None
     """What is done to the images."""
     any_axis: bool = False

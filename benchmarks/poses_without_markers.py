@@ -93,12 +93,12 @@ class Session:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the frames."""
+        """Names of the frames."""
         return tuple(f"frame_{i:03d}" for i in range(len(self.images)))
 
     @property
     def distance_m(self) -> float:
-        """Of the camera from the axis."""
+        """Distance of the camera from the axis."""
         return float(np.linalg.norm(self.camera_to_world[0, :2, 3]))
 
     @property

@@ -59,13 +59,13 @@ class TraitsAccuracy:
     session: tyro.conf.Positional[Path]
     """Simulated session."""
     name: tyro.conf.Positional[str]
-    """Of the cloud, in the table."""
+    """Name of the cloud in the table."""
     cloud: Path | None = None
     """Spectral cloud reconstructed from it; without it, an ideal cloud."""
     points: int = 100_000
-    """Of the ideal cloud."""
+    """Points of the ideal cloud."""
     noise_m: float = 0.0003
-    """Of the ideal cloud, in each direction."""
+    """Noise of the ideal cloud in each direction."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """How the mesh is made."""
     results: Path = RESULTS

@@ -46,11 +46,11 @@ UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
 """Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
 are seen tell what is to be expected of those that are not."""
 UNEVENNESS_AT_FIRST = 0.003
-"""The same while a lamp is looked for, lest the chamber explain how near it is."""
+"""Expected root mean square while a lamp is searched for, so that the chamber does not explain how near it is."""
 MOST_UNEVEN = 0.1
 """A chamber's harmonics are no larger: what is more uneven is a lamp."""
 LEAST_DISTANCE_M = 0.25
-"""Of lamps, which the first order of their nearness still describes."""
+"""Least distance of lamps; the first order of their nearness still describes it."""
 LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
 """Expected size of a lamp, of a correction of its direction, and of one over the lamps' distance (1/m)."""
 WHITE_STD = 0.01

@@ -30,7 +30,7 @@ class ObjectLight:
 
     Attributes:
         elements: of the object and its support.
-        turning: the same as they turn.
+        turning: the elements as they turn under the light.
         views: what frames measured of them.
         fit: the light by groups of bands.
         spectral: the fit's light and materials at the bands of the views.
@@ -83,7 +83,7 @@ class ObjectLight:
 
     @property
     def _relative_variance(self) -> Float[np.ndarray, "elements"]:
-        """Of each element's irradiance: of the light, of what occludes it, of what the model misses."""
+        """Relative variance of each element's irradiance: of the light, its occluders, and the model's errors."""
         count, views = len(self.elements.positions), np.bincount(self.views.element)
         views = np.pad(views, (0, count - len(views)))
         of_light = np.bincount(self.views.element, self.fit.relative_std**2, count) / np.maximum(views, 1)
@@ -120,7 +120,7 @@ def light_on_object(
 
     Args:
         elements: of the object and its support.
-        turning: the same as they turn.
+        turning: the elements as they turn under the light.
         views: what frames measured of them.
         white_normal: outward unit normal of the white reference, camera's frame.
     """

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.special import sph_harm_y
 
 DEGREE = 2
-"""Of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
+"""Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
 FINE_DIRECTIONS = 1 << 13
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -32,8 +32,8 @@ class StandingLight:
         lamps: irradiance of each lamp on a surface that faces it.
         to_lamps: unit vector to each lamp.
         nearness: one over the lamps' distance, 1/m; 0 for lamps at infinity.
-        chamber_colour: factor by band; 1 for light of the white reference's colour.
-        lamp_colour: likewise.
+        chamber_colour: factor of the chamber's light by band; 1 for light of the white reference's colour.
+        lamp_colour: factor of the lamps' light by band.
     """
 
     chamber: Float[np.ndarray, "terms"]
