@@ -38,7 +38,7 @@ from hsi_sc_nerf.simulate.truth import load_truth
 NOISE = ("photon_noise", "read_noise")
 SHADING = ("chamber_shading",)
 DRIFT = {"tomato": ("lamp_drift",)}
-"""Of the sessions with noise: the tomato is the harder one, glossy and under lamps that drift."""
+"""More effects of the sessions with noise: the tomato is glossy and under lamps that drift."""
 CLOUD_POINTS = 60_000
 
 # The paper's table of held-out views (mean), and its F-score, which it gives for the maize.
@@ -64,7 +64,7 @@ class BeyondThePaper(PaperTable):
     configurations: tuple[str, ...] = ("paper", "ours")
     """Configurations of `hsi-sc-nerf benchmark`."""
     seeds: tuple[int, ...] = (0,)
-    """Of the networks and the drawn pixels, a run each. The table has means and standard deviations over them."""
+    """Seeds of networks and drawn pixels, a run each. The table has means and standard deviations over them."""
 
     table: str = "beyond_the_paper"
     """Name of the CSV file."""

@@ -4,7 +4,7 @@
     uv run python benchmarks/calibration_accuracy.py --tables drift --path-traced SESSION_0 SESSION_1 SESSION_2
 
 Each row is a pear under some effects of light and sensor, calibrated with and without the corrections for them. A
-second table has the error of the lamps' drift, and how well its stated error tells it, if the light of each pixel
+second table has the error of the lamps' drift, and its ratio to the stated error, if the light of each pixel
 scatters from frame to frame. Its path-traced sessions are made by benchmarks/independent_session.py, each with a
 --seed of its own.
 """

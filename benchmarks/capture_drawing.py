@@ -92,7 +92,7 @@ def draw_top(axes: Axes, scene: Scene) -> None:
     axes.add_patch(Circle((0.0, 0.0), scene.turntable.disc_diameter_m / 2, facecolor="0.93", edgecolor="0.45"))
     axes.add_patch(Circle((0.0, 0.0), scene.container.diameter_m / 2, facecolor="white", edgecolor="0.45"))
     axes.add_patch(Circle((0.0, 0.0), 0.033, color=FRUIT))
-    around, on_disc = marker_frames(scene.markers, scene.container, scene.turntable)
+    around, on_disc = marker_frames(scene)
     half = scene.markers.side_m / 2
     for centre, sideways, _ in around.values():
         axes.plot(

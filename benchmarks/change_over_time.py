@@ -3,7 +3,7 @@
     uv run python benchmarks/change_over_time.py
     uv run python benchmarks/change_over_time.py --points 60000 --picture docs/images/change.png  # that alone
 
-The clouds are those that runs would give of simulated fruit (`hsi_sc_nerf.simulate.another_day`): the true surface
+The clouds are those that runs would give of simulated fruit (`another_day`): the true surface
 with the errors of a run, of which those that are smooth over centimetres count; other ones on each day.
 """
 
@@ -15,6 +15,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import tyro
+from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -33,7 +34,6 @@ from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG
 from hsi_sc_nerf.indices.catalogue import CATALOGUE, find_indices
 from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.paper import CLASSIFICATION_ANGLE_RAD
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
 from hsi_sc_nerf.simulate.true_surface import TrueSurface

@@ -71,8 +71,8 @@ def results_table(name: str, folder: Path = RESULTS) -> str:
         raise PluginError(f"{path}: needs rows, and {', '.join(SOURCE_COLUMNS)} as its last columns.")
     shown = [[cell.strip() for cell in row[: -len(SOURCE_COLUMNS)]] for row in (columns, *rows)]
     sources = {tuple(row[-len(SOURCE_COLUMNS) :]) for row in rows}
-    told = "; ".join(f"commit {commit}, seed {seed}, {machine}" for commit, seed, machine in sorted(sources))
-    return "\n".join([markdown_table(shown[0], shown[1:]), "", f"*`benchmarks/results/{name}.csv`: {told}.*"])
+    origin = "; ".join(f"commit {commit}, seed {seed}, {machine}" for commit, seed, machine in sorted(sources))
+    return "\n".join([markdown_table(shown[0], shown[1:]), "", f"*`benchmarks/results/{name}.csv`: {origin}.*"])
 
 
 def readme_table(folder: Path = RESULTS) -> str:

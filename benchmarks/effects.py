@@ -115,7 +115,7 @@ class Effects(PaperTable):
     bands: int = 24
     """Spectral bands."""
     seeds: tuple[int, ...] = (0, 1)
-    """Of the networks and the drawn pixels, a run each."""
+    """Seeds of the networks and of the drawn pixels, a run each."""
     parts: tuple[Literal["decisions", "models"], ...] = ("decisions", "models")
     """Which tables to make."""
     only: str = ""

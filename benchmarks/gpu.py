@@ -86,19 +86,19 @@ class GpuBenchmark:
     results: Path = RESULTS
     """Folder of the CSV file to which rows are added."""
     commit: str = ""
-    """Of the code; where it is not given, git is asked."""
+    """Commit of the code; by default the current one of git."""
     parts: tuple[str, ...] = ("tests", "demo", "session", "train")
-    """Which parts."""
+    """Parts to run."""
     scene: str = "pear"
-    """Of the session."""
+    """Scene of the session."""
     frames: int = 60
-    """Of the session."""
+    """Frames of the session."""
     size: int = 512
     """Width and height of its frames, pixels."""
     bands: int = 204
-    """Of its frames."""
+    """Spectral bands of its frames."""
     demo_iterations: int = 500
-    """Of the demo."""
+    """Iterations of the demo's training."""
     runs: tuple[str, ...] = (
         "ours:graph:600i",
         "ours:graph:60",
@@ -208,7 +208,7 @@ class GpuBenchmark:
         self._row(part="tests", note=f"{seconds:.0f} s; " + log.strip().splitlines()[-1].strip("= "))
 
     def _demo(self) -> None:
-        """The demo's steps; its iterations and scene are the command's own where nothing else is asked for."""
+        """The demo's steps; its iterations and scene are the options'."""
         folder = self.output_dir / "demo"
         words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "demo", "--output-dir", str(folder)]
         words += ["--scene", self.scene, "--iterations", str(self.demo_iterations)]

@@ -67,7 +67,7 @@ class PatternedWall(TexturedBackground):
 
 @dataclass(frozen=True)
 class Poster(TexturedBackground):
-    """A white wall with a poster of leaves behind the object only: only that it stands tells it from a plant."""
+    """A white wall with a poster of leaves behind the object only: it differs from a plant only by standing still."""
 
     name: ClassVar[str] = "poster"
     materials: ClassVar[tuple[str, ...]] = ("husk",)

@@ -1,4 +1,4 @@
-"""How well the material's reflectance is told apart from the light, on simulated sessions of known materials.
+"""How well the material's reflectance is separated from the light, on simulated sessions of known materials.
 
     uv run hsi-sc-nerf simulate pear SESSION --frames 30 --size 96 --bands 24 \\
         --effects chamber_shading '{inter_reflection: {bounces: 3}}' lamp
@@ -71,12 +71,12 @@ PURE = 0.999
 
 @dataclass(frozen=True)
 class MaterialReflectance:
-    """Tell light and material of a simulated session apart, and compare with the truth."""
+    """Separate light and material of a simulated session, and compare with the truth."""
 
     session: tyro.conf.Positional[Path]
     """Folder of a simulated session."""
     name: tyro.conf.Positional[str]
-    """Of the session, in the table."""
+    """Name of the session in the table."""
     even: bool = False
     """Take even light instead of the session's own."""
     config: Path | None = None
@@ -111,7 +111,7 @@ def facing_of(truth: Truth) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True)
 class Judged:
-    """What is compared: spectra of points and their irradiance; its truth is NaN where no pixel tells it."""
+    """What is compared: spectra of points and their irradiance; its truth is NaN where no pixel shows it."""
 
     evidence: ShadingEvidence
     points: Float[np.ndarray, "n 3"]

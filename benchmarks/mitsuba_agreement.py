@@ -100,9 +100,9 @@ def render_ours(scene: Scene, frame: int) -> Ours:
     weights = rendered.material_weights
     camera = dataclasses.replace(scene.camera, supersampling=max(1, scene.camera.supersampling - 1))
     plain = Simulation(dataclasses.replace(scene, camera=camera, effects=()))
-    other_grid = (plain.frame(frame).material_weights - weights) @ rendered.endmembers
+    other_grid = (plain.frame(frame).material_weights - weights) @ simulation.endmembers
     if scene.effects:
-        radiance += weights[..., -1:] * (1.0 - rendered.endmembers[-1])
+        radiance += weights[..., -1:] * (1.0 - simulation.endmembers[-1])
     ray_grid = _rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
     of_object = np.isin(simulation.materials, simulation.object_part.materials)
     return Ours(radiance, weights, simulation.materials, of_object, ray_grid)

@@ -63,18 +63,18 @@ class Ended:
     Attributes:
         before, after: root mean square errors; NaN where the run did not begin or end.
         skipped: steps that were not finite.
-        told: the sentence that it stopped with; empty for none.
+        message: the sentence that it stopped with; empty for none.
     """
 
     before: float
     after: float
     skipped: int
-    told: str
+    message: str
 
     @property
     def is_good(self) -> bool:
         """Whether it ended better than it began, or with one sentence."""
-        return (self.told != "" and "\n" not in self.told) or self.after < self.before
+        return (self.message != "" and "\n" not in self.message) or self.after < self.before
 
 
 def simulated(folder: Path) -> Scene:
@@ -278,9 +278,9 @@ def main(steps: int = 300, only: str = "", results: Path = RESULTS) -> None:
                 ended = train(case, scene, Path(temporary) / str(number), steps)
             except Exception as error:  # the table shows that a case ends in what it should not
                 ended = Ended(float("nan"), float("nan"), 0, f"NOT one sentence: {type(error).__name__}: {error}")
-            told = ended.told or ("better than it began" if ended.is_good else "NOT better than it began")
-            told = " ".join(told.replace(temporary, "").split())[:160]
-            rows.append([case.name, f"{ended.before:.4f}", f"{ended.after:.4f}", str(ended.skipped), told])
+            outcome = ended.message or ("better than it began" if ended.is_good else "NOT better than it began")
+            outcome = " ".join(outcome.replace(temporary, "").split())[:160]
+            rows.append([case.name, f"{ended.before:.4f}", f"{ended.after:.4f}", str(ended.skipped), outcome])
             print(*rows[-1], sep=" | ", flush=True)
     write_results("odd_runs", COLUMNS, rows, keys=1, seed=f"0, {steps} steps", folder=results)
 

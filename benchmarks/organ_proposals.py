@@ -5,7 +5,7 @@
     uv run python benchmarks/organ_proposals.py --picture docs/images/organs.png  # that alone
 
 The clouds are those that runs would give: the true surface as cameras see it, with the errors of a run
-(`hsi_sc_nerf.simulate.another_day.CloudErrors`). A point is an organ's if its material is more than half of it.
+(`another_day.CloudErrors`). A point is an organ's if its material is more than half of it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from another_day import CloudErrors, SetDown, cloud_of, set_down
 from matplotlib import rc_context
 from results_table import RESULTS, write_results
 from rich.progress import track
@@ -24,7 +25,6 @@ from hsi_sc_nerf.analysis.organs import BODY, HUSK, KERNELS, STEM
 from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, set_down
 from hsi_sc_nerf.simulate.assemble import object_part
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.scene import load_scene

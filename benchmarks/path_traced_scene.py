@@ -68,11 +68,11 @@ class PathTracedScene:
     markers: bool = True
     """Whether markers lie on the disc."""
     field_of_view_deg: float = 24.0
-    """Over the image's width."""
+    """Field of view over the image's width."""
     sampler: Literal["independent", "multijitter"] = "independent"
     """The latter makes less noise, which is no longer independent between the paths of a pixel."""
     seed: int = 0
-    """Of the paths."""
+    """Seed of the paths."""
 
     @property
     def focal_px(self) -> float:
@@ -154,7 +154,7 @@ def fruit_mesh(name: str) -> trimesh.Trimesh:
 
 
 def marker_poses() -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Of each marker on the disc: the transform of the square [-1, 1]², and its corners in OpenCV's order, metres."""
+    """Markers on the disc by number: transform of the square [-1, 1]², and corners in OpenCV's order, metres."""
     poses = {}
     for number in range(MARKERS):
         turn = about_z(360.0 / MARKERS * number)

@@ -19,10 +19,11 @@ import numpy as np
 import tyro
 from jaxtyping import Float, UInt8
 from results_table import RESULTS, write_results
+from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z, rotation_angle_deg
+from hsi_sc_nerf.geometry.camera import rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -49,13 +50,13 @@ class Case:
     """A session that is hard to pose."""
 
     effects: tuple[str, ...] = ()
-    """Of the simulator."""
+    """Effects of the simulator."""
     scene: str = "pear"
     frames: int = 24
     size: float = 1.0
-    """Of the images, as a fraction of the usual size."""
+    """Size of the images, as a fraction of the usual size."""
     changes: dict[str, dict[str, float]] = field(default_factory=dict)
-    """To parts of the scene."""
+    """Changes to parts of the scene."""
     alter: Callable[[Images], Images] | None = None
     """What is done to the images."""
     any_axis: bool = False
@@ -190,7 +191,7 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
     azimuth = np.rad2deg(np.arctan2(truth[0, 1, 3], truth[0, 0, 3]))
     truth = rotation_about_z(-azimuth) @ truth  # x points to the first used frame's camera
     if case.any_axis:
-        truth = transformed_poses(align_poses(truth, found), truth)
+        truth = aligned_poses(truth, found)
     if case.any_height:
         truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
     return Posed(simulation, info, poses, *pose_errors(found, truth), seconds)
@@ -204,24 +205,15 @@ def pose_errors(
     return degrees, 1e3 * np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=-1)
 
 
-def align_poses(poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
-    """The rigid motion that brings poses closest to a reference: first their orientations, then their positions.
-
-    Args:
-        poses: camera-to-world, metres.
-        reference: likewise.
-    """
-    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], poses[:, :3, :3]))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    shift = (reference[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(axis=0)
-    return Similarity(1.0, rotation, shift)
-
-
-def transformed_poses(similarity: Similarity, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    """Camera-to-world poses in the frame that the similarity leads to."""
-    moved = poses.copy()
-    moved[:, :3, :3] = similarity.rotation @ poses[:, :3, :3]
-    moved[:, :3, 3] = similarity(poses[:, :3, 3])
+def aligned_poses(
+    poses: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Camera-to-world poses (metres) moved rigidly onto a reference: first by orientations, then by positions."""
+    turn = np.eye(4)
+    relative = reference[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)
+    turn[:3, :3] = Rotation.from_matrix(relative).mean().as_matrix()
+    moved = turn @ poses
+    moved[:, :3, 3] += (reference - moved)[:, :3, 3].mean(axis=0)
     return moved
 
 

@@ -93,17 +93,17 @@ class Session:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the frames."""
+        """Names of the frames."""
         return tuple(f"frame_{i:03d}" for i in range(len(self.images)))
 
     @property
     def distance_m(self) -> float:
-        """Of the camera from the axis."""
+        """Distance of the camera from the axis."""
         return float(np.linalg.norm(self.camera_to_world[0, :2, 3]))
 
     @property
     def camera(self) -> KnownCamera:
-        """What an earlier session of the camera told."""
+        """What is known of the camera from an earlier session."""
         height, width = self.images[0].shape
         lens = PinholeIntrinsics(width, height, self.focal_px, self.focal_px, width / 2.0, height / 2.0)
         return KnownCamera(lens, (0.0, 0.0, 0.0, 0.0), self.camera_to_world[0])
@@ -175,8 +175,8 @@ class PosesWithoutMarkers:
 
     def _free_poses(self, name: str, session: Session, camera: KnownCamera | None) -> FreePoses:
         """What COLMAP finds in the session, with the focal length where it is known, unless the folder has it."""
-        told = "" if camera is None else "_known_camera"
-        path = self.folder / f"{name.replace(', ', '_')}_{self.size}_colmap{told}.pickle"
+        known = "" if camera is None else "_known_camera"
+        path = self.folder / f"{name.replace(', ', '_')}_{self.size}_colmap{known}.pickle"
         if not path.is_file():
             focal_px = None if camera is None else camera.intrinsics.fl_x
             path.write_bytes(pickle.dumps(structure_from_motion(session.images, session.names, focal_px=focal_px)))
@@ -200,11 +200,15 @@ class PosesWithoutMarkers:
 
 
 def what_is_known(session: Session) -> dict[str, tuple[SessionInfo, KnownCamera | None]]:
-    """What is told of a session without markers, case by case."""
-    told = session.info
-    outline = SessionInfo(container_diameter_m=told.container_diameter_m, container_height_m=told.container_height_m)
-    angles = SessionInfo(nominal_step_deg=told.nominal_step_deg, direction=told.direction)
-    both = replace(angles, container_diameter_m=told.container_diameter_m, container_height_m=told.container_height_m)
+    """What is known of a session without markers, case by case."""
+    whole = session.info
+    outline = SessionInfo(
+        container_diameter_m=whole.container_diameter_m, container_height_m=whole.container_height_m
+    )
+    angles = SessionInfo(nominal_step_deg=whole.nominal_step_deg, direction=whole.direction)
+    both = replace(
+        angles, container_diameter_m=whole.container_diameter_m, container_height_m=whole.container_height_m
+    )
     return {
         "nothing": (SessionInfo(), None),
         "container": (outline, None),
@@ -237,25 +241,25 @@ def _cells(
     size = distance_m / session.distance_m * session.focal_px / poses.intrinsics.fl_x - 1.0
     stated_size = stated.size if poses.scale is None else poses.scale.uncertainty
     found = [rotation_deg, position_mm, 100.0 * abs(size)]
-    told = [stated.rotation_deg, 1e3 * metres * stated.position_m, 100.0 * stated_size]
+    stated_errors = [stated.rotation_deg, 1e3 * metres * stated.position_m, 100.0 * stated_size]
     levels = [f"{f.name} {f.level}" for f in check_poses(poses, info) if f.level != "green"]
     return (
         f"{rotation_deg:.3f}",
-        f"{told[0]:.3f}",
+        f"{stated_errors[0]:.3f}",
         f"{position_mm:.2f}",
-        f"{told[1]:.2f}",
+        f"{stated_errors[1]:.2f}",
         f"{100.0 * (poses.intrinsics.fl_x / session.focal_px - 1.0):+.2f}",
         f"{100.0 * stated.focal:.2f}",
         f"{100.0 * size:+.2f}",
-        f"{told[2]:.2f}",
-        goal_met(found, told),
+        f"{stated_errors[2]:.2f}",
+        goal_met(found, stated_errors),
         "; ".join(levels),
     )
 
 
 def goal_met(found: list[float], stated: list[float]) -> str:
     """Whether errors meet the goal, or are as large as stated, or within twice of that."""
-    beyond = [e / told for e, told, goal in zip(found, stated, GOAL, strict=True) if e > goal]
+    beyond = [e / std for e, std, goal in zip(found, stated, GOAL, strict=True) if e > goal]
     ratio = max(beyond, default=0.0)
     if not beyond:
         return "met"

@@ -130,8 +130,8 @@ class SessionMistakes:
         sentence = said.replace(str(made), "SESSION")
         if len(sentence) > LONGEST_SENTENCE:
             sentence = f"{sentence[:LONGEST_SENTENCE]} ..."
-        told = "" if processed == 0 else sentence
-        return [str(inspected), red, f"{inspect_s:.0f}", str(processed), told, *errors, f"{process_s:.0f}"]
+        said = "" if processed == 0 else sentence
+        return [str(inspected), red, f"{inspect_s:.0f}", str(processed), said, *errors, f"{process_s:.0f}"]
 
 
 def measured_errors(data: Path, session: Path, left_out: Sequence[str] = ()) -> list[str]:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import tempfile
 import time
+import timeit
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 from results_table import RESULTS, write_results
@@ -33,6 +33,7 @@ FLOAT_BYTES = 4
 CORNERS = 8
 COPIED_FLOATS = 2**25
 PRODUCT_SIDE = 1024
+REPEATS = 7
 PARTS = (
     *("fetch", "occupancy grid", "sampling", "hash grid", "networks", "rest of the forward pass", "loss and metrics"),
     *("backward: hash grid", "backward: networks and the rest", "optimisers", "rest"),
@@ -196,13 +197,8 @@ def product_flops() -> float:
     return 2.0 * PRODUCT_SIDE**3 / _best_seconds(lambda: first @ second)
 
 
-def _best_seconds(work: Callable[[], object], times: int = 7) -> float:
-    found = []
-    for _ in range(times):
-        before = time.perf_counter()
-        work()
-        found.append(time.perf_counter() - before)
-    return float(np.min(found))
+def _best_seconds(work: Callable[[], object]) -> float:
+    return min(timeit.repeat(work, number=1, repeat=REPEATS))
 
 
 if __name__ == "__main__":

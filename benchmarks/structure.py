@@ -5,12 +5,12 @@ uv run python benchmarks/structure.py --picture docs/images/structure.png
 
 from __future__ import annotations
 
-import ast
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import grimp
 import matplotlib
 import networkx
 import tyro
@@ -19,27 +19,26 @@ from rich.console import Console
 from hsi_sc_nerf.terminal import screen_table
 
 PACKAGE = "hsi_sc_nerf"
+ROOT = Path(__file__).parents[1]
 FOLDERS = ("benchmarks", "tests")
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Count files, lines and import circles of a checkout; draw its folders and their imports."""
+    """Count files, lines and import circles of the checkout; draw its folders and their imports."""
 
-    root: Path = Path(__file__).parents[1]
-    """The checkout."""
     picture: Path | None = None
     """PNG file for the picture."""
 
     def main(self) -> None:
         """Print the table, draw the picture."""
-        lines = {path: count_lines(path) for path in python_files(self.root / PACKAGE)}
-        imports = module_imports(self.root)
+        lines = {path: count_lines(path) for path in python_files(ROOT / PACKAGE)}
+        imports = module_imports()
         circles = [circle for circle in networkx.strongly_connected_components(imports) if len(circle) > 1]
         figures = {
             "files": len(lines),
             "lines": sum(lines.values()),
-            **{f"lines of {name}": sum(map(count_lines, python_files(self.root / name))) for name in FOLDERS},
+            **{f"lines of {name}": sum(map(count_lines, python_files(ROOT / name))) for name in FOLDERS},
             "largest folder, files": max(Counter(path.parent for path in lines).values()),
             "files in import circles": sum(map(len, circles)),
             "import circles": len(circles),
@@ -49,7 +48,7 @@ class Structure:
         if self.picture is not None:
             sizes = Counter[str]()
             for path, count in lines.items():
-                sizes[folder_of(".".join(path.relative_to(self.root).with_suffix("").parts))] += count
+                sizes[folder_of(".".join(path.relative_to(ROOT).with_suffix("").parts))] += count
             draw(folder_imports(imports), sizes, self.picture)
 
 
@@ -63,19 +62,11 @@ def count_lines(path: Path) -> int:
     return len(path.read_text(encoding="utf-8").splitlines())
 
 
-def module_imports(root: Path) -> networkx.DiGraph:
+def module_imports() -> networkx.DiGraph:
     """Edges from importing to imported modules, imports inside functions and for type checking included."""
-    modules = {".".join(path.relative_to(root).with_suffix("").parts): path for path in python_files(root / PACKAGE)}
-    graph = networkx.DiGraph()
-    for name, path in modules.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(PACKAGE):
-                for alias in node.names:
-                    whole = f"{node.module}.{alias.name}"
-                    target = whole if whole in modules else node.module
-                    if target in modules:
-                        graph.add_edge(name, target)
-    return graph
+    graph = grimp.build_graph(PACKAGE, cache_dir=None)
+    edges = ((name, found) for name in graph.modules for found in graph.find_modules_directly_imported_by(name))
+    return networkx.DiGraph(list(edges))
 
 
 def folder_of(module: str) -> str:
@@ -101,22 +92,17 @@ def draw(graph: networkx.DiGraph, sizes: Mapping[str, int], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     order = networkx.condensation(graph)
-    floor_of: dict[str, int] = {}
-    for number in reversed(list(networkx.topological_sort(order))):
-        below = [floor_of[member] for after in order.successors(number) for member in order.nodes[after]["members"]]
-        floor_of |= {member: max(below, default=-1) + 1 for member in order.nodes[number]["members"]}
-    floors: dict[int, list[str]] = {}
-    for name in sorted(floor_of, key=lambda folder: -sizes[folder]):
-        floors.setdefault(floor_of[name], []).append(name)
-    centre = {
-        name: ((place - (len(names) - 1) / 2) * 2.6, 1.4 * floor)
-        for floor, names in floors.items()
-        for place, name in enumerate(names)
-    }
-    together = {member: number for number in order for member in order.nodes[number]["members"]}
+    centre = {}
+    floors = list(networkx.topological_generations(order.reverse()))
+    for floor, circles in enumerate(floors):
+        names = sorted(
+            (name for circle in circles for name in order.nodes[circle]["members"]), key=lambda n: -sizes[n]
+        )
+        centre |= {name: ((place - (len(names) - 1) / 2) * 2.6, 1.4 * floor) for place, name in enumerate(names)}
+    circle_of = order.graph["mapping"]
     figure, axes = plt.subplots(figsize=(11, 0.9 * len(floors) + 1))
     for source, target in graph.edges:
-        circular = together[source] == together[target]
+        circular = circle_of[source] == circle_of[target]
         axes.annotate(
             "",
             centre[target],

@@ -59,13 +59,13 @@ class TraitsAccuracy:
     session: tyro.conf.Positional[Path]
     """Simulated session."""
     name: tyro.conf.Positional[str]
-    """Of the cloud, in the table."""
+    """Name of the cloud in the table."""
     cloud: Path | None = None
     """Spectral cloud reconstructed from it; without it, an ideal cloud."""
     points: int = 100_000
-    """Of the ideal cloud."""
+    """Points of the ideal cloud."""
     noise_m: float = 0.0003
-    """Of the ideal cloud, in each direction."""
+    """Noise of the ideal cloud in each direction."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """How the mesh is made."""
     results: Path = RESULTS
@@ -146,9 +146,9 @@ def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -
     Skin that blushes has references between its two ends: half-blushed skin is nearer to a bruise than to either.
     """
     names = [name.replace("_blush", "_skin") for name in true.materials]
-    wanted = [index for index, name in enumerate(names) if name not in LEFT_OUT]
-    references = [(names[index], true.endmembers[index]) for index in wanted]
-    ends = [true.endmembers[index] for index in wanted if names[index].endswith("_skin")]
+    kept = [index for index, name in enumerate(names) if name not in LEFT_OUT]
+    references = [(names[index], true.endmembers[index]) for index in kept]
+    ends = [true.endmembers[index] for index in kept if names[index].endswith("_skin")]
     if len(ends) == 2:
         references += [(names[0], (1.0 - part) * ends[0] + part * ends[1]) for part in BLUSH_FRACTIONS]
     library = SpectralLibrary(
@@ -156,7 +156,7 @@ def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -
     )
     found, alike = (classified(one, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0) for one in (surface, ideal))
     rows = []
-    # Unmixing wants all tissues, each pure, and tells their mixtures itself.
+    # Unmixing needs all tissues, each pure, and finds their mixtures itself.
     pure = SpectralLibrary(tuple(names), true.wavelengths_nm, true.endmembers)
     unmixed = classified(surface, pure, paper.CLASSIFICATION_ANGLE_RAD, 0.0)
     mixture_m2 = dict(zip(unmixed.names, unmixed.mixture_areas_m2, strict=True))

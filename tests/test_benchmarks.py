@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from damaged_files import damaged, run_kind
 from file_kinds import Kind, kinds
 from results_table import RESULTS, SOURCE_COLUMNS, read_results, write_results

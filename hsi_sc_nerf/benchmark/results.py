@@ -89,7 +89,7 @@ def write_page(path: Path, runs: Sequence[BenchmarkRun], settings: dict[str, Any
     Raises:
         InputError: the operating system refused to write.
     """
-    told = "\n".join(f"- {key}: {value}" for key, value in settings.items())
+    listed = "\n".join(f"- {key}: {value}" for key, value in settings.items())
     made_of = "\n".join(f"- `{run.name}`: `ns-train {' '.join((run.method, *run.words))}`" for run in runs)
     text = f"""# What accuracy costs in time
 
@@ -103,7 +103,7 @@ process held until then, earlier evaluations included.
 
 Measured on: {", ".join(f"{key} {value}" for key, value in machine.items())}.
 
-{told}
+{listed}
 
 {made_of}
 """

@@ -85,10 +85,10 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     else:
         of_white = Finding("white", "red", f"{session.path}: {fault}.", values)
     level: Level = "red" if clipped > ABOVE_RED else "amber" if clipped > ABOVE_AMBER else "green"
-    told = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
+    text = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
     if level != "green":
-        told = f"{session.path}: {told} and will be clipped; check that it is a white, in the frames' light"
-    return [of_white, Finding("white-clipped", level, f"{told}.", {"fraction": clipped})]
+        text = f"{session.path}: {text} and will be clipped; check that it is a white, in the frames' light"
+    return [of_white, Finding("white-clipped", level, f"{text}.", {"fraction": clipped})]
 
 
 def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]:
@@ -226,15 +226,15 @@ def check_clipped(session: Session, calibration: SessionCalibration, counts: Pix
     clipped = float(counts.clipped_high.mean() / pixels)
     values = {"clipped": clipped, "saturated": float(by_band[worst]), "saturated_nm": worst_nm}
     of_a_band = f"at most {100.0 * by_band[worst]:.2g} % of a band ({worst_nm:.0f} nm) are"
-    told = (
+    text = (
         f"{100.0 * clipped:.2g} % of the values are clipped at the upper bound, and "
         f"{of_a_band if by_band[worst] else 'none is'} saturated"
     )
     if clipped > CLIPPED_RED or by_band[worst] > SATURATED_RED:
-        return Finding("clipped", "red", f"{session.path}: {told}; check the white and the integration time.", values)
+        return Finding("clipped", "red", f"{session.path}: {text}; check the white and the integration time.", values)
     if clipped > CLIPPED_AMBER or by_band[worst] > SATURATED_AMBER:
-        return Finding("clipped", "amber", f"{session.path}: {told}; a shorter integration time avoids it.", values)
-    return Finding("clipped", "green", f"Values: {told}.", values)
+        return Finding("clipped", "amber", f"{session.path}: {text}; a shorter integration time avoids it.", values)
+    return Finding("clipped", "green", f"Values: {text}.", values)
 
 
 def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
@@ -248,14 +248,14 @@ def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
     error = float(drift.standard_error[:, calibration.bands].max())
     pixels = int(drift.static.sum())
     values = {"measured": True, "largest_change": change, "standard_error": error, "static_pixels": pixels}
-    told = f"the lamps' light changes by up to {100.0 * change:.1f} %"
+    text = f"the lamps' light changes by up to {100.0 * change:.1f} %"
     if change > LARGE_DRIFT:
         level: Level = "red" if change > IMPLAUSIBLE_DRIFT else "amber"
-        return Finding("drift", level, f"{session.path}: {told}; check lamps and exposure times.", values)
+        return Finding("drift", level, f"{session.path}: {text}; check lamps and exposure times.", values)
     if error > MAX_ERROR:
-        sentence = f"{told}, but only to {100.0 * error:.1f} %, from {pixels} pixels; show more of the still chamber."
+        sentence = f"{text}, but only to {100.0 * error:.1f} %, from {pixels} pixels; show more of the still chamber."
         return Finding("drift", "amber", f"{session.path}: {sentence}", values)
-    return Finding("drift", "green", f"Lamps: {told}, known to {100.0 * error:.2f} %.", values)
+    return Finding("drift", "green", f"Lamps: {text}, known to {100.0 * error:.2f} %.", values)
 
 
 def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
@@ -267,10 +267,10 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
     snr = float(np.median(spectrum / np.sqrt(noise.read_noise[bands] ** 2 + noise.counts_per_electron * spectrum)))
     scatter = 0.0 if isinstance(drift, NotMeasurable) else drift.scatter
     values = {"signal_to_noise_of_white": snr, "scatter_of_wall": scatter}
-    told = f"one pixel of the white has a signal-to-noise ratio of {snr:.0f}"
+    text = f"one pixel of the white has a signal-to-noise ratio of {snr:.0f}"
     if snr < LOW_SNR:
         level: Level = "red" if snr < USELESS_SNR else "amber"
-        return Finding("noise", level, f"{session.path}: {told}; use more light or a longer exposure.", values)
+        return Finding("noise", level, f"{session.path}: {text}; use more light or a longer exposure.", values)
     if scatter > MAX_SCATTER:
         sentence = f"the still wall scatters by {100.0 * scatter:.1f} % from frame to frame; check lamps and shadows."
         return Finding("noise", "amber", f"{session.path}: {sentence}", values)
@@ -278,4 +278,4 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
         what = "read noise" if noise.photon_noise_measured else "photon noise"
         sentence = f"the {what} was not measured; add dark cubes of several lines and a white that fills the image."
         return Finding("noise", "amber", f"{session.path}: {sentence}", values)
-    return Finding("noise", "green", f"Noise: {told}.", values)
+    return Finding("noise", "green", f"Noise: {text}.", values)

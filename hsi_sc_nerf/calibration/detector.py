@@ -37,7 +37,7 @@ MIN_TOP_PAIRS = 20
 SAME_PATTERN = 1.5
 """Variance of the frames' dark patterns, relative to that of noise, up to which they are the same."""
 SOME_LINES = 16
-"""Lines that are read of a cube, and at most of its dark cube, for a look at it."""
+"""Lines that are read of a cube, and at most of its dark cube, to inspect it."""
 BRIGHT = 0.5
 """Fraction of the largest count above which readings are bright."""
 

@@ -89,13 +89,13 @@ def smoothing_basis(
     penalty = _roughness_of_splines(scaled)
     weight = np.diag(precision[order])
     penalty *= np.trace(weight) / max(float(np.trace(penalty)), 1e-300)
-    told, functions = linalg.eigh(weight, weight + penalty)
+    eigenvalues, eigenvectors = linalg.eigh(weight, weight + penalty)
     terms = min(MAX_TERMS, int(np.count_nonzero(precision)))
-    told, functions = told[::-1][:terms], functions[:, ::-1][:, :terms]
-    roughness = np.maximum(1.0 / told - 1.0, 0.0)
+    eigenvalues, eigenvectors = eigenvalues[::-1][:terms], eigenvectors[:, ::-1][:, :terms]
+    roughness = np.maximum(1.0 / eigenvalues - 1.0, 0.0)
     roughness[:2] = 0.0
-    basis = np.empty_like(functions)
-    basis[order] = functions / np.sqrt(told)
+    basis = np.empty_like(eigenvectors)
+    basis[order] = eigenvectors / np.sqrt(eigenvalues)
     return basis, roughness
 
 

@@ -52,11 +52,11 @@ class LampDriftEstimate:
 
     Attributes:
         factor: the smooth curve, which reflectance is divided by to correct the drift.
-        measured: the same before smoothing; nan in bands without enough light.
+        measured: the light before smoothing; nan in bands without enough light.
         standard_error: of ``factor``; 0 in the first frame.
         static: which of the surveyed pixels are static.
-        scatter: of their grey levels, sensor noise included (standard deviation, relative).
-        p_value: of such a drift under steady lamps (`drift_p_value`).
+        scatter: scatter of the static pixels' grey levels, sensor noise included (standard deviation, relative).
+        p_value: probability of such a drift under steady lamps (`drift_p_value`).
     """
 
     factor: Float[np.ndarray, "frames bands"]

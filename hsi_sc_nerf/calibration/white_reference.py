@@ -39,7 +39,7 @@ class White:
     Attributes:
         measured: mean counts above dark before smoothing; nan in bad bands and, with one column for each sample, in
             dead elements.
-        spectrum: the same after smoothing.
+        spectrum: mean counts above dark after smoothing.
         pixels: pixels averaged for each column.
         window_bands: bands averaged by smoothing for each band; 0 in bad bands.
         bad_bands: bands in which the white is unlit, saturated, or without a live detector element.

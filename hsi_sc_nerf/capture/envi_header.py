@@ -86,7 +86,7 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
     Raises:
         InputError: there is no such file, it is no ENVI header, a field is missing or unreadable, a list does not
             have one number a band, the pixels would be read wrongly (complex numbers, frame offsets, compression), or
-            it describes a library where an image is wanted, or the converse.
+            it describes a library where an image is expected, or the converse.
     """
     fields = _mended_fields(path)
     try:

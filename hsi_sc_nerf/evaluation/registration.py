@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 REFERENCE_POINTS, MOVED_POINTS = 50_000, 20_000
 """Largest numbers of points of the reference and of the cloud."""
 SEARCH_REFERENCE_POINTS, SEARCH_POINTS = 10_000, 1_000
-"""The same while a start is searched for."""
+"""Largest numbers of points while a start is searched for."""
 SEARCH_FRACTIONS = (1 / 3, 1 / 10)
 """Largest distances of pairs in the first rounds, as fractions of the reference's radius."""
 ROUNDS, CONVERGED = 50, 1e-7
@@ -39,11 +39,11 @@ class Rival:
     """An attitude that fits as well as the one that was taken, because the shape is (nearly) symmetric."""
 
     turn_deg: float
-    """Between the two."""
+    """Angle between the two attitudes."""
     rms_m: float
-    """Of distances off the tangent planes, both ways, each at most a tenth of the object's radius."""
+    """RMS of distances off the tangent planes, in both directions, each at most a tenth of the object's radius."""
     taken_rms_m: float
-    """The same of the attitude that was taken."""
+    """RMS of these distances in the attitude that was taken."""
 
 
 @dataclass(frozen=True)

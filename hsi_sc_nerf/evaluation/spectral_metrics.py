@@ -17,76 +17,25 @@ Every function raises ValueError if the images differ in shape, if the mask is n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.band_scores import Image, Mask, Valid, band_scores, decibel, image_blocks
-from hsi_sc_nerf.numerics import masked_mean, narrow, safe_sqrt, select_pixels, spectral_angle
+from hsi_sc_nerf.numerics import check_mask, masked_mean, narrow, safe_sqrt, select_pixels, spectral_angle
 
+# The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
+PSNR_DELTA = 1e-10
 MIN_BANDS_OF_AN_ANGLE = 2
 """A spectrum of a single band is a length: it has no direction that could differ."""
-
-
-def _pixel_mean(
-    values: Float[Tensor, "h w"], mask: Mask | None, weights: Shaped[Tensor, "h w"] | None
-) -> Float[Tensor, ""]:
-    """Weighted mean over the mask; what has weight 0 may be anything."""
-    if weights is None:
-        return masked_mean(values, mask)
-    values, weights = select_pixels(torch.stack([values.double(), weights.double()], -1), mask).unbind(-1)
-    return (torch.where(weights > 0, values, 0.0) * weights).sum() / weights.sum().clamp_min(1.0)
-
-
-def _mean_over_bands(scores: Float[Tensor, "bands"], mask: Mask | None, valid: Valid | None) -> Float[Tensor, ""]:
-    """Mean over the bands that have a valid pixel in the mask; over all where none has."""
-    if valid is None:
-        return scores.mean()
-    measured = select_pixels(valid, mask).any(0)
-    return scores[measured].mean() if measured.any() else scores.mean()
-
-
-def spectral_angle_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
-    """The angle between the spectra of each pixel, radians in [0, pi]; pi / 2 where either spectrum is zero.
-
-    NaN where a pixel has fewer than two valid bands.
-    """
-    angles = torch.cat([spectral_angle(p, t) for p, t, _ in image_blocks(predicted, target, valid, 0)])
-    return angles if valid is None else torch.where(has_angle(valid), angles, torch.nan)
-
-
-def squared_error_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
-    """Mean squared error over the bands of each pixel, float64; NaN where none is valid."""
-    return torch.cat(
-        [
-            (p.double() - t.double()).square().mean(-1)
-            if v is None
-            else (p.double() - t.double()).square().sum(-1) / count_bands(v)
-            for p, t, v in image_blocks(predicted, target, valid, 0)
-        ]
-    )
-
-
-def spectral_angle_mapper(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, ""]:
-    """Mean over pixels of the angle between the spectra, radians (paper, SAM; Kruse et al. 1993).
-
-    A pixel whose spectrum is zero on either side counts pi / 2, which is what the paper's delta makes of it. One with
-    fewer than two valid bands is left out.
-    """
-    angles = spectral_angle_map(predicted, target, valid)
-    return narrow(_pixel_mean(angles, mask, None if valid is None else has_angle(valid)), predicted)
-
-
-def spectral_rmse(
-    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
-) -> Float[Tensor, ""]:
-    """Root of the squared error's mean over pixels and bands (paper, spectral RMSE); valid values count alike."""
-    squares = squared_error_map(predicted, target, valid)
-    return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else count_bands(valid))), predicted)
+BLOCK_VALUES = 1 << 20
+"""Values of one image in a block: 8 MiB a temporary in float64, of which there are some dozens."""
+Image = Float[Tensor, "h w bands"]
+Mask = Bool[Tensor, "h w"]
+Valid = Bool[Tensor, "h w bands"]
+BandScore = Float[np.ndarray, "masks bands"]
 
 
 def spectral_metrics(
@@ -115,19 +64,94 @@ def metrics_of_regions(
     has_angles, number, has_any = None, None, None
     if valid is not None:
         has_angles, number, has_any = has_angle(valid), count_bands(valid), valid.any(-1)
-    by_band = band_scores(predicted, target, list(regions.values()), valid)
+    masks = list(regions.values())
+    windowed = windowed_scores(predicted, target, masks, valid)
+    by_band = zip(*moment_scores(predicted, target, masks, valid), windowed, strict=True)
     found: dict[str, float] = {}
-    for (name, mask), (mse, similarity, windows) in zip(regions.items(), by_band, strict=True):
+    for (name, mask), (pixels, mse, similarity, windows) in zip(regions.items(), by_band, strict=True):
+        counted = pixels > 0 if pixels.any() else np.ones_like(pixels, bool)
         values = {
             "sam": _pixel_mean(angles, mask, has_angles),
             "rmse": safe_sqrt(_pixel_mean(squares, mask, number)),
             "rmse_pixel_mean": _pixel_mean(safe_sqrt(squares), mask, has_any),
-            "ssim": _mean_over_bands(similarity, mask, valid),
-            "ssim_windowed": _mean_over_bands(windows, mask, valid),
-            "psnr": _mean_over_bands(decibel(mse), mask, valid),
+            "ssim": torch.tensor(similarity[counted].mean()),
+            "ssim_windowed": torch.tensor(windows[counted].mean()),
+            "psnr": torch.tensor(decibel(mse)[counted].mean()),
         }
         found |= {f"{name}{metric}": narrow(value, predicted).item() for metric, value in values.items()}
     return found
+
+
+def spectral_angle_mapper(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, ""]:
+    """Mean over pixels of the angle between the spectra, radians (paper, SAM; Kruse et al. 1993).
+
+    A pixel whose spectrum is zero on either side counts pi / 2, which is what the paper's delta makes of it. One with
+    fewer than two valid bands is left out.
+    """
+    angles = spectral_angle_map(predicted, target, valid)
+    return narrow(_pixel_mean(angles, mask, None if valid is None else has_angle(valid)), predicted)
+
+
+def spectral_rmse(
+    predicted: Image, target: Image, mask: Mask | None = None, valid: Valid | None = None
+) -> Float[Tensor, ""]:
+    """Root of the squared error's mean over pixels and bands (paper, spectral RMSE); valid values count alike."""
+    squares = squared_error_map(predicted, target, valid)
+    return narrow(safe_sqrt(_pixel_mean(squares, mask, None if valid is None else count_bands(valid))), predicted)
+
+
+def spectral_angle_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
+    """The angle between the spectra of each pixel, radians in [0, pi]; pi / 2 where either spectrum is zero.
+
+    NaN where a pixel has fewer than two valid bands.
+    """
+    angles = torch.cat([spectral_angle(p, t) for p, t, _ in _blocks(predicted, target, valid)])
+    return angles if valid is None else torch.where(has_angle(valid), angles, torch.nan)
+
+
+def squared_error_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
+    """Mean squared error over the bands of each pixel, float64; NaN where none is valid."""
+    return torch.cat(
+        [
+            (p.double() - t.double()).square().mean(-1)
+            if v is None
+            else (p.double() - t.double()).square().sum(-1) / count_bands(v)
+            for p, t, v in _blocks(predicted, target, valid)
+        ]
+    )
+
+
+def moment_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
+) -> tuple[Int[np.ndarray, "masks bands"], BandScore, BandScore]:
+    """Valid pixels, mean squared error (paper, MSE_b) and SSIM of each band over each of several masks, float64.
+
+    SSIM takes means, variances and covariance over all the pixels of the mask: one window.
+    """
+    from hsi_sc_nerf.evaluation import band_moments  # compiles, which losses do without
+
+    return band_moments.moment_scores(*_arrays(predicted, target, masks, valid))
+
+
+def windowed_scores(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
+) -> BandScore:
+    """SSIM of each band over 11 x 11 Gaussian windows (sigma 1.5 px), float64: the usual index of Wang et al. 2004.
+
+    A window counts if its centre lies in the mask and is valid; what it covers may lie outside the mask. At the
+    image's border the window is cut, values that are not valid are cut out of it, and its weights are scaled to sum
+    to 1, so that every valid pixel is a centre.
+    """
+    from hsi_sc_nerf.evaluation import band_moments
+
+    return band_moments.windowed_scores(*_arrays(predicted, target, masks, valid))
+
+
+def decibel(mse: Float[np.ndarray, "*bands"]) -> Float[np.ndarray, "*bands"]:
+    """Peak signal-to-noise ratio of mean squared errors, dB, for a peak of 1; at most ``-10 log10(PSNR_DELTA)``."""
+    return -10.0 * np.log10(mse + PSNR_DELTA)
 
 
 def count_bands(valid: Bool[Tensor, "*pixels bands"]) -> Int[Tensor, "*pixels"]:
@@ -139,3 +163,68 @@ def count_bands(valid: Bool[Tensor, "*pixels bands"]) -> Int[Tensor, "*pixels"]:
 def has_angle(valid: Bool[Tensor, "*pixels bands"]) -> Bool[Tensor, "*pixels"]:
     """Pixels with bands enough to tell a spectral angle from."""
     return count_bands(valid) >= MIN_BANDS_OF_AN_ANGLE
+
+
+def cleared(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """``values``, 0 where they are not valid: what stood there, NaN included, touches neither values nor gradients.
+
+    Raises:
+        ValueError: ``valid`` is not boolean or of another shape.
+    """
+    _check_valid(values, valid)
+    return torch.where(valid, values, 0.0)
+
+
+def _pixel_mean(
+    values: Float[Tensor, "h w"], mask: Mask | None, weights: Shaped[Tensor, "h w"] | None
+) -> Float[Tensor, ""]:
+    """Weighted mean over the mask; what has weight 0 may be anything."""
+    if weights is None:
+        return masked_mean(values, mask)
+    values, weights = select_pixels(torch.stack([values.double(), weights.double()], -1), mask).unbind(-1)
+    return (torch.where(weights > 0, values, 0.0) * weights).sum() / weights.sum().clamp_min(1.0)
+
+
+def _blocks(
+    predicted: Tensor, target: Tensor, valid: Tensor | None
+) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """Lines of both images, a block at a time, 0 where not valid, and which of their values are."""
+    _check_shapes(predicted, target)
+    step = max(1, BLOCK_VALUES * len(predicted) // max(1, predicted.numel()))
+    pairs = zip(predicted.split(step), target.split(step), strict=True)
+    if valid is None:
+        yield from ((p, t, None) for p, t in pairs)
+    else:
+        for (p, t), v in zip(pairs, valid.split(step), strict=True):
+            yield cleared(p, v), cleared(t, v), v
+
+
+def _arrays(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Bool[np.ndarray, "masks h w"]]:
+    """The images and all masks as `band_moments` takes them, in the processor's memory."""
+    _check_shapes(predicted, target)
+    if valid is not None:
+        _check_valid(target, valid)
+    for mask in masks:
+        if mask is not None:
+            check_mask(predicted, mask)
+    precision = torch.float64 if torch.float64 in (predicted.dtype, target.dtype) else torch.float32
+    flags = torch.zeros(0, 0, 0, dtype=torch.bool) if valid is None else valid
+    images = (predicted.to(precision), target.to(precision), flags)
+    first, second, third = (image.contiguous().numpy(force=True) for image in images)
+    whole = torch.ones(predicted.shape[:2], dtype=torch.bool)
+    return (first, second, third), np.stack([(whole if mask is None else mask).numpy(force=True) for mask in masks])
+
+
+def _check_shapes(predicted: Tensor, target: Tensor) -> None:
+    if predicted.shape != target.shape:
+        raise ValueError(f"the images differ in shape: {tuple(predicted.shape)} and {tuple(target.shape)}")
+
+
+def _check_valid(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> None:
+    if valid.dtype != torch.bool or valid.shape != values.shape:
+        raise ValueError(
+            f"the validity of values of shape {tuple(values.shape)} is boolean with that shape, not {valid.dtype} "
+            f"with shape {tuple(valid.shape)}"
+        )

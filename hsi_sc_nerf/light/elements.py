@@ -95,7 +95,7 @@ def shown_points(
         lift_m: lines of sight begin so far outside of the surface.
 
     Returns:
-        Points, outward unit normals, and the share of each in each element as seen along its normal.
+        Points, outward unit normals, and the weight of each in each element as seen along its normal.
     """
     count, whole = len(elements.positions), elements.occluders
     scanned = Mesh(whole.vertices, whole.triangles[elements.on_object[elements.of_triangle]])
@@ -109,19 +109,19 @@ def shown_points(
     cosine = (normals[point] * elements.normals[element]).sum(axis=1)
     kept = elements.on_object[element] & (cosine > 0.0)
     shape = count, len(points)
-    shares = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
+    weights = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
     # What lies in a groove is hidden to one who looks along the mean normal of the elements around.
-    sight = np.concatenate([points + lift_m * normals, shares.T @ elements.normals], axis=1, dtype=np.float32)
+    sight = np.concatenate([points + lift_m * normals, weights.T @ elements.normals], axis=1, dtype=np.float32)
     hidden = ray_scene(whole.vertices, whole.triangles).test_occlusions(sight).numpy()
-    shares = shares @ scipy.sparse.diags_array(1.0 - hidden)
+    weights = weights @ scipy.sparse.diags_array(1.0 - hidden)
     # An element that is left without a point, and those of the support, stand for themselves.
-    alone = shares.sum(axis=1) <= 0.0
-    shares = scipy.sparse.hstack([shares, scipy.sparse.diags_array(alone.astype(float))], format="csr")
-    shares.eliminate_zeros()
-    used = shares.sum(axis=0) > 0.0
-    shares = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / shares.sum(axis=1)) @ shares[:, used])
+    alone = weights.sum(axis=1) <= 0.0
+    weights = scipy.sparse.hstack([weights, scipy.sparse.diags_array(alone.astype(float))], format="csr")
+    weights.eliminate_zeros()
+    used = weights.sum(axis=0) > 0.0
+    weights = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / weights.sum(axis=1)) @ weights[:, used])
     points = np.concatenate([points, elements.positions])[used]
-    return points, np.concatenate([normals, elements.normals])[used], shares
+    return points, np.concatenate([normals, elements.normals])[used], weights
 
 
 def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: float) -> Float[np.ndarray, "n 3"]:
@@ -218,11 +218,11 @@ def observe(
         value, of_object, across, along = 0.0, [], 0.0, 0.0
         for down in (0, 1):
             for right in (0, 1):
-                share_across, share_along = np.abs(1 - right - part[:, 0]), np.abs(1 - down - part[:, 1])
+                weight_across, weight_along = np.abs(1 - right - part[:, 0]), np.abs(1 - down - part[:, 1])
                 pixel = pixels(frame, line + down, sample + right)
-                value = value + (share_across * share_along)[:, None] * pixel
-                across = across + (2 * right - 1) * share_along * pixel.mean(axis=1)
-                along = along + (2 * down - 1) * share_across * pixel.mean(axis=1)
+                value = value + (weight_across * weight_along)[:, None] * pixel
+                across = across + (2 * right - 1) * weight_along * pixel.mean(axis=1)
+                along = along + (2 * down - 1) * weight_across * pixel.mean(axis=1)
                 of_object.append(masks[frame, line + down, sample + right])
         on = elements.on_object[seen]
         whole = np.where(on, np.all(of_object, axis=0), ~np.any(of_object, axis=0))

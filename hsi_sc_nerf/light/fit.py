@@ -46,11 +46,11 @@ UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
 """Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
 are seen tell what is to be expected of those that are not."""
 UNEVENNESS_AT_FIRST = 0.003
-"""The same while a lamp is looked for, lest the chamber explain how near it is."""
+"""Expected root mean square while a lamp is searched for, so that the chamber does not explain how near it is."""
 MOST_UNEVEN = 0.1
 """A chamber's harmonics are no larger: what is more uneven is a lamp."""
 LEAST_DISTANCE_M = 0.25
-"""Of lamps, which the first order of their nearness still describes."""
+"""Least distance of lamps; the first order of their nearness still describes it."""
 LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
 """Expected size of a lamp, of a correction of its direction, and of one over the lamps' distance (1/m)."""
 WHITE_STD = 0.01
@@ -157,9 +157,9 @@ class _Fit:
             residual, jacobian = self._linearised()
             self._weigh(residual)
             residual, jacobian = self._without_materials(residual[:, None], jacobian)
-            told, known = self.errors.information(residual[:, 0], jacobian, self._precision)
+            information, known = self.errors.information(residual[:, 0], jacobian, self._precision)
             prior, pull = self._prior()
-            hessian = told + prior
+            hessian = information + prior
             step = np.linalg.solve(hessian, known + pull)
             self._move(step)
             if see_unevenness:
@@ -204,8 +204,8 @@ class _Fit:
         self._bounce()
         residual, full = self._linearised()
         residual, jacobian = self._without_materials(residual[:, None], full)
-        told, _ = self.errors.information(residual[:, 0], jacobian, self._precision)
-        covariance = np.linalg.inv(told + self._prior()[0])
+        information, _ = self.errors.information(residual[:, 0], jacobian, self._precision)
+        covariance = np.linalg.inv(information + self._prior()[0])
         variance = np.einsum("mi,ij,mj->m", full, covariance, full)
         irradiance = self.irradiance()
         return LightFit(
@@ -249,14 +249,14 @@ class _Fit:
         """
         light, irradiance = self.light, self.irradiance()
         expected = self._materials(irradiance)[self.views.element] * irradiance
-        share = expected**2 / (expected**2).sum(axis=1, keepdims=True)
-        residual = (share * (self.views.reflectance / expected - 1.0)).sum(axis=1)
-        by_chamber = (share * light.chamber_colour / irradiance).sum(axis=1)[:, None]
-        by_lamps = (share * light.lamp_colour / irradiance).sum(axis=1)[:, None]
+        band_weights = expected**2 / (expected**2).sum(axis=1, keepdims=True)
+        residual = (band_weights * (self.views.reflectance / expected - 1.0)).sum(axis=1)
+        by_chamber = (band_weights * light.chamber_colour / irradiance).sum(axis=1)[:, None]
+        by_lamps = (band_weights * light.lamp_colour / irradiance).sum(axis=1)[:, None]
         units: LampUnits = self.lamps
         columns = [self._chamber * by_chamber, (units.irradiance + light.nearness * units.by_nearness) * by_lamps]
         if len(light.lamps):
-            turning = (units.by_direction * light.lamps[:, None]).reshape(len(share), -1)
+            turning = (units.by_direction * light.lamps[:, None]).reshape(len(band_weights), -1)
             columns += [turning * by_lamps, (units.by_nearness @ light.lamps)[:, None] * by_lamps]
         return residual, np.hstack(columns)
 
@@ -268,12 +268,12 @@ class _Fit:
 
     def _weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
-        told = self.views.tells_light
-        self.scatter = float(robust_std(residual[told], least=SMALLEST_SCATTER))
-        beyond = scatter_beyond(residual[told], self._own_std[told])
+        used = self.views.shows_light
+        self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
+        beyond = scatter_beyond(residual[used], self._own_std[used])
         std = np.hypot(beyond, self._own_std)
-        self.weights = np.where(told, tukey_weights(residual / std), 1.0)
-        self._precision = self.weights * told / std**2
+        self.weights = np.where(used, tukey_weights(residual / std), 1.0)
+        self._precision = self.weights * used / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Precision of what is expected of the parameters, and its pull from where they are."""

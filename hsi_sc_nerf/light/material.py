@@ -30,7 +30,7 @@ class ObjectLight:
 
     Attributes:
         elements: of the object and its support.
-        turning: the same as they turn.
+        turning: the elements as they turn under the light.
         views: what frames measured of them.
         fit: the light by groups of bands.
         spectral: the fit's light and materials at the bands of the views.
@@ -57,22 +57,22 @@ class ObjectLight:
         """
         of_object = np.flatnonzero(self.elements.on_object)
         right_angle_m = NORMAL_WEIGHT * self._spacing_m / np.sqrt(2.0)
-        places = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
-        distance, nearest = cKDTree(places).query(
-            np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(places))
+        features = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
+        distance, nearest = cKDTree(features).query(
+            np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(features))
         )
         distance, nearest = distance.reshape(len(points_m), -1), of_object[nearest.reshape(len(points_m), -1)]
-        share = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
-        share /= share.sum(axis=1, keepdims=True)
+        weights = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
+        weights /= weights.sum(axis=1, keepdims=True)
         result = np.empty((len(points_m), self.spectral.material.shape[1]), np.float32)
         for frame in np.unique(frames):
             rows = np.flatnonzero(frames == frame)
             light, material = self.spectral.light, self.spectral.material
             whole = self.turning.direct(light, int(frame))
             whole = whole + self.turning.bounced(light, material, int(frame))
-            result[rows] = np.einsum("nk,nkb->nb", share[rows], whole[nearest[rows]])
+            result[rows] = np.einsum("nk,nkb->nb", weights[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
-        relative = np.sqrt((share * self._relative_variance[nearest]).sum(axis=1))
+        relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))
         return result, relative * result.mean(axis=1)
 
     @property
@@ -83,7 +83,7 @@ class ObjectLight:
 
     @property
     def _relative_variance(self) -> Float[np.ndarray, "elements"]:
-        """Of each element's irradiance: of the light, of what occludes it, of what the model misses."""
+        """Relative variance of each element's irradiance: of the light, its occluders, and the model's errors."""
         count, views = len(self.elements.positions), np.bincount(self.views.element)
         views = np.pad(views, (0, count - len(views)))
         of_light = np.bincount(self.views.element, self.fit.relative_std**2, count) / np.maximum(views, 1)
@@ -104,9 +104,9 @@ def turning_elements(
         lift_m: rays begin so far outside of the surface.
     """
     directions = even_directions(RAY_DIRECTIONS)
-    points, normals, shares = shown_points(elements, pixel_m, lift_m)
+    points, normals, weights = shown_points(elements, pixel_m, lift_m)
     faces = elements.of_triangle, len(elements.positions)
-    seen = transfer(points, normals, elements.occluders, *faces, directions, lift_m).mean(shares)
+    seen = transfer(points, normals, elements.occluders, *faces, directions, lift_m).mean(weights)
     centre_m = elements.positions[elements.on_object].mean(axis=0)
     return TurningElements(
         elements.positions - centre_m, elements.normals, elements.on_object, seen, directions, rotations
@@ -120,7 +120,7 @@ def light_on_object(
 
     Args:
         elements: of the object and its support.
-        turning: the same as they turn.
+        turning: the elements as they turn under the light.
         views: what frames measured of them.
         white_normal: outward unit normal of the white reference, camera's frame.
     """

@@ -120,7 +120,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         return np.where(valid, reflectance, np.nan)
 
     views = observe(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
-    if views.tells_light.sum() < LEAST_VIEWS:
+    if views.shows_light.sum() < LEAST_VIEWS:
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
@@ -177,7 +177,7 @@ def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> 
         views: their measurements, by the same bands as the fit.
         fit: light and materials.
     """
-    rows = np.flatnonzero(views.tells_light)
+    rows = np.flatnonzero(views.shows_light)
     element, weights = views.element[rows], fit.weights[rows]
     brightness = np.log(np.maximum(views.reflectance[rows].mean(axis=1), 1e-4))
     # Brightness of a material is that of its mean over the bands.

@@ -24,12 +24,12 @@ class SharedErrors:
     """Groups of measurements that share errors.
 
     Args:
-        groups: the group of each measurement, in one way or several.
+        groups: one grouping of the measurements or several: the group of each.
     """
 
     def __init__(self, *groups: Int[np.ndarray, "m"]) -> None:
-        ways = [scipy.sparse.csr_array((np.ones(len(way)), (way, np.arange(len(way))))) for way in groups]
-        self._ways, self._by_group = len(groups), scipy.sparse.csr_array(scipy.sparse.vstack(ways))
+        members = [scipy.sparse.csr_array((np.ones(len(group)), (group, np.arange(len(group))))) for group in groups]
+        self._groupings, self._by_group = len(groups), scipy.sparse.csr_array(scipy.sparse.vstack(members))
 
     def information(
         self,
@@ -49,7 +49,7 @@ class SharedErrors:
         spread = CORRELATED * alone + sums.T @ sums
         # For parameters that nothing shows yet.
         spread += 1e-9 * np.trace(spread) * np.eye(len(spread))
-        known = np.linalg.solve(spread, np.column_stack([alone, sums.sum(axis=0) / self._ways]))
+        known = np.linalg.solve(spread, np.column_stack([alone, sums.sum(axis=0) / self._groupings]))
         return alone @ known[:, :-1], alone @ known[:, -1]
 
     def significance(

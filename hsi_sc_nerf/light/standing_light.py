@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.special import sph_harm_y
 
 DEGREE = 2
-"""Of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
+"""Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
 FINE_DIRECTIONS = 1 << 13
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -32,8 +32,8 @@ class StandingLight:
         lamps: irradiance of each lamp on a surface that faces it.
         to_lamps: unit vector to each lamp.
         nearness: one over the lamps' distance, 1/m; 0 for lamps at infinity.
-        chamber_colour: factor by band; 1 for light of the white reference's colour.
-        lamp_colour: likewise.
+        chamber_colour: factor of the chamber's light by band; 1 for light of the white reference's colour.
+        lamp_colour: factor of the lamps' light by band.
     """
 
     chamber: Float[np.ndarray, "terms"]
@@ -76,13 +76,12 @@ def harmonics(directions: Float[np.ndarray, "n 3"], degree: int) -> Float[np.nda
     """Real spherical harmonics up to ``degree``, (degree + 1)^2 terms by rising degree; their mean square is 1."""
     polar = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-    terms = []
-    for n in range(degree + 1):
-        for m in range(-n, n + 1):
-            term = sph_harm_y(n, abs(m), polar, azimuth)
-            part = term.real if m >= 0 else term.imag
-            terms.append((np.sqrt(2.0) if m else 1.0) * np.sqrt(4.0 * np.pi) * part)
-    return np.stack(terms, axis=-1)
+    degrees = harmonic_degrees(degree)
+    orders = np.arange(len(degrees)) - degrees * (degrees + 1)
+    terms = sph_harm_y(degrees, np.abs(orders), polar[:, None], azimuth[:, None])
+    return (
+        np.sqrt(4.0 * np.pi) * np.where(orders == 0, 1.0, np.sqrt(2.0)) * np.where(orders < 0, terms.imag, terms.real)
+    )
 
 
 def harmonic_degrees(degree: int) -> Int[np.ndarray, "terms"]:

@@ -20,7 +20,7 @@ LEAST_COSINE = 0.15
 CELLS_ACROSS = 4
 """Cells across the object; elements in one of them share errors of mesh and poses."""
 FACING_SIDE = 0.35
-"""Cells of normals in the camera's frame, 20 degrees wide; in one of them elements share errors of the model."""
+"""Cells of normals in the camera's frame, 20 degrees wide; elements in one of them share errors of the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class Transfer:
         """Irradiance in an even chamber with black occluders, 0 to 1."""
         return self.open_weights.sum(axis=1)
 
-    def mean(self, shares: scipy.sparse.csr_array) -> Transfer:
-        """Means over points, by their shares in each row."""
-        means = np.asarray(shares @ self.open_weights, np.float32)
-        return Transfer(means, scipy.sparse.csr_array(shares @ self.form_factors))
+    def mean(self, weights: scipy.sparse.csr_array) -> Transfer:
+        """Means over points, weighted by each row."""
+        means = np.asarray(weights @ self.open_weights, np.float32)
+        return Transfer(means, scipy.sparse.csr_array(weights @ self.form_factors))
 
 
 def transfer(
@@ -80,12 +80,12 @@ def transfer(
         start = (points[rows] + lift_m * normals[rows]).astype(np.float32)
         hits = scene.cast_rays(np.concatenate([start[point], along[direction]], axis=1))
         hit = np.isfinite(hits["t_hit"].numpy())
-        share = cosines[point, direction]
-        share /= np.bincount(point, share, minlength=len(start))[point].astype(np.float32)
-        weights[first + point[~hit], direction[~hit]] = share[~hit]
+        fraction = cosines[point, direction]
+        fraction /= np.bincount(point, fraction, minlength=len(start))[point].astype(np.float32)
+        weights[first + point[~hit], direction[~hit]] = fraction[~hit]
         met = element_of_triangle[hits["primitive_ids"].numpy()[hit]]
         shape = len(start), elements
-        factors.append(scipy.sparse.coo_array((share[hit], (point[hit], met)), shape=shape).tocsr())
+        factors.append(scipy.sparse.coo_array((fraction[hit], (point[hit], met)), shape=shape).tocsr())
     return Transfer(weights, scipy.sparse.csr_array(scipy.sparse.vstack(factors, format="csr")))
 
 
@@ -97,7 +97,7 @@ class Views:
         element: index of the element.
         frame: index of the frame.
         reflectance: as measured, relative to the white reference.
-        tells_light: whether it tells of the light; others tell of their element's material alone. Markers do not,
+        shows_light: whether the light is fitted to it; others serve their element's material alone. Markers do not,
             whose pixels hold paper and ink.
         own_std: standard deviation relative to the reflectance, as far as it is known beforehand.
     """
@@ -105,7 +105,7 @@ class Views:
     element: Int[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
     reflectance: Float[np.ndarray, "m bands"]
-    tells_light: Bool[np.ndarray, "m"]
+    shows_light: Bool[np.ndarray, "m"]
     own_std: Float[np.ndarray, "m"]
 
 
@@ -190,21 +190,21 @@ class TurningElements:
     def cells(self) -> Int[np.ndarray, "n"]:
         """The cell that each element lies in."""
         side = np.cbrt(np.ptp(self.positions[self.on_object], axis=0).prod()) / CELLS_ACROSS
-        return _numbered(self.positions / side)
+        return _cell_numbers(self.positions / side)
 
     def facing(self, views: Views) -> Int[np.ndarray, "m"]:
         """The cell of normals in the camera's frame that each measurement lies in."""
         normals = np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
-        return _numbered(normals / FACING_SIDE)
+        return _cell_numbers(normals / FACING_SIDE)
 
     @cached_property
     def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:
         return [harmonics(self.directions @ rotation, DEGREE).astype(np.float32) for rotation in self.rotations]
 
 
-def _numbered(places: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """The unit cube that each place lies in."""
-    return np.unique(np.floor(places).astype(int), axis=0, return_inverse=True)[1].ravel()
+def _cell_numbers(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """Number of the unit cube that each point lies in."""
+    return np.unique(np.floor(points).astype(int), axis=0, return_inverse=True)[1].ravel()
 
 
 def _by_frame(views: Views) -> list[tuple[int, Int[np.ndarray, "rows"]]]:

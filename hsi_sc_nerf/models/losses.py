@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.band_scores import cleared
-from hsi_sc_nerf.evaluation.spectral_metrics import has_angle
+from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
 
 DIRECTION_FLOOR = 1e-4

@@ -11,8 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hsi_sc_nerf.evaluation.band_scores import decibel, moment_scores
-from hsi_sc_nerf.evaluation.spectral_metrics import metrics_of_regions, spectral_angle_map, squared_error_map
+from hsi_sc_nerf.evaluation.spectral_metrics import (
+    decibel,
+    metrics_of_regions,
+    moment_scores,
+    spectral_angle_map,
+    squared_error_map,
+)
 from hsi_sc_nerf.packed.pixels import spread_over
 
 if TYPE_CHECKING:
@@ -100,11 +105,8 @@ def score_view(
     valid: Bool[Tensor, "h w bands"],
 ) -> ViewScores:
     """Scores of a view, with the paper's metrics (section "Evaluation Metrics")."""
-    known = valid[mask].any(0).cpu().numpy()
-    (scores,) = moment_scores(rendered, measured, [mask], valid)
-    mse, psnr_db, ssim = (
-        np.where(known, score.double().cpu().numpy(), np.nan) for score in (scores[0], decibel(scores[0]), scores[1])
-    )
+    pixels, mse, ssim = (scores[0] for scores in moment_scores(rendered, measured, [mask], valid))
+    mse, psnr_db, ssim = (np.where(pixels > 0, score, np.nan) for score in (mse, decibel(mse), ssim))
     return ViewScores(
         name,
         metrics_of_regions(rendered, measured, {"": mask, "full_": None}, valid),

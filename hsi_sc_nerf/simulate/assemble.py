@@ -17,13 +17,12 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh, plants
-from hsi_sc_nerf.simulate.effect import effect_rng, of_kind
-from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect
+from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
+from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect, OffCentre
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, quads, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import (
     CameraSettings,
-    ContainerSettings,
     Cylinder,
     MaizeEar,
     MarkerSettings,
@@ -32,7 +31,6 @@ from hsi_sc_nerf.simulate.scene import (
     Scene,
     Sphere,
     Tomato,
-    TurntableSettings,
 )
 
 PLAQUE_STANDOFF_M = 0.0005
@@ -86,7 +84,14 @@ def object_part(scene: Scene) -> Part:
         InputError: the object is a mesh whose files cannot be used.
     """
     part = _object_on_zero(scene.object, np.random.default_rng(scene.seed))
-    return replace(part, mesh=part.mesh.moved(np.array([0.0, 0.0, scene.container.height_m])), is_object=True)
+    mesh = part.mesh.moved(np.array([0.0, 0.0, scene.container.height_m])).moved(_offset_m(scene))
+    return replace(part, mesh=mesh, is_object=True)
+
+
+def _offset_m(scene: Scene) -> Float[np.ndarray, "3"]:
+    """Shift of the disc and of what stands on it from the axis."""
+    off_centre = find_effect(scene.effects, OffCentre)
+    return off_centre.offset_m() if off_centre else np.zeros(3)
 
 
 def _object_on_zero(settings: Object, rng: np.random.Generator) -> Part:
@@ -118,32 +123,26 @@ def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
     disc = disc.moved(np.array([0.0, 0.0, -DISC_THICKNESS_M - PRINT_HEIGHT_M]))
     container = cylinder(scene.container.diameter_m, scene.container.height_m, spacing_m=spacing_m)
     parts = [_plain(disc, "disc"), _plain(container, "container_plastic")]
-    on_container, on_disc = marker_frames(scene.markers, scene.container, scene.turntable)
+    on_container, on_disc = marker_frames(scene)
     for number, frame in (on_container | on_disc).items():
         mesh, ink = marker_mesh(frame, number, scene.markers)
         parts.append(Part(mesh, ("paper", "marker_ink"), np.stack([~ink, ink], axis=-1).astype(float)))
     parts += [_plain(plaque_back(frame, scene.markers), "paper") for frame in on_container.values()]
-    return parts
+    return [replace(part, mesh=part.mesh.moved(_offset_m(scene))) for part in parts]
 
 
 def build_renderer(
-    scene: Scene,
-    scanned: Part,
-    offset_m: Float[np.ndarray, "3"] | float = 0.0,
-    extra_materials: Sequence[str] = (),
-    spacing_m: float | None = None,
+    scene: Scene, scanned: Part, extra_materials: Sequence[str] = (), spacing_m: float | None = None
 ) -> Renderer:
     """The renderer of the whole scene.
 
     Args:
         scene: the scene.
         scanned: its object, from `object_part`.
-        offset_m: shift of disc, container and markers, metres.
         extra_materials: materials of patterns on the chamber, which get columns of their own.
         spacing_m: approximate largest distance between vertices, metres, for light that is computed at vertices.
     """
-    support = support_parts(scene, spacing_m)
-    parts = [scanned, *(replace(part, mesh=part.mesh.moved(np.broadcast_to(offset_m, 3))) for part in support)]
+    parts = [scanned, *support_parts(scene, spacing_m)]
     if spacing_m is not None:
         # The factor keeps the diagonals of squares of that side.
         parts = [part.refined(1.5 * spacing_m) for part in parts]
@@ -154,9 +153,7 @@ def _plain(mesh: Mesh, material: str) -> Part:
     return Part(mesh, (material,), np.ones((len(mesh.vertices), 1)))
 
 
-def marker_frames(
-    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
-) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
+def marker_frames(scene: Scene) -> tuple[dict[int, MarkerFrame], dict[int, MarkerFrame]]:
     """Centre, right and up vector of each marker on the container and on the disc, by marker number, object frame.
 
     The markers of the container have the first numbers.
@@ -164,6 +161,7 @@ def marker_frames(
     Raises:
         InputError: the markers do not fit on the container or on the disc.
     """
+    markers, container = scene.markers, scene.container
     paper = markers.side_m * paper_side_in_markers(markers)
     apothem = container.diameter_m / 2.0 + PLAQUE_STANDOFF_M
     if paper > container.height_m or (
@@ -183,7 +181,7 @@ def marker_frames(
     plaque_corner = np.hypot(apothem, paper / 2.0)
     neighbours = paper / 2.0 / np.tan(np.pi / max(markers.on_disc, 3))
     inner_edge = max(plaque_corner, neighbours) + 0.001
-    if markers.on_disc and np.hypot(inner_edge + paper, paper / 2.0) > turntable.disc_diameter_m / 2.0:
+    if markers.on_disc and np.hypot(inner_edge + paper, paper / 2.0) > scene.turntable.disc_diameter_m / 2.0:
         raise InputError(
             f"{markers.on_disc} markers of {markers.side_m:g} m do not fit on the disc around the container; "
             "make markers.side_m smaller or turntable.disc_diameter_m larger."
@@ -201,13 +199,11 @@ def _directions(azimuth: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarra
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
 
 
-def marker_layout(
-    markers: MarkerSettings, container: ContainerSettings, turntable: TurntableSettings
-) -> MarkerLayout:
+def marker_layout(scene: Scene) -> MarkerLayout:
     """The four corners of each marker's black square in OpenCV's order, metres, object frame."""
-    on_container, on_disc = marker_frames(markers, container, turntable)
+    on_container, on_disc = marker_frames(scene)
     return {
-        number: _to_object_frame(UNIT_CORNERS, frame, markers.side_m)
+        number: _to_object_frame(UNIT_CORNERS, frame, scene.markers.side_m) + _offset_m(scene)
         for number, frame in (on_container | on_disc).items()
     }
 

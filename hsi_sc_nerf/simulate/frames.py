@@ -22,7 +22,6 @@ from hsi_sc_nerf.simulate.effects.image import (
     OpticalBlur,
     TexturedBackground,
 )
-from hsi_sc_nerf.simulate.effects.motion import OffCentre
 from hsi_sc_nerf.simulate.light import Light, LightEffect, Lighting, SurfaceLightEffect, colour_spectra, render
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 from hsi_sc_nerf.simulate.render import exact_weights
@@ -65,16 +64,22 @@ class SimulatedFrame(SimulatedCapture):
     Attributes:
         material_weights: fraction of each material in each pixel, summing to 1.
         coverage: fraction of each pixel that the object covers.
-        endmembers: reflectance of the materials at the start of the session at the header's wavelengths.
     """
 
     material_weights: Float[np.ndarray, "lines samples materials"]
     coverage: Float[np.ndarray, "lines samples"]
-    endmembers: Float[np.ndarray, "materials bands"]
 
 
 class Simulation:
     """A scene ready for its captures, which `frame` and `white` simulate in any order and from several threads.
+
+    Attributes:
+        plan: the frames.
+        captures: their names.
+        materials: names of the columns of the frames' material weights.
+        endmembers: reflectance of the materials at the start of the session at the header's wavelengths.
+        object_part: the scanned object, object frame.
+        detector_maps: maps of each read-out effect by its name.
 
     Example:
         >>> simulation = Simulation(load_scene("pear"))
@@ -87,8 +92,6 @@ class Simulation:
         self.scene = scene
         self.plan = assemble.frame_plan(scene)
         self.intrinsics = assemble.intrinsics(scene.camera)
-        off_centre = find_effect(effects, OffCentre)
-        self.offset_m = off_centre.offset_m() if off_centre else np.zeros(3)
         self.lens = find_effect(effects, LensDistortion)
         self._blur = find_effect(effects, OpticalBlur)
         self._rotation = find_effect(effects, ImageRotation)
@@ -97,14 +100,12 @@ class Simulation:
         self._exposures = of_kind(effects, ExposureEffect)
         self._readout = of_kind(effects, ReadoutEffect)
 
-        scanned = assemble.object_part(scene)
-        self.object_part = replace(scanned, mesh=scanned.mesh.moved(self.offset_m))
+        self.object_part = assemble.object_part(scene)
         background = find_effect(effects, TexturedBackground)
         lights = tuple(effect for effect in effects if isinstance(effect, LightEffect))
         self.renderer = assemble.build_renderer(
             scene,
             self.object_part,
-            self.offset_m,
             background.materials if background else (),
             LIGHT_SPACING_M if of_kind(lights, SurfaceLightEffect) else None,
         )
@@ -115,7 +116,7 @@ class Simulation:
             # The pattern replaces the chamber, which is the last material.
             pattern = background.cover(size_px, self.materials, effect_rng(scene.seed, background))
             self._background = pattern - np.eye(len(self.materials))[-1]
-        self._object_materials = [(MATERIALS | scene.materials)[name] for name in scanned.materials]
+        self._object_materials = [(MATERIALS | scene.materials)[name] for name in self.object_part.materials]
         self.camera_to_world = self.plan.camera_to_world
         self.captures = tuple(f"{scene.name}_{i:03d}" for i in range(len(self.camera_to_world)))
         self.wavelengths_nm = detector.band_centres_nm(scene.sensor.bands)
@@ -154,15 +155,8 @@ class Simulation:
         light = Light(light_weights, colour_spectra(rendering.colours, spectra))
         light = self._on_sensor(light, elapsed)
         counts, dark = self._expose(light, number + 1)
-        return SimulatedFrame(
-            counts,
-            dark,
-            light,
-            self._integration_time_ms(of_white=False),
-            weights,
-            rendering.coverage,
-            self.endmembers,
-        )
+        time_ms = self._integration_time_ms(of_white=False)
+        return SimulatedFrame(counts, dark, light, time_ms, weights, rendering.coverage)
 
     def white(self) -> SimulatedCapture:
         """Simulate the capture of the white tarp before the first frame."""

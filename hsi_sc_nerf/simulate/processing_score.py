@@ -45,15 +45,12 @@ class ProcessingScore:
     mask_iou: float
 
 
-def score_processing(
-    dataset: PackedDataset, truth: Truth, bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
-) -> ProcessingScore:
+def score_processing(dataset: PackedDataset, truth: Truth) -> ProcessingScore:
     """Compare a packed dataset with the truth of its session, frame by frame and without alignment.
 
     Args:
         dataset: processed session.
-        truth: truth of the session, in all bands of the dataset.
-        bounds: range to which the calibration clipped reflectance; the truth is clipped to it as well.
+        truth: truth of the session, in all bands of the dataset; it is clipped as reflectance is by default.
 
     Example:
         >>> score = score_processing(open_packed("data"), load_truth("pear-session"))
@@ -69,7 +66,7 @@ def score_processing(
         rotations.append(float(rotation_angle_deg(frame.camera_to_world, pose)))
         positions.append(float(np.linalg.norm(frame.camera_to_world[:3, 3] - pose[:3, 3])))
         measured, valid = unpack(frame.cube())
-        errors = np.clip(truth.reflectance(frame.capture)[..., bands], *bounds) - measured
+        errors = np.clip(truth.reflectance(frame.capture)[..., bands], *paper.REFLECTANCE_BOUNDS) - measured
         squares += float(np.sum(errors**2, where=valid, dtype=float))
         measurements += int(valid.sum())
         values += valid.size
@@ -143,7 +140,5 @@ def score_calibration(
 
 def lamp_output(truth: Truth, capture: str) -> Float[np.ndarray, "bands"]:
     """True illumination in the image centre, which differs between frames by the lamp drift only."""
-    product = np.ones(len(truth.wavelengths_nm))
-    for factor in truth.light(capture).illumination:
-        product = product * factor[factor.shape[0] // 2, factor.shape[1] // 2]
-    return product
+    factors = (factor[factor.shape[0] // 2, factor.shape[1] // 2] for factor in truth.light(capture).illumination)
+    return np.prod([np.ones(len(truth.wavelengths_nm)), *factors], axis=0)

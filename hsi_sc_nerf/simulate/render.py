@@ -140,9 +140,9 @@ class Renderer:
         is_object: which triangles belong to the scanned object.
     """
 
-    def __init__(self, parts: Sequence[Part], chamber: str = "chamber", extra_materials: Sequence[str] = ()) -> None:
+    def __init__(self, parts: Sequence[Part], extra_materials: Sequence[str] = ()) -> None:
         names = dict.fromkeys([name for part in parts for name in part.materials] + list(extra_materials))
-        self.materials = (*names, chamber)
+        self.materials = (*names, "chamber")
         vertices, triangles, weights, is_object, offset = [], [], [], [], 0
         for part in parts:
             vertices.append(part.mesh.vertices)

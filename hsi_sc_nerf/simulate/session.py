@@ -100,7 +100,7 @@ def _write(simulation: Simulation, session_dir: Path, progress: bool) -> None:
     def write_frame(number: int) -> None:
         capture, frame = simulation.captures[number], simulation.frame(number)
         _write_capture(session_dir, capture, frame, simulation)
-        truth.write_pixels(session_dir, capture, frame)
+        truth.write_pixels(session_dir, capture, frame, simulation.endmembers)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         frames = [pool.submit(write_frame, number) for number in range(len(simulation.captures))]

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse
+import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
@@ -116,21 +117,14 @@ def split_at_creases(
         The triangles as indices of points, and the vertex of each point.
     """
     normals = Mesh(vertices, triangles).facet_normals()
-    # Corner 3 t + k is the start of edge k of triangle t. Sorting by edge pairs the two triangles of each edge.
-    corner = np.arange(triangles.size)
-    following = corner - corner % 3 + (corner + 1) % 3
-    start, end = triangles.ravel(), triangles.ravel()[following]
-    edge = np.minimum(start, end).astype(np.int64) * len(vertices) + np.maximum(start, end)
-    order = np.argsort(edge, kind="stable")
-    shared = edge[order[1:]] == edge[order[:-1]]
-    one, other = order[:-1][shared], order[1:][shared]
-    smooth = np.einsum("nk,nk->n", normals[one // 3], normals[other // 3]) >= np.cos(np.deg2rad(crease_deg))
-    one, other = one[smooth], other[smooth]
-    runs_back = start[one] != start[other]
-    same_as_start = np.where(runs_back, following[other], other)
-    same_as_end = np.where(runs_back, other, following[other])
-    rows, columns = np.concatenate([one, following[one]]), np.concatenate([same_as_start, same_as_end])
-    joined = scipy.sparse.coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(corner),) * 2)
+    faces, edges = trimesh.graph.face_adjacency(triangles, return_edges=True)
+    smooth = np.einsum("nk,nk->n", *normals[faces.T]) >= np.cos(np.deg2rad(crease_deg))
+    # Corner 3 t + k is vertex k of triangle t. At both ends of a smooth edge its triangles' corners are one point.
+    one, other = (
+        (3 * face + (triangles[face] == edges[smooth].T[..., None]).argmax(axis=-1)).ravel()
+        for face in faces[smooth].T
+    )
+    joined = scipy.sparse.coo_array((np.ones(len(one), np.int8), (one, other)), shape=(triangles.size,) * 2)
     points, point = connected_components(joined, directed=False)
     vertex = np.empty(points, np.int64)
     vertex[point] = triangles.ravel()

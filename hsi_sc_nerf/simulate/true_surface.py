@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LIFT_M = 1e-5
 """Offset of the origin of a line of sight from the surface."""
 FACET_LIFT_M = 0.0001
-"""The same where the facets of a concave surface must not hide each other."""
+"""Offset by which the facets of a concave surface do not hide each other."""
 
 
 def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:

@@ -153,12 +153,11 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         simulation.captures, simulation.plan.angles_deg.tolist(), simulation.camera_to_world.tolist(), strict=True
     )
     wavelengths_nm, materials = simulation.wavelengths_nm, simulation.materials
-    layout = marker_layout(scene.markers, scene.container, scene.turntable)
     values = {
         "object": scene.name,
         "intrinsics": dataclasses.asdict(simulation.intrinsics),
         "frames": [{"capture": name, "angle_deg": angle, "camera_to_world": c2w} for name, angle, c2w in frames],
-        "marker_layout": {str(number): (c + simulation.offset_m).tolist() for number, c in layout.items()},
+        "marker_layout": {str(number): c.tolist() for number, c in marker_layout(scene).items()},
         "wavelengths_nm": wavelengths_nm.tolist(),
         "materials": list(materials),
         "effects": {effect.name: dataclasses.asdict(effect) for effect in scene.effects},
@@ -180,7 +179,9 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         np.savez_compressed(detector_path(session_dir), **maps)
 
 
-def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None:
+def write_pixels(
+    session_dir: Path, capture: str, frame: SimulatedFrame, endmembers: Float[np.ndarray, "materials bands"]
+) -> None:
     """Write the pixels of one frame.
 
     Weights are multiples of 1 / 2048 and exact in float16. The light is written only if it differs from the product
@@ -194,7 +195,7 @@ def write_pixels(session_dir: Path, capture: str, frame: SimulatedFrame) -> None
     }
     if frame.light.weights is not frame.material_weights:
         arrays["light_weights"] = frame.light.weights
-    if not np.array_equal(frame.light.spectra, frame.endmembers):
+    if not np.array_equal(frame.light.spectra, endmembers):
         arrays["light_spectra"] = frame.light.spectra
     arrays |= {f"illumination_{i}": factor for i, factor in enumerate(frame.light.illumination)}
     np.savez_compressed(path, **arrays)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 
 from hsi_sc_nerf.analysis.change_features import surface_gradients, surface_samples
 from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
 from hsi_sc_nerf.simulate.true_surface import TrueSurface

@@ -1,20 +1,19 @@
 """Whole sessions of known truth through the calibration: what is not saturated is right, and what is, is flagged."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
 
-from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
-from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.processing.frames import FramePaths, pack_frames
+from hsi_sc_nerf.simulate.processing_score import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -34,21 +33,15 @@ NOISE = ["photon_noise", "read_noise", "dark_pattern"]
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """A simulated session, its calibration and what was packed; images as the files hold them."""
+    """A simulated session, its calibration and the folder of its packed frames."""
 
     session: Session
     truth: Truth
     calibration: SessionCalibration
     root: Path
 
-    def frame(self, number):
-        """Reflectance, which of it is measured, and the clipped truth, in the kept bands."""
-        capture = self.session.frames[number].name
-        reflectance, valid = unpack(open_cube(FramePaths.of(self.root, capture).cube).memmap())
-        turns = -self.session.quarter_turns
-        even = replace(self.truth.light(capture), illumination=()).radiance()
-        expected = np.clip(even[..., self.calibration.bands], *paper.REFLECTANCE_BOUNDS)
-        return np.rot90(reflectance, turns), np.rot90(valid, turns), expected
+    def score(self) -> CalibrationScore:
+        return score_calibration(self.session, self.calibration, self.root, self.truth)
 
 
 def calibrated(folder: Path, effects: list[str], config: CalibrationConfig) -> Calibrated:
@@ -70,31 +63,18 @@ def noisy(tmp_path_factory) -> Calibrated:
 
 
 @pytest.mark.slow
-def test_reflectance_is_within_one_percent(odd):
-    errors = []
-    for number in range(len(odd.session.frames)):
-        reflectance, valid, expected = odd.frame(number)
-        errors.append((reflectance - expected)[valid])
-    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.01
-
-
-def middle_of_illumination(truth: Truth, capture: str):
-    product = np.ones(len(truth.wavelengths_nm))
-    for factor in truth.light(capture).illumination:
-        product = product * factor[factor.shape[0] // 2, factor.shape[1] // 2]
-    return product
-
-
-@pytest.mark.slow
-def test_drift_is_recovered(odd, noisy):
+def test_reflectance_drift_and_uncertainty_are_right(odd, noisy):
+    assert odd.score().reflectance_rms < 0.01
+    assert 0.9 < noisy.score().error_over_uncertainty < 1.15
     for session in (odd, noisy):
-        drift = session.calibration.drift
-        assert isinstance(drift, LampDriftEstimate)
         assert session.calibration.drift_corrected
-        # The falloff is the same in all frames: what is left of the illumination's middle is the lamps'.
-        middle = np.stack([middle_of_illumination(session.truth, c.name) for c in session.session.frames])
-        error = drift.factor / (middle / middle[0]) - 1.0
-        assert np.sqrt(np.mean(error**2)) < 0.003
+        assert session.score().drift_rms < 0.003
+
+
+def validity(root: Path, session: Session, capture: Capture):
+    """Which of a packed frame's values are measured, (H, W, bands), turned as the camera recorded them."""
+    valid = unpack(open_cube(FramePaths.of(root, capture.name).cube).memmap())[1]
+    return np.rot90(valid, -session.quarter_turns)
 
 
 @pytest.mark.slow
@@ -106,25 +86,12 @@ def test_saturated_and_dead_values_are_flagged_and_no_others(odd, noisy):
         np.testing.assert_array_equal(np.delete(np.arange(40), bands), np.flatnonzero(dead_bands))
         dead = (maps["dead"] | maps["hot"])[:, bands]
         saturated = 0
-        for number, capture in enumerate(session.session.frames):
-            _, valid, _ = session.frame(number)
+        for capture in session.session.frames:
+            valid = validity(session.root, session.session, capture)
             at_top = (capture.cube.memmap()[..., bands] >= LARGEST_COUNT) & ~dead
             saturated += at_top.sum()
             np.testing.assert_array_equal(~valid, at_top | dead)
         assert saturated > 100
-
-
-@pytest.mark.slow
-def test_errors_are_as_large_as_the_uncertainty_says(noisy):
-    scores = []
-    for number in range(len(noisy.session.frames)):
-        reflectance, valid, expected = noisy.frame(number)
-        # Nothing that is clipped.
-        inside = valid & (expected > 0.1) & (expected < 0.9)
-        deviation = noisy.calibration.uncertainty.standard_deviation(expected)
-        scores.append(((reflectance - expected) / deviation)[inside])
-    spread = np.sqrt(np.mean(np.concatenate(scores) ** 2))
-    assert 0.9 < spread < 1.15
 
 
 def leave_gaps(cube: Cube, gap: float, dtype: str) -> None:
@@ -195,8 +162,7 @@ def test_a_small_saturated_highlight_is_found(tmp_path):
     calibration = calibrate_session(session, CalibrationConfig())
     pack_frames(session, calibration, tmp_path / "data")
     for capture in session.frames:
-        valid = unpack(open_cube(FramePaths.of(tmp_path / "data", capture.name).cube).memmap())[1]
-        flagged = ~np.rot90(valid, -session.quarter_turns)
+        flagged = ~validity(tmp_path / "data", session, capture)
         np.testing.assert_array_equal(flagged, saturated[capture.name][..., calibration.bands])
 
 

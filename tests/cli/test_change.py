@@ -8,6 +8,7 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
+from another_day import CloudErrors, SetDown, cloud_of, fruit_of
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.cli import change
@@ -15,7 +16,6 @@ from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.models import trained_run
-from hsi_sc_nerf.simulate.another_day import CloudErrors, SetDown, cloud_of, fruit_of
 
 NM = np.linspace(400.0, 1000.0, 13)
 DAYS = {

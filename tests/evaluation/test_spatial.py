@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import norm
 
 from hsi_sc_nerf.evaluation.spatial import (
-    SpatialScore,
     Surface,
     ThresholdCurves,
     best_threshold_m,
@@ -32,41 +31,33 @@ def plane(side: int = 41, spacing_m: float = 0.0025, z_m: float = 0.0) -> np.nda
     return np.stack([x.ravel(), y.ravel(), np.full(side * side, z_m)], -1)
 
 
-def as_tuple(score: SpatialScore) -> tuple[float, float, float]:
-    return score.precision, score.recall, score.f_score
+GRID = plane(40)
+HALF = GRID[GRID[:, 0] < 0.0499]
+NOTHING = np.zeros((0, 3))
 
 
-@pytest.mark.parametrize(("offset_m", "percent"), [(0.0, 100), (0.001999, 100), (0.002001, 0), (0.5, 0)])
-def test_a_plane_moved_along_its_normal(offset_m: float, percent: float) -> None:
-    assert as_tuple(precision_recall_f_score(plane(z_m=offset_m), plane(), 0.002)) == (percent,) * 3
-
-
-def test_the_threshold_itself_counts() -> None:
-    assert as_tuple(precision_recall_f_score(np.array([[0.0, 0, 0.5]]), np.zeros((1, 3)), 0.5)) == (100, 100, 100)
-
-
-def test_a_missing_half_costs_recall_only() -> None:
-    reference = plane(40)
-    half = reference[reference[:, 0] < 0.0499]
-    score = precision_recall_f_score(half, reference, 0.002)
-    assert as_tuple(score) == pytest.approx((100, 50, 200 / 3))
-    assert as_tuple(precision_recall_f_score(reference, half, 0.002)) == pytest.approx((50, 100, 200 / 3))
-
-
-def test_outliers_cost_precision_only() -> None:
-    reference = plane(40)
-    cloud = np.concatenate([reference, plane(20, z_m=1.0)])
-    assert as_tuple(precision_recall_f_score(cloud, reference, 0.002)) == pytest.approx((80, 100, 1600 / 18))
-
-
-def test_a_plane_moved_in_itself_loses_its_rim() -> None:
-    shifted = plane(40) + np.array([0.0025 * 4, 0, 0])
-    assert as_tuple(precision_recall_f_score(shifted, plane(40), 0.001)) == pytest.approx((90, 90, 90))
-
-
-def test_an_empty_cloud_scores_nothing() -> None:
-    assert as_tuple(precision_recall_f_score(np.zeros((0, 3)), plane(), 0.002)) == (0, 0, 0)
-    assert as_tuple(precision_recall_f_score(plane(), np.zeros((0, 3)), 0.002)) == (0, 0, 0)
+@pytest.mark.parametrize(
+    ("cloud", "reference", "threshold_m", "precision", "recall"),
+    [
+        pytest.param(plane(), plane(), 0.002, 100, 100, id="itself"),
+        pytest.param(plane(z_m=0.001999), plane(), 0.002, 100, 100, id="just within along its normal"),
+        pytest.param(plane(z_m=0.002001), plane(), 0.002, 0, 0, id="just beyond along its normal"),
+        pytest.param(plane(z_m=0.5), plane(), 0.002, 0, 0, id="far away"),
+        pytest.param(np.array([[0.0, 0, 0.5]]), np.zeros((1, 3)), 0.5, 100, 100, id="the threshold itself counts"),
+        pytest.param(HALF, GRID, 0.002, 100, 50, id="a missing half costs recall only"),
+        pytest.param(GRID, HALF, 0.002, 50, 100, id="a half too many costs precision only"),
+        pytest.param(
+            np.concatenate([GRID, plane(20, z_m=1)]), GRID, 0.002, 80, 100, id="outliers cost precision only"
+        ),
+        pytest.param(GRID + np.array([0.01, 0, 0]), GRID, 0.001, 90, 90, id="moved in itself it loses its rim"),
+        pytest.param(NOTHING, plane(), 0.002, 0, 0, id="an empty cloud"),
+        pytest.param(plane(), NOTHING, 0.002, 0, 0, id="an empty reference"),
+    ],
+)
+def test_scores_of_planes(cloud, reference, threshold_m: float, precision: float, recall: float) -> None:
+    score = precision_recall_f_score(cloud, reference, threshold_m)
+    expected = 2 * precision * recall / (precision + recall) if precision + recall else 0
+    assert (score.precision, score.recall, score.f_score) == pytest.approx((precision, recall, expected))
 
 
 def test_samples_are_even_over_the_area_whatever_the_triangles() -> None:
@@ -152,24 +143,24 @@ def test_points_overstate_the_distance_to_a_surface() -> None:
     assert Surface(sampled).distances_m(above) == pytest.approx(0.005)
 
 
-def test_the_knee_is_where_a_broken_line_breaks() -> None:
-    thresholds = np.linspace(0, 0.01, 101)
-    rising = np.interp(thresholds, [0, 0.003, 0.01], [10, 90, 100])
-    curves = ThresholdCurves(thresholds, rising, rising, rising)
-    assert best_threshold_m(curves) == pytest.approx(0.003)
+def exponential_knee(scale: float) -> float:
+    """Where 1 - exp(-x / scale) over [0, 1] leaves its chord furthest: its slope is the chord's."""
+    return -scale * np.log(scale * (1 - np.exp(-1 / scale)))
 
 
-def test_the_knee_of_an_exponential_rise() -> None:
-    # 1 - exp(-x / s) over [0, 1] leaves its chord furthest where its slope is the chord's.
-    thresholds, scale = np.linspace(0, 1, 10_001), 0.2
-    curve = 1 - np.exp(-thresholds / scale)
-    knee = -scale * np.log(scale * (1 - np.exp(-1 / scale)))
-    assert best_threshold_m(ThresholdCurves(thresholds, curve, curve, curve)) == pytest.approx(knee, abs=1e-4)
+X = np.linspace(0, 1, 10_001)
 
 
-def test_a_flat_curve_has_its_knee_at_the_start() -> None:
-    flat = np.full(5, 100.0)
-    assert best_threshold_m(ThresholdCurves(np.linspace(0, 1, 5), flat, flat, flat)) == 0
+@pytest.mark.parametrize(
+    ("curve", "knee"),
+    [
+        pytest.param(np.interp(X, [0, 0.3, 1], [10, 90, 100]), 0.3, id="a broken line"),
+        pytest.param(1 - np.exp(-X / 0.2), exponential_knee(0.2), id="an exponential rise"),
+        pytest.param(np.full(len(X), 100.0), 0.0, id="a flat curve"),
+    ],
+)
+def test_the_knee_of_a_curve(curve: np.ndarray, knee: float) -> None:
+    assert best_threshold_m(ThresholdCurves(X, curve, curve, curve)) == pytest.approx(knee, abs=1e-4)
 
 
 def test_the_threshold_that_reaches_a_score_does_and_the_next_smaller_one_does_not() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from hsi_sc_nerf.evaluation import band_scores
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 
 H, W, BANDS = 17, 23, 5
@@ -29,47 +28,76 @@ def blob() -> torch.Tensor:
 MASKS = pytest.mark.parametrize("mask", [None, blob()], ids=["full", "masked"])
 
 
-def pixels(image: torch.Tensor, mask: torch.Tensor | None) -> np.ndarray:
-    return image.double().numpy()[np.ones((H, W), bool) if mask is None else mask.numpy()]
+def some_valid() -> torch.Tensor:
+    """A fifth flagged; band 4 wholly, pixel (3, 9) but for one band, pixel (3, 10) wholly."""
+    valid = torch.rand(H, W, BANDS, generator=torch.Generator().manual_seed(5)) > 0.2
+    valid[..., 4] = False
+    valid[3, 9:11] = False
+    valid[3, 9, 2] = True
+    return valid
 
 
+def score_of_windows(
+    x: np.ndarray, y: np.ndarray, valid: np.ndarray, centres: list[tuple[int, int]], reach: int
+) -> float:
+    """Mean SSIM of one band over Gaussian windows of the valid values around each centre."""
+    scores = []
+    for row, column in centres:
+        rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
+        weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
+        weights[(abs(rows - row) > reach) | (abs(columns - column) > reach)] = 0
+        w, a, b = weights[valid], x[valid], y[valid]
+        mean_a, mean_b = np.average(a, weights=w), np.average(b, weights=w)
+        variances = np.average((a - mean_a) ** 2, weights=w) + np.average((b - mean_b) ** 2, weights=w)
+        covariance = np.average((a - mean_a) * (b - mean_b), weights=w)
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        scores.append(luminance * (2 * covariance + 9e-4) / (variances + 9e-4))
+    return float(np.mean(scores))
+
+
+def score_of_pixels(x: np.ndarray, y: np.ndarray) -> float:
+    """SSIM of one band over all its valid values at once."""
+    covariance = np.mean((x - x.mean()) * (y - y.mean()))
+    luminance = (2 * x.mean() * y.mean() + 1e-4) / (x.mean() ** 2 + y.mean() ** 2 + 1e-4)
+    return luminance * (2 * covariance + 9e-4) / (x.var() + y.var() + 9e-4)
+
+
+@pytest.mark.parametrize("valid", [None, some_valid()], ids=["all valid", "some valid"])
 @MASKS
-def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
+def test_metrics_are_the_papers_formulas_over_valid_values(
+    mask: torch.Tensor | None, valid: torch.Tensor | None
+) -> None:
     predicted, target = pair()
-    p, t = pixels(predicted, mask), pixels(target, mask)
-    angles = [math.acos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) for a, b in zip(p, t, strict=True)]
-    mse = np.mean([np.sum((a - b) ** 2) / BANDS for a, b in zip(p, t, strict=True)])
-    roots = [math.sqrt(np.sum((a - b) ** 2) / BANDS) for a, b in zip(p, t, strict=True)]
-    similarity, ratio = [], []
-    for band in range(BANDS):
-        x, y = p[:, band], t[:, band]
-        covariance = np.mean((x - x.mean()) * (y - y.mean()))
-        similarity.append(
-            (2 * x.mean() * y.mean() + 1e-4)
-            * (2 * covariance + 9e-4)
-            / ((x.mean() ** 2 + y.mean() ** 2 + 1e-4) * (x.var() + y.var() + 9e-4))
-        )
-        ratio.append(10 * math.log10(1 / (np.mean((x - y) ** 2) + 1e-10)))
-    found = metrics.spectral_metrics(predicted, target, mask)
-    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
-    assert found["rmse"] == pytest.approx(math.sqrt(mse), rel=1e-5)
-    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
-    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
-    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
-    assert found["rmse_pixel_mean"] < found["rmse"]
-
-
-@MASKS
-def test_windowed_ssim_is_wangs(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    centres = list(zip(*np.nonzero(np.ones((H, W), bool) if mask is None else mask.numpy()), strict=True))
+    chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
+    judged = np.ones((H, W, BANDS), bool) if valid is None else valid.numpy()
     x, y = predicted.double().numpy(), target.double().numpy()
-    everywhere = np.ones((H, W), bool)
-    by_band = [score_of_windows(x[..., b], y[..., b], everywhere, centres, reach=5) for b in range(BANDS)]
-    (found,) = band_scores.windowed_scores(predicted, target, [mask])
-    np.testing.assert_allclose(found.numpy(), by_band, rtol=1e-5)
-    mean = metrics.spectral_metrics(predicted, target, mask)["ssim_windowed"]
-    assert mean == pytest.approx(np.mean(by_band), rel=1e-5)
+    angles, squares, roots = [], [], []
+    for place in zip(*np.nonzero(chosen), strict=True):
+        a, b = x[place][judged[place]], y[place][judged[place]]
+        squares.extend((a - b) ** 2)
+        if len(a) >= 1:
+            roots.append(math.sqrt(np.mean((a - b) ** 2)))
+        if len(a) >= 2:
+            angles.append(math.acos(min(1.0, a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))))
+    similarity, ratio, windowed = [], [], []
+    for band in np.flatnonzero(judged.any((0, 1))):
+        in_band = chosen & judged[..., band]
+        a, b = x[in_band, band], y[in_band, band]
+        similarity.append(score_of_pixels(a, b))
+        ratio.append(-10 * math.log10(np.mean((a - b) ** 2) + 1e-10))
+        centres = list(zip(*np.nonzero(in_band), strict=True))
+        windowed.append(score_of_windows(x[..., band], y[..., band], judged[..., band], centres, reach=5))
+    found = metrics.spectral_metrics(predicted, target, mask, valid)
+    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
+    assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
+    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
+    assert found["rmse_pixel_mean"] < found["rmse"]
+    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
+    assert found["ssim_windowed"] == pytest.approx(np.mean(windowed), rel=1e-5)
+    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
+    if valid is None:
+        by_band = metrics.windowed_scores(predicted, target, [mask])[0]
+        np.testing.assert_allclose(by_band, windowed, rtol=1e-5)
 
 
 def test_closed_forms() -> None:
@@ -159,67 +187,6 @@ def test_pixels_outside_the_mask_may_be_anything() -> None:
     assert all(found[name] == expected[name] for name in found if name != "ssim_windowed")
 
 
-def some_valid() -> torch.Tensor:
-    """A fifth flagged; band 4 wholly, pixel (3, 9) but for one band, pixel (3, 10) wholly."""
-    valid = torch.rand(H, W, BANDS, generator=torch.Generator().manual_seed(5)) > 0.2
-    valid[..., 4] = False
-    valid[3, 9:11] = False
-    valid[3, 9, 2] = True
-    return valid
-
-
-def score_of_windows(
-    x: np.ndarray, y: np.ndarray, valid: np.ndarray, centres: list[tuple[int, int]], reach: int
-) -> float:
-    """Mean SSIM of one band over Gaussian windows of the valid values around each centre."""
-    scores = []
-    for row, column in centres:
-        rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
-        weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 1.5**2))
-        weights[(abs(rows - row) > reach) | (abs(columns - column) > reach)] = 0
-        w, a, b = weights[valid], x[valid], y[valid]
-        mean_a, mean_b = np.average(a, weights=w), np.average(b, weights=w)
-        variances = np.average((a - mean_a) ** 2, weights=w) + np.average((b - mean_b) ** 2, weights=w)
-        covariance = np.average((a - mean_a) * (b - mean_b), weights=w)
-        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
-        scores.append(luminance * (2 * covariance + 9e-4) / (variances + 9e-4))
-    return float(np.mean(scores))
-
-
-@MASKS
-def test_only_valid_values_are_judged(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    valid = some_valid()
-    chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
-    p, t, v = (image.numpy()[chosen] for image in (predicted.double(), target.double(), valid))
-    angles, squares, roots = [], [], []
-    for pixel in range(len(p)):
-        a, b = p[pixel][v[pixel]], t[pixel][v[pixel]]
-        squares.extend((a - b) ** 2)
-        if len(a) >= 1:
-            roots.append(math.sqrt(np.mean((a - b) ** 2)))
-        if len(a) >= 2:
-            angles.append(math.acos(min(1.0, a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))))
-    similarity, ratio, windowed = [], [], []
-    for band in range(BANDS - 1):  # nothing is valid in the last one
-        a, b = p[v[:, band], band], t[v[:, band], band]
-        covariance = np.mean((a - a.mean()) * (b - b.mean()))
-        luminance = (2 * a.mean() * b.mean() + 1e-4) / (a.mean() ** 2 + b.mean() ** 2 + 1e-4)
-        similarity.append(luminance * (2 * covariance + 9e-4) / (a.var() + b.var() + 9e-4))
-        ratio.append(-10 * math.log10(np.mean((a - b) ** 2) + 1e-10))
-        in_band = valid[..., band].numpy()
-        centres = list(zip(*np.nonzero(chosen & in_band), strict=True))
-        images = (image[..., band].double().numpy() for image in (predicted, target))
-        windowed.append(score_of_windows(*images, in_band, centres, reach=5))
-    found = metrics.spectral_metrics(predicted, target, mask, valid)
-    assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
-    assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
-    assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
-    assert found["ssim"] == pytest.approx(np.mean(similarity), rel=1e-5)
-    assert found["ssim_windowed"] == pytest.approx(np.mean(windowed), rel=1e-5)
-    assert found["psnr"] == pytest.approx(np.mean(ratio), rel=1e-5)
-
-
 @MASKS
 def test_everything_valid_changes_nothing(mask: torch.Tensor | None) -> None:
     predicted, target = pair()
@@ -262,12 +229,14 @@ def test_errors_of_valid_values_are_not_hidden() -> None:
     assert np.isnan(list(metrics.spectral_metrics(predicted, target, blob(), valid).values())).all()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["compiled", "tensors"])
-def test_blocks_of_valid_values_change_nothing(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    predicted, target = (image.to(dtype) for image in pair())
-    whole = metrics.spectral_metrics(predicted, target, blob(), some_valid())
-    monkeypatch.setattr(band_scores, "BLOCK_VALUES", 2 * H * W)
-    assert metrics.spectral_metrics(predicted, target, blob(), some_valid()) == pytest.approx(whole, rel=1e-6)
+def test_blocks_and_precision_change_nothing_but_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = pair()
+    whole = metrics.spectral_metrics(*images, blob(), some_valid())
+    assert metrics.spectral_metrics(*(i.double() for i in images), blob(), some_valid()) == pytest.approx(
+        whole, rel=1e-6
+    )
+    monkeypatch.setattr(metrics, "BLOCK_VALUES", 2 * W * BANDS)
+    assert metrics.spectral_metrics(*images, blob(), some_valid()) == pytest.approx(whole, rel=1e-6)
 
 
 @SCORERS
@@ -276,17 +245,6 @@ def test_a_validity_that_does_not_fit_is_refused(score) -> None:
     for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
         with pytest.raises(ValueError, match="the validity of values of shape"):
             score(predicted, target, blob(), valid)
-
-
-@pytest.mark.parametrize("valid", [None, some_valid()], ids=["all", "some"])
-def test_compiled_scores_are_those_of_tensors(valid: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    masks = [blob(), None, torch.zeros(H, W, dtype=torch.bool)]
-    compiled = band_scores.band_scores(predicted, target, masks, valid)
-    for found, mask in zip(compiled, masks, strict=True):
-        (expected,) = band_scores.band_scores(predicted.double(), target.double(), [mask], valid)
-        for score, reference in zip(found, expected, strict=True):
-            torch.testing.assert_close(score, reference, rtol=1e-9, atol=1e-12)
 
 
 def test_regions_are_scored_as_if_alone() -> None:

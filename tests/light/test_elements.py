@@ -65,14 +65,14 @@ def test_the_support_points_outwards_and_has_the_area_of_a_drum_on_a_disc():
 
 def test_pixels_show_points_around_each_element_and_the_support_as_it_is():
     elements, _ = ball_over(0.1, height_m=RADIUS_M)
-    points, normals, shares = shown_points(elements, 0.006, 1e-4)
-    ball, shown = elements.on_object, np.diff(shares.indptr)
-    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    points, normals, weights = shown_points(elements, 0.006, 1e-4)
+    ball, shown = elements.on_object, np.diff(weights.indptr)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     assert np.median(shown[ball]) > 3
-    assert np.linalg.norm(shares @ points - elements.positions, axis=1).max() < 0.006
-    assert np.einsum("nk,nk->n", shares @ normals, elements.normals).min() > 0.9
+    assert np.linalg.norm(weights @ points - elements.positions, axis=1).max() < 0.006
+    assert np.einsum("nk,nk->n", weights @ normals, elements.normals).min() > 0.9
     np.testing.assert_array_equal(shown[~ball], 1)
-    np.testing.assert_allclose((shares @ points)[~ball], elements.positions[~ball])
+    np.testing.assert_allclose((weights @ points)[~ball], elements.positions[~ball])
 
 
 def test_pixels_do_not_show_what_lies_in_a_groove():
@@ -89,9 +89,9 @@ def test_pixels_do_not_show_what_lies_in_a_groove():
     elements = Elements(
         positions, np.tile([0.0, 0.0, 1.0], (50, 1)), np.ones(50, bool), comb, np.zeros(len(comb.triangles), int)
     )
-    points, _, shares = shown_points(elements, 0.006, 1e-5)
+    points, _, weights = shown_points(elements, 0.006, 1e-5)
     on_side = (points[:, 2] > 1e-4) & (points[:, 2] < 0.0039)
-    assert (shares @ on_side.astype(float)).max() < 0.01
+    assert (weights @ on_side.astype(float)).max() < 0.01
 
 
 SIZE, DISTANCE_M, PIXEL_M = 32, 1.0, 0.01

@@ -116,7 +116,7 @@ def pear():
     simulation = Simulation(scene)
     white = simulation.white().counts[96, 96].astype(float) - scene.sensor.dark_level
     reflectance = [(simulation.frame(i).counts - float(scene.sensor.dark_level)) / white for i in range(3)]
-    corners_m = marker_layout(scene.markers, scene.container, scene.turntable)
+    corners_m = marker_layout(scene)
     corners_px = [
         {m: project(c, pose, simulation.intrinsics)[0] for m, c in corners_m.items()}
         for pose in simulation.camera_to_world

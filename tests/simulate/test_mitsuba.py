@@ -1,21 +1,18 @@
 """Our renderer against Mitsuba 3; skipped where that is not installed."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 
+import mitsuba_agreement
+import mitsuba_rendering
+
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.materials import Plain
 from hsi_sc_nerf.simulate.scene import load_scene, override
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import mitsuba_agreement
-import mitsuba_rendering
 
 RAYS = 72  # a multiple of the bands
 REPEATS = 4

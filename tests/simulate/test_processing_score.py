@@ -96,7 +96,6 @@ def test_reflectance_is_compared_with_the_truth_of_its_bands_clipped_likewise(da
 
     honest, clipped = score_processing(dataset, truth), with_cubes(dataset, tmp_path, lit)
     assert score_processing(clipped, bright).reflectance_rmse < 4.0 * honest.reflectance_rmse
-    assert score_processing(clipped, bright, (0.0, 4.0)).reflectance_rmse > 8.0 * honest.reflectance_rmse
 
     kept = [1, 4, 5]
     frames = []

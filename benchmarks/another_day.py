@@ -20,7 +20,7 @@ from hsi_sc_nerf.simulate.true_surface import TrueSurface
 STAND_M = 0.07
 """Height of the container."""
 _SMOOTH_SD = 0.7
-"""Of `smooth_noise`."""
+"""Standard deviation of `smooth_noise`."""
 
 
 @dataclass(frozen=True)

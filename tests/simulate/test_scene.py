@@ -177,12 +177,12 @@ def test_overrides_are_checked_as_well(wrong):
 def test_markers_that_cannot_be_made_are_refused(old, new, sentence):
     scene = parse(GOOD.replace(old, new))
     with pytest.raises(InputError, match=sentence):
-        marker_layout(scene.markers, scene.container, scene.turntable)
+        marker_layout(scene)
 
 
 def test_layout_is_square_planar_distinct_and_faces_outwards():
     scene = load_scene("pear")
-    layout = marker_layout(scene.markers, scene.container, scene.turntable)
+    layout = marker_layout(scene)
     assert sorted(layout) == list(range(14))
     for number, corners in layout.items():
         sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)

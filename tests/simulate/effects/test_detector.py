@@ -12,12 +12,11 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import open_session
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate import assemble, frames
 from hsi_sc_nerf.simulate.effect import effect_rng
 from hsi_sc_nerf.simulate.effects import detector as sensor
 from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
-from hsi_sc_nerf.simulate.effects.image import OpticalBlur, distort, gaussian_kernel, undistort
+from hsi_sc_nerf.simulate.effects.image import gaussian_kernel
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.light import render
 from hsi_sc_nerf.simulate.materials import Measured, endmembers
@@ -142,18 +141,27 @@ def test_dark_pattern_is_the_same_in_all_exposures():
         assert np.abs(added).max() <= 1.0 + 1e-3
 
 
-def test_bad_pixels_are_where_the_maps_say_and_nothing_else_changes():
-    simulation = Simulation(scene(size_px=40, bands=30, bad_pixels={"dead_fraction": 0.01, "hot_fraction": 0.02}))
-    even, maps = quiet(40, 30), simulation.detector_maps["bad_pixels"]
-    dead, hot = maps["dead"], maps["hot"]
-    assert dead.shape == (40, 30)
-    assert (dead.sum(), hot.sum(), (dead & hot).sum()) == (12, 24, 0)
-    for capture, without in ((simulation.white(), even.white()), (simulation.frame(0), even.frame(0))):
-        for cube, reference in ((capture.counts, without.counts), (capture.dark, without.dark)):
-            assert (cube[:, dead] == DARK).all()
-            assert (cube[:, hot] == LARGEST).all()
-            kept = np.broadcast_to(reference, cube.shape)
-            np.testing.assert_array_equal(cube[:, ~dead & ~hot], kept[:, ~dead & ~hot])
+def test_bad_pixels_and_dead_bands_are_where_the_maps_say_and_nothing_else_changes():
+    fractions = {"dead_fraction": 0.01, "hot_fraction": 0.02}
+    even, single = quiet(40, 30), Simulation(scene(size_px=40, bands=30, bad_pixels=fractions))
+    banded = Simulation(scene(size_px=40, bands=30, bad_pixels={**fractions, "dead_bands": 3}))
+    maps, more = (simulation.detector_maps["bad_pixels"] for simulation in (single, banded))
+    assert maps["dead"].shape == (40, 30)
+    assert (maps["dead"].sum(), maps["hot"].sum(), (maps["dead"] & maps["hot"]).sum()) == (12, 24, 0)
+    # Dead bands come on top of the other bad pixels.
+    dead_bands = more["dead"].all(axis=0)
+    assert dead_bands.sum() == 3
+    assert not more["hot"][:, dead_bands].any()
+    for name in ("dead", "hot"):
+        np.testing.assert_array_equal(more[name][:, ~dead_bands], maps[name][:, ~dead_bands])
+    for simulation in (single, banded):
+        dead, hot = (simulation.detector_maps["bad_pixels"][name] for name in ("dead", "hot"))
+        for capture, without in ((simulation.white(), even.white()), (simulation.frame(0), even.frame(0))):
+            for cube, reference in ((capture.counts, without.counts), (capture.dark, without.dark)):
+                assert (cube[:, dead] == DARK).all()
+                assert (cube[:, hot] == LARGEST).all()
+                kept = np.broadcast_to(reference, cube.shape)
+                np.testing.assert_array_equal(cube[:, ~dead & ~hot], kept[:, ~dead & ~hot])
 
 
 @pytest.mark.slow
@@ -216,59 +224,6 @@ def test_tarp_of_its_own_integration_time():
     np.testing.assert_array_equal(white.dark, usual.white().dark)
 
 
-def test_dead_bands_come_on_top_of_the_other_bad_pixels():
-    strengths = {"dead_fraction": 0.05, "hot_fraction": 0.05}
-    without = Simulation(scene(bad_pixels=strengths)).detector_maps["bad_pixels"]
-    changed = Simulation(scene(bad_pixels={**strengths, "dead_bands": 3}))
-    maps = changed.detector_maps["bad_pixels"]
-    dead_bands = maps["dead"].all(axis=0)
-    assert dead_bands.sum() == 3
-    assert not maps["hot"][:, dead_bands].any()
-    for name in ("dead", "hot"):
-        np.testing.assert_array_equal(maps[name][:, ~dead_bands], without[name][:, ~dead_bands])
-    for capture in (changed.white(), changed.frame(0)):
-        assert (capture.counts[..., dead_bands] == DARK).all()
-        assert (capture.dark[..., dead_bands] == DARK).all()
-
-
-# Optics
-
-
-@pytest.mark.parametrize("sigma_px", [0.2, 0.6, 1.7])
-def test_blur_keeps_the_light_and_spreads_it_by_sigma(sigma_px):
-    blur = OpticalBlur(sigma_px)
-    point = np.zeros((61, 61, 1))
-    point[30, 30] = 1.0
-    image = blur.image(point)[..., 0]
-    assert image.sum() == pytest.approx(1.0, abs=1e-12)
-    assert (image >= 0.0).all()
-    offset = np.arange(61) - 30.0
-    assert (image.sum(axis=0) * offset**2).sum() == pytest.approx(sigma_px**2, rel=1e-8)
-    assert (image.sum(axis=1) * offset**2).sum() == pytest.approx(sigma_px**2, rel=1e-8)
-
-
-def test_blur_loses_nothing_at_the_border_and_twice_is_once_wider():
-    light = np.random.default_rng(0).random((12, 17, 3))
-    image = OpticalBlur(2.0).image(light)
-    np.testing.assert_allclose(image.sum(axis=(0, 1)), light.sum(axis=(0, 1)), rtol=1e-12)
-    np.testing.assert_allclose(OpticalBlur(1.2).image(OpticalBlur(1.6).image(light)), image, atol=1e-12)
-    np.testing.assert_allclose(OpticalBlur(3.0).image(np.ones((9, 9, 1))), 1.0, rtol=1e-12)
-
-
-LENS = {"k1": -0.35, "k2": 0.2, "p1": 0.004, "p2": -0.006}
-
-
-def test_distortion_comes_undone():
-    coefficients = tuple(LENS.values())
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 2))
-    np.testing.assert_allclose(undistort(distort(points, coefficients), coefficients), points, atol=1e-9)
-
-
-def test_a_lens_that_folds_the_image_is_refused():
-    with pytest.raises(InputError, match=r"lens_distortion.*fold the image"):
-        Simulation(scene(lens_distortion={"k1": -2.0, "k2": -2.0})).frame(0)
-
-
 # Orientation
 
 
@@ -303,7 +258,7 @@ def test_rotation_leaves_the_detector_where_it_is_and_truth_knows_its_maps(tmp_p
 # Together and off
 
 STRENGTHS = {
-    "lens_distortion": LENS,
+    "lens_distortion": {"k1": -0.35, "k2": 0.2, "p1": 0.004, "p2": -0.006},
     "optical_blur": {"sigma_px": 1.1},
     "image_rotation": {"quarter_turns": 1},
     "spectral_smile": {"shift_nm": 5.0},

@@ -99,7 +99,7 @@ def test_truth_comes_back_whole(small_session):
     # The first camera looks at the axis from above the x axis.
     np.testing.assert_allclose(truth.camera_to_world[0, 1, 3], 0.0, atol=1e-12)
     assert truth.camera_to_world[0, 0, 3] > 0.3
-    layout = marker_layout(scene.markers, scene.container, scene.turntable)
+    layout = marker_layout(scene)
     assert truth.marker_layout.keys() == layout.keys()
     np.testing.assert_allclose(truth.marker_layout[9], layout[9])
     np.testing.assert_allclose(truth.endmembers, endmembers(truth.materials, truth.wavelengths_nm))

@@ -1,4 +1,4 @@
-"""Moments of two images by band, over masks and over Gaussian windows, as compiled loops for float32 images.
+"""Mean squared error and structural similarity of two images by band, as compiled loops over the processor's cores.
 
 A tensor library would write every moment of every window to memory in float64. Here a line of windows is kept, and
 the bands of a pixel, which lie side by side, are worked on at once.
@@ -12,61 +12,52 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
+SSIM_STABILITY = (0.01**2, 0.03**2)
+"""Constants of Wang et al. 2004 (K1 = 0.01, K2 = 0.03) for a dynamic range of 1."""
+SSIM_WINDOW_PX = 11
+SSIM_WINDOW_SIGMA_PX = 1.5
 _BANDS_AT_ONCE = 32
 """Bands whose window sums of a line of pixels are kept at a time: they fit into a processor's cache."""
 
 _compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
-Images = tuple[Float32[np.ndarray, "h w bands"], Float32[np.ndarray, "h w bands"], Bool[np.ndarray, "h w bands"]]
+Images = tuple[Float[np.ndarray, "h w bands"], Float[np.ndarray, "h w bands"], Bool[np.ndarray, "h w bands"]]
 """Predicted, target, and which values of the target count; the last has no pixels where all do."""
+BandScore = Float[np.ndarray, "masks bands"]
 
 
-def moments(images: Images, masks: Bool[np.ndarray, "masks h w"]) -> Float[np.ndarray, "6 masks bands"]:
-    """Moments over the valid pixels of each mask, which are 0 where there are none.
+def moment_scores(
+    images: Images, masks: Bool[np.ndarray, "masks h w"]
+) -> tuple[Int[np.ndarray, "masks bands"], BandScore, BandScore]:
+    """Scores over the valid pixels of each mask as one window.
 
     Returns:
-        Means of predicted and target, their variances, their covariance, mean squared error.
+        Numbers of these pixels, mean squared error (0 without any pixel), and SSIM (1 without any).
     """
-    bands = images[0].shape[2]
-    counts, sums = np.zeros((len(masks), bands), np.int64), np.zeros((6, len(masks), bands))
-
-    def add(kernel: Callable[..., None], *arguments: np.ndarray) -> None:
-        for part_counts, part_sums in _in_parts(kernel, images, masks, *arguments):
-            counts[:] += part_counts
-            sums[:] += part_sums
-
-    add(_add_values)
-    number = np.maximum(counts, 1)
-    sums /= number
-    means = sums[:2].copy()
-    sums[2:] = 0.0
+    means = np.zeros((2, len(masks), images[0].shape[2]))
     # Deviations from the means keep large offsets from cancelling.
-    add(_add_deviations, means)
-    sums[:2] = means
-    sums[2:] /= number
-    return sums
+    for _ in range(2):
+        parts = _in_parts(_add_deviations, images, masks, means)
+        pixels, sums = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+        moments = sums / np.maximum(pixels, 1)
+        means += moments[:2]
+    variance_p, variance_t, covariance, mse = moments[2:]
+    return pixels, mse, _similarity.py_func(*means, variance_p, variance_t, covariance)
 
 
-def window_scores(
-    images: Images,
-    masks: Bool[np.ndarray, "masks h w"],
-    taps: Float[np.ndarray, "window"],
-    stability: tuple[float, float],
-) -> tuple[Int[np.ndarray, "masks bands"], Float[np.ndarray, "masks bands"]]:
-    """Numbers of the valid pixels of each mask, and sums of SSIM over the windows around them.
+def windowed_scores(images: Images, masks: Bool[np.ndarray, "masks h w"]) -> BandScore:
+    """Mean SSIM of the Gaussian windows around the valid pixels of each mask; 1 without any.
 
-    Args:
-        images: see `Images`.
-        masks: centres of windows.
-        taps: weights of a window along a line, of odd length; they are cut at the image's borders.
-        stability: constants of the index.
+    Windows are cut at the image's borders, and values that are not valid are cut out of them.
     """
+    from_middle = np.arange(SSIM_WINDOW_PX) - SSIM_WINDOW_PX // 2
+    taps = np.exp(-0.5 * (from_middle / SSIM_WINDOW_SIGMA_PX) ** 2)
     counts, sums = np.zeros((2, len(masks), images[0].shape[2]))
-    for part_counts, part_sums in _in_parts(_add_windows, images, masks, taps, np.array(stability)):
+    for part_counts, part_sums in _in_parts(_add_windows, images, masks, taps / taps.sum()):
         counts += part_counts
         sums += part_sums[0]
-    return counts.astype(np.int64), sums
+    return np.where(counts > 0, sums / np.maximum(counts, 1), 1.0)
 
 
 def _in_parts(
@@ -89,21 +80,8 @@ def _in_parts(
 
 
 @_compiled
-def _add_values(images, masks, first, last, counts, sums):
-    predicted, target, valid = images
-    for m in range(len(masks)):
-        for y in range(first, last):
-            for x in range(predicted.shape[1]):
-                if masks[m, y, x]:
-                    for b in range(predicted.shape[2]):
-                        if len(valid) == 0 or valid[y, x, b]:
-                            counts[m, b] += 1
-                            sums[0, m, b] += predicted[y, x, b]
-                            sums[1, m, b] += target[y, x, b]
-
-
-@_compiled
 def _add_deviations(images, masks, means, first, last, counts, sums):
+    """Add p, t, p², t², p t and the squared error, where p and t are deviations from the means."""
     predicted, target, valid = images
     for m in range(len(masks)):
         for y in range(first, last):
@@ -116,6 +94,8 @@ def _add_deviations(images, masks, means, first, last, counts, sums):
                             p -= means[0, m, b]
                             t -= means[1, m, b]
                             counts[m, b] += 1
+                            sums[0, m, b] += p
+                            sums[1, m, b] += t
                             sums[2, m, b] += p * p
                             sums[3, m, b] += t * t
                             sums[4, m, b] += p * t
@@ -123,7 +103,7 @@ def _add_deviations(images, masks, means, first, last, counts, sums):
 
 
 @_compiled
-def _add_windows(images, masks, taps, stability, first, last, counts, sums):
+def _add_windows(images, masks, taps, first, last, counts, sums):
     """SSIM over the windows of some lines; the kept sums are those of p, t, p², t², p t and of what is valid."""
     valid = images[2]
     _, width, bands = images[0].shape
@@ -143,7 +123,7 @@ def _add_windows(images, masks, taps, stability, first, last, counts, sums):
                 if not masks[:, y, x].any():
                     continue
                 _sum_across(down, taps, x, some, window)
-                _score(window, some, stability, score)
+                _score(window, some, score)
                 for m in range(len(masks)):
                     if masks[m, y, x]:
                         for k in range(some):
@@ -194,14 +174,20 @@ def _sum_across(down, taps, x, some, window):
 
 
 @_compiled
-def _score(window, some, stability, score):
-    """Wang et al. 2004, Eq. 13, in [-1, 1] even where rounding has bent the moments."""
+def _score(window, some, score):
     for k in range(some):
         total = window[5, k]
         mean_p, mean_t = window[0, k] / total, window[1, k] / total
-        variance_p = max(window[2, k] / total - mean_p * mean_p, 0.0)
-        variance_t = max(window[3, k] / total - mean_t * mean_t, 0.0)
-        bound = np.sqrt(variance_p * variance_t)
-        covariance = min(max(window[4, k] / total - mean_p * mean_t, -bound), bound)
-        luminance = (2.0 * mean_p * mean_t + stability[0]) / (mean_p * mean_p + mean_t * mean_t + stability[0])
-        score[k] = luminance * (2.0 * covariance + stability[1]) / (variance_p + variance_t + stability[1])
+        variance_p, variance_t = window[2, k] / total - mean_p * mean_p, window[3, k] / total - mean_t * mean_t
+        score[k] = _similarity(mean_p, mean_t, variance_p, variance_t, window[4, k] / total - mean_p * mean_t)
+
+
+@_compiled
+def _similarity(mean_p, mean_t, variance_p, variance_t, covariance):
+    """SSIM (Wang et al. 2004, Eq. 13), in [-1, 1] even where rounding has bent the moments."""
+    variance_p, variance_t = np.maximum(variance_p, 0.0), np.maximum(variance_t, 0.0)
+    bound = np.sqrt(variance_p * variance_t)
+    covariance = np.minimum(np.maximum(covariance, -bound), bound)
+    c1, c2 = SSIM_STABILITY
+    luminance = (2.0 * mean_p * mean_t + c1) / (mean_p * mean_p + mean_t * mean_t + c1)
+    return luminance * (2.0 * covariance + c2) / (variance_p + variance_t + c2)
