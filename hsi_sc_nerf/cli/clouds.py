@@ -110,8 +110,8 @@ class TraitsCommand:
     """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
     --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
     calibration: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A regression that was fitted elsewhere, to map and to average (docs/how-to/calibrations.md): a table (CSV) of
-    coefficients, or one that names an ONNX model. May be repeated."""
+    """A regression or a classifier that was fitted elsewhere, for a map with means or areas
+    (docs/how-to/calibrations.md): a table (CSV) of coefficients, or one that names an ONNX model. May be repeated."""
     components: int = between(0, math.inf, default=0)
     """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
 
