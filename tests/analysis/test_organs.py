@@ -91,7 +91,9 @@ def test_no_organ_is_invented(shape, coloured):
     rng = np.random.default_rng(1)
     points_m = ball(8000, rng) if shape == "ball" else rod(0.16, 0.02, 8000, rng)
     height = (points_m[:, 2] - points_m[:, 2].min()) / np.ptp(points_m[:, 2])
-    part = {"fading": height, "one side": points_m[:, 0] > 0.01, "rim": height < 0.03}.get(coloured, 0.0 * height)
+    # Pixels at the lower edge are mixed with what the object stands on, the more the lower they lie.
+    rim = np.clip(0.7 - height / 0.06, 0.0, 1.0)
+    part = {"fading": height, "one side": points_m[:, 0] > 0.01, "rim": rim}.get(coloured, 0.0 * height)
     spectra = SKIN + part[:, None] * (GREEN - SKIN)
     if coloured == "in shadow":
         spectra = spectra * np.where(height < 0.2, 0.3, 1.0)[:, None]
