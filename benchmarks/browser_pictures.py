@@ -1,12 +1,14 @@
 """The documentation's pictures of pages in a browser: a run's report and the viewer, as a user has them.
 
     uv run python benchmarks/browser_pictures.py RUN --pictures docs/images
+    uv run python benchmarks/browser_pictures.py RUN --no-viewer --views 2  # the report alone, sooner
 
 Needs playwright and Chromium. RUN is the folder of a trained run of an apple or a pear, with its dataset in place.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import subprocess
@@ -26,8 +28,10 @@ from headless_browser import launch
 from hsi_sc_nerf.report.build import ReportSources, write_report
 
 REPORT_PX, VIEWER_PX = (1200, 1300), (1100, 900)
-ON_THE_OBJECT = ((0.45, 0.55), (0.88, 0.55))
-"""Points of the report's drawing that are clicked, as fractions of its width and height."""
+REGIONS = {"shaded side": (0.32, 0.5, 0.09), "lit side": (0.66, 0.62, 0.09)}
+"""Circles that are drawn in the report: centre and radius as fractions of the drawing's width and height."""
+ON_THE_OBJECT = (0.5, 0.45)
+"""Point of the report's drawing that is clicked, likewise."""
 CLICKED_PX = (390, 330)
 """Point of the viewer that is clicked."""
 FIRST_PICTURE_S = 300
@@ -45,6 +49,10 @@ class BrowserPictures:
     """Point cloud of the run; without it, points are sampled from the model."""
     pictures: Path = Path("docs/images")
     """Folder of the pictures."""
+    viewer: bool = True
+    """Whether to take that of the viewer as well."""
+    views: int | None = None
+    """Held-out views that the report renders. Default: all."""
 
     def main(self) -> None:
         """Write the report, start the viewer, and take a picture of each."""
@@ -52,8 +60,10 @@ class BrowserPictures:
 
         with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
             chromium, report = launch(playwright), Path(folder) / "report.html"
-            write_report(self.run, report, ReportSources(self.cloud))
+            write_report(self.run, report, ReportSources(self.cloud, views=self.views))
             self._report(chromium, report)
+            if not self.viewer:
+                return
             with viewer(self.run / "config.yml") as address:
                 self._viewer(chromium, address)
 
@@ -62,9 +72,24 @@ class BrowserPictures:
         page.goto(report.as_uri())
         canvas = page.locator("#cloud[data-state=ready] canvas")
         canvas.scroll_into_view_if_needed()
-        for x, y in ON_THE_OBJECT:
-            box = canvas.bounding_box()
-            page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        box = canvas.bounding_box()
+
+        def at(x: float, y: float) -> tuple[float, float]:
+            return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+        page.mouse.click(*at(*ON_THE_OBJECT))
+        page.check("input[name=drawing]")
+        for name, (x, y, radius) in REGIONS.items():
+            turns = [2.0 * math.pi * step / 36 for step in range(37)]
+            places = [at(x + radius * math.cos(turn), y + radius * math.sin(turn)) for turn in turns]
+            page.mouse.move(*places[0])
+            page.mouse.down()
+            for place in places:
+                page.mouse.move(*place)
+            page.mouse.up()
+            page.locator(".regions input:not([type])").last.fill(name)
+            page.keyboard.press("Tab")
+        page.uncheck("input[name=drawing]")
         page.evaluate("scrollTo(0, 0)")
         page.screenshot(path=self.pictures / "report.png")
 
