@@ -7,6 +7,7 @@ import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain, read_calibration
 from hsi_sc_nerf.analysis.class_maps import class_areas, class_map
+from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_content, trait_tables
 from hsi_sc_nerf.analysis.size import Size, size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
@@ -148,6 +149,20 @@ def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
         [region, "ripe", label] for region in ("whole surface", "side") for label in ("unripe", "ripe", "outside")
     ]
     assert all("±" in row[3] for row in rows if row[2] != "outside")
+
+
+def test_what_has_no_value_is_striped_in_pictures_and_the_rest_as_it_was():
+    """In the colours of no map; both where it is unknown and nowhere else."""
+    views, colours = SideViews(MESH), np.full((len(MESH.vertices), 3), [0.1, 0.5, 0.2])
+    lower = MESH.vertices[:, 2] < 0.02
+    for plain, striped in zip(views.on_white(colours), views.on_white(colours, lower), strict=True):
+        height = plain.shape[0]
+        upper_half, lower_half = slice(0, int(0.48 * height)), slice(int(0.55 * height), height)
+        np.testing.assert_array_equal(plain[upper_half], striped[upper_half])
+        on = np.abs(plain[lower_half] - [0.1, 0.5, 0.2]).max(axis=-1) < 1e-6
+        greys = striped[lower_half][on]
+        assert (greys == greys[:, :1]).all()
+        assert 0.3 < (greys[:, 0] < 0.5).mean() < 0.7
 
 
 def test_two_maps_of_one_name_are_refused():
