@@ -62,6 +62,8 @@ class OrganProposals:
 
     points: int = 50_000
     """Of each cloud, before what no camera sees is left out."""
+    errors: tuple[str, ...] = tuple(ERRORS)
+    """Which errors the clouds have."""
     trained: tuple[Path, ...] = ()
     """Folders that `hsi-sc-nerf demo` wrote, whose rows are added."""
     results: Path = RESULTS
@@ -75,7 +77,7 @@ class OrganProposals:
             _draw(self.picture, [self._simulated(name, CloudErrors(), 1)[0] for name in ORGANS if ORGANS[name]])
             return
         rows = []
-        for name, errors in track([(name, errors) for name in ORGANS for errors in ERRORS], "Proposing"):
+        for name, errors in track([(name, errors) for name in ORGANS for errors in self.errors], "Proposing"):
             cases = [self._simulated(name, ERRORS[errors], seed) for seed in SEEDS]
             rows += _rows(name, errors, cases)
         for folder in self.trained:
