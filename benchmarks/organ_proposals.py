@@ -62,8 +62,10 @@ class OrganProposals:
 
     points: int = 50_000
     """Of each cloud, before what no camera sees is left out."""
+    objects: tuple[str, ...] = tuple(ORGANS)
+    """Which objects are measured."""
     errors: tuple[str, ...] = tuple(ERRORS)
-    """Which errors the clouds have."""
+    """Which errors their clouds have."""
     trained: tuple[Path, ...] = ()
     """Folders that `hsi-sc-nerf demo` wrote, whose rows are added."""
     results: Path = RESULTS
@@ -76,15 +78,17 @@ class OrganProposals:
         if self.picture is not None:
             _draw(self.picture, [self._simulated(name, CloudErrors(), 1)[0] for name in ORGANS if ORGANS[name]])
             return
-        rows = []
-        for name, errors in track([(name, errors) for name in ORGANS for errors in self.errors], "Proposing"):
-            cases = [self._simulated(name, ERRORS[errors], seed) for seed in SEEDS]
-            rows += _rows(name, errors, cases)
+        for errors, name in track([(errors, name) for errors in self.errors for name in self.objects], "Proposing"):
+            self._write(name, errors, [self._simulated(name, ERRORS[errors], seed) for seed in SEEDS])
         for folder in self.trained:
             truth = load_truth(folder / "session")
             case = read_spectral_ply(folder / "point_cloud.ply"), TrueSurface.of(truth)
-            rows += _rows(truth.object, f"trained on {truth.intrinsics.w} px", [case])
-        write_results("organ_proposals", COLUMNS, rows, seed="11 to 13", folder=self.results)
+            self._write(truth.object, f"trained on {truth.intrinsics.w} px", [case])
+
+    def _write(self, name: str, errors: str, cases: list[tuple[SpectralCloud, TrueSurface]]) -> None:
+        """As soon as an object is measured; what stops later loses nothing."""
+        rows = _rows(name, errors, cases)
+        write_results("organ_proposals", COLUMNS, rows, keys=3, seed="11 to 13", folder=self.results)
 
     def _simulated(self, name: str, errors: CloudErrors, seed: int) -> tuple[SpectralCloud, TrueSurface]:
         part = object_part(replace(load_scene(name.split()[0]), seed=seed))
