@@ -1,7 +1,7 @@
 """The documentation's pictures of pages in a browser: a run's report and the viewer, as a user has them.
 
     uv run python benchmarks/browser_pictures.py RUN --pictures docs/images
-    uv run python benchmarks/browser_pictures.py RUN --no-viewer --views 2  # the report alone, sooner
+    uv run python benchmarks/browser_pictures.py RUN --cloud point_cloud.ply --only-object  # that card of the report
 
 Needs playwright and Chromium. RUN is the folder of a trained run of an apple or a pear, with its dataset in place.
 """
@@ -25,9 +25,12 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from headless_browser import launch
 
-from hsi_sc_nerf.report.build import ReportSources, write_report
+from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS
+from hsi_sc_nerf.export.cloud import read_spectral_ply
+from hsi_sc_nerf.report.build import ReportSources, object_section, write_report
+from hsi_sc_nerf.report.page import html_page
 
-REPORT_PX, VIEWER_PX = (1200, 1300), (1100, 900)
+REPORT_PX, VIEWER_PX, PHONE_PX = (1200, 1300), (1100, 900), (390, 844)
 REGIONS = {"shaded side": (0.32, 0.5, 0.09), "lit side": (0.66, 0.62, 0.09)}
 """Circles that are drawn in the report: centre and radius as fractions of the drawing's width and height."""
 ON_THE_OBJECT = (0.5, 0.45)
@@ -49,10 +52,9 @@ class BrowserPictures:
     """Point cloud of the run; without it, points are sampled from the model."""
     pictures: Path = Path("docs/images")
     """Folder of the pictures."""
-    viewer: bool = True
-    """Whether to take that of the viewer as well."""
-    views: int | None = None
-    """Held-out views that the report renders. Default: all."""
+    only_object: bool = False
+    """Take only the report's card of the object, of --cloud, for which nothing is rendered; in dark mode and at a
+    phone's width as well."""
 
     def main(self) -> None:
         """Write the report, start the viewer, and take a picture of each."""
@@ -60,10 +62,13 @@ class BrowserPictures:
 
         with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
             chromium, report = launch(playwright), Path(folder) / "report.html"
-            write_report(self.run, report, ReportSources(self.cloud, views=self.views))
-            self._report(chromium, report)
-            if not self.viewer:
+            if self.only_object and self.cloud is not None:
+                card = object_section(read_spectral_ply(self.cloud), PAGE_POINTS)
+                report.write_text(html_page(self.cloud.stem, "", {}, [card]), encoding="utf-8")
+                self._report(chromium, report)
                 return
+            write_report(self.run, report, ReportSources(self.cloud))
+            self._report(chromium, report)
             with viewer(self.run / "config.yml") as address:
                 self._viewer(chromium, address)
 
@@ -92,6 +97,11 @@ class BrowserPictures:
         page.uncheck("input[name=drawing]")
         page.evaluate("scrollTo(0, 0)")
         page.screenshot(path=self.pictures / "report.png")
+        if self.only_object:
+            page.emulate_media(color_scheme="dark")
+            page.screenshot(path=self.pictures / "report_dark.png")
+            page.set_viewport_size({"width": PHONE_PX[0], "height": PHONE_PX[1]})
+            page.screenshot(path=self.pictures / "report_phone.png", full_page=True)
 
     def _viewer(self, chromium: Any, address: str) -> None:
         from playwright.sync_api import expect

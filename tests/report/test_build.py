@@ -99,7 +99,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(run):
-    write_report(run, run / "report.html", ReportSources())
+    write_report(run, run / "report.html", ReportSources(indices=("NDVI", "own = R550 / R670")))
     return run / "report.html"
 
 
@@ -138,6 +138,7 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report, tmp_path_
     assert "<img src=x" not in text
     assert text.count("{{ 7 * 7 }}") > 5
     assert len(page.all("script")) == 2
+    assert '"name": "own", "tells": "R550 / R670: own formula"' in text
     for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229.0 ± 1.0", "250.0 ± 2.0", "cm²", "mL"):
         assert shown in text
     assert "run <code>ns-train" in text  # it has no log
@@ -191,6 +192,8 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no JSON object"),
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
+        (ReportSources(indices=("own = R1240",)), "1240 nm"),
+        (ReportSources(calibrations=(run / "no.csv",)), r"no\.csv: is no table of a calibration"),
     ):
         with pytest.raises(InputError, match=sentence):
             write_report(run, tmp_path / "report.html", sources)
