@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -37,7 +37,7 @@ _SMALL = 0.1
 _PLACES, _BEST_PLACES = 250, 12
 """Places at the sides that are tried, 9 mm apart on an apple, and how many of them are then moved."""
 _LOWEST, _LEAST_EVENNESS = 0.01, 0.8
-"""A part begins at the lower edge if it has some of this fraction of the points, the lowest ones. The contrast of its
+"""A part begins at the lower edge if it has some of the lowest points, this fraction of them. The contrast of its
 upper third to the rest, over that of its lower third: near 1 for an organ, 0.6 where contrast falls to 0 evenly."""
 _STANDS_OFF = 0.7
 """Distance of a part's farthest point from the rest, over its length: 1 for a leaf, 0.5 for a spot."""
@@ -75,15 +75,16 @@ def propose_organs(
     # Spectra without their brightness, in as few coordinates as they support.
     shapes = unit_spectra(spectra[near].mean(axis=1, dtype=float))
     surface = _Surface(points_m, shapes @ find_subspace(shapes[:: max(1, len(shapes) // _SAMPLE)]).basis, near)
-    for search in (partial(_part_at_end, True), partial(_part_at_end, False), _part_at_side):
+    for search in _SEARCHES:
         organs = 0
         for _ in range(_MOST_SEARCHES):
             if organs == _MOST_PARTS or (found := search(surface, rest)) is None:
                 break
             name, part, edge = found
-            rest = rest & ~part
-            if edge is not None and _is_mixed_with_support(part, edge, surface):
+            if edge is not None and _is_mixed_with_support(part, edge, surface, rest):
+                rest = rest & (points_m[:, 2] > points_m[part, 2].max())  # around the object
                 continue
+            rest = rest & ~part
             number, organs = sum(other.startswith("part") for other in named) + 1, organs + 1
             named[f"part {number}" if name is None or name in named else name] = part
     body = ~np.any([*named.values()], axis=0) if named else np.ones(len(points_m), bool)
@@ -155,7 +156,7 @@ def _part_at_side(surface: _Surface, rest: Bool[np.ndarray, "n"]) -> _Part | Non
     part = _largest_piece(beside(edge, features, rest), near)
     if edge.separation < _LEAST_SEPARATION or not LEAST_POINTS <= part.sum() <= _SMALL * len(part):
         return None
-    if not _stands_off(points_m, part, rest):
+    if not _stands_off(points_m, part):
         return None, part, edge
     return STEM if _is_slender(points_m[part]) else LEAF, part, edge
 
@@ -169,13 +170,15 @@ def _spread(points_m: Float[np.ndarray, "n 3"], count: int) -> list[int]:
     return chosen
 
 
-def _is_mixed_with_support(part: Bool[np.ndarray, "n"], edge: Edge, surface: _Surface) -> bool:
+def _is_mixed_with_support(
+    part: Bool[np.ndarray, "n"], edge: Edge, surface: _Surface, rest: Bool[np.ndarray, "n"]
+) -> bool:
     """Whether a part at the lower edge is no organ, but pixels that are mixed with what the object stands on.
 
     Mixed pixels hold less of it the higher they lie; the spectra of an organ do not change towards its edge.
     """
     height = surface.points_m[:, 2]
-    if height[part].min() > np.quantile(height, _LOWEST):
+    if height[part].min() > np.quantile(height[rest], _LOWEST):
         return False
     # 0 on the ring outside, 1 on that inside.
     contrast = (surface.features[part] @ edge.direction - edge.level) / edge.separation**2 + 0.5
@@ -184,14 +187,21 @@ def _is_mixed_with_support(part: Bool[np.ndarray, "n"], edge: Edge, surface: _Su
     return bool(upper < _LEAST_EVENNESS * lower)
 
 
-def _stands_off(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"], rest: Bool[np.ndarray, "n"]) -> bool:
+def _stands_off(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"]) -> bool:
     """Whether a part is fixed at one of its ends: its farthest point is as far from the rest as it is long.
 
     The middle of a spot is half as far from the rest.
     """
-    own, others = points_m[part], points_m[rest & ~part]
+    own, others = points_m[part], points_m[~part]
     length_m = 2.0 * np.linalg.norm(own - own.mean(axis=0), axis=1).max()
-    return bool(len(others) and cKDTree(others).query(own)[0].max() > _STANDS_OFF * length_m)
+    return bool(cKDTree(others).query(own)[0].max() > _STANDS_OFF * length_m)
+
+
+_SEARCHES: tuple[Callable[[_Surface, Bool[np.ndarray, "n"]], _Part | None], ...] = (
+    partial(_part_at_end, True),
+    partial(_part_at_end, False),
+    _part_at_side,
+)
 
 
 def _distances(
