@@ -31,9 +31,9 @@ from hsi_sc_nerf.report.build import ReportSources, object_section, write_report
 from hsi_sc_nerf.report.page import html_page
 
 REPORT_PX, VIEWER_PX, PHONE_PX = (1200, 1300), (1100, 900), (390, 844)
-REGIONS = {"shaded side": (0.32, 0.5, 0.09), "lit side": (0.66, 0.62, 0.09)}
+REGIONS = {"bruise": (0.415, 0.565, 0.1), "skin": (0.66, 0.62, 0.09)}
 """Circles that are drawn in the report: centre and radius as fractions of the drawing's width and height."""
-ON_THE_OBJECT = (0.5, 0.45)
+ON_THE_OBJECT = (0.5, 0.33)
 """Point of the report's drawing that is clicked, likewise."""
 CLICKED_PX = (390, 330)
 """Point of the viewer that is clicked."""
@@ -64,7 +64,7 @@ class BrowserPictures:
             chromium, report = launch(playwright), Path(folder) / "report.html"
             if self.only_object and self.cloud is not None:
                 card = object_section(read_spectral_ply(self.cloud), PAGE_POINTS)
-                report.write_text(html_page(self.cloud.stem, "", {}, [card]), encoding="utf-8")
+                report.write_text(html_page("The report", "", {}, [card]), encoding="utf-8")
                 self._report(chromium, report)
                 return
             write_report(self.run, report, ReportSources(self.cloud))
