@@ -96,7 +96,7 @@ class OrganProposals:
             part = _upside_down(part)
         spectra = endmembers([STEM if one == CALYX else one for one in part.materials], NM)
         true = TrueSurface(part.materials, part.mesh, part.weights, spectra, NM)
-        cloud = cloud_of(true, SetDown(), errors, self.points, seed)
+        cloud = cloud_of(true, SetDown(keeps_stem=name != UPSIDE_DOWN), errors, self.points, seed)
         placed = set_down(SetDown(), true.mesh.vertices)(true.mesh.vertices)
         return cloud, replace(true, mesh=Mesh(placed, true.mesh.triangles))
 
@@ -106,9 +106,6 @@ def _upside_down(apple: Part) -> Part:
     low, high = apple.mesh.vertices[:, 2].min(), apple.mesh.vertices[:, 2].max()
     vertices = apple.mesh.vertices * [1.0, -1.0, -1.0] + [0.0, 0.0, low + high]
     weights = np.column_stack([apple.weights, np.zeros(len(vertices))])
-    stem, skin = apple.materials.index(STEM), 0
-    weights[:, skin] += weights[:, stem]
-    weights[:, stem] = 0.0
     aside_m = np.linalg.norm(vertices[:, :2], axis=1)
     weights[(aside_m < CALYX_RADIUS_M) & (vertices[:, 2] > (low + high) / 2.0)] = np.eye(weights.shape[1])[-1]
     return replace(
@@ -148,7 +145,7 @@ def _draw(path: Path, clouds: list[SpectralCloud]) -> None:
             axes.scatter(x_mm, z_mm, s=0.6, c=colour, linewidths=0.0, rasterized=True)
             axes.plot([], [], "o", c=colour, label=f"{region.name}, {region.chosen.sum():,} points")
         axes.set(aspect="equal", xlabel="x (mm)", ylabel="z (mm)")
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), fontsize=7, frameon=False)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=7, frameon=False)
     save_figure(figure, path)
 
 
