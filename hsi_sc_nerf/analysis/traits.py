@@ -193,7 +193,7 @@ def analyse(
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
-    every = [*maps, *class_maps]
+    every: list[SurfaceMap | ClassMap] = [*maps, *class_maps]
     for number, one in enumerate(every):
         if any(one.name == other.name or one.column == other.column for other in every[:number]):
             raise InputError(f"two indices or calibrations are named {one.name}; give each a name of its own.")
