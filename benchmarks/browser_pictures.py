@@ -1,12 +1,14 @@
 """The documentation's pictures of pages in a browser: a run's report and the viewer, as a user has them.
 
     uv run python benchmarks/browser_pictures.py RUN --pictures docs/images
+    uv run python benchmarks/browser_pictures.py RUN --cloud point_cloud.ply --only-object  # that card of the report
 
 Needs playwright and Chromium. RUN is the folder of a trained run of an apple or a pear, with its dataset in place.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import subprocess
@@ -23,11 +25,16 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from headless_browser import launch
 
-from hsi_sc_nerf.report.build import ReportSources, write_report
+from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS
+from hsi_sc_nerf.export.cloud import read_spectral_ply
+from hsi_sc_nerf.report.build import ReportSources, object_section, write_report
+from hsi_sc_nerf.report.page import html_page
 
-REPORT_PX, VIEWER_PX = (1200, 1300), (1100, 900)
-ON_THE_OBJECT = ((0.45, 0.55), (0.88, 0.55))
-"""Points of the report's drawing that are clicked, as fractions of its width and height."""
+REPORT_PX, VIEWER_PX, PHONE_PX = (1200, 1300), (1100, 900), (390, 844)
+REGIONS = {"bruise": (0.415, 0.565, 0.1), "skin": (0.66, 0.62, 0.09)}
+"""Circles that are drawn in the report: centre and radius as fractions of the drawing's width and height."""
+ON_THE_OBJECT = (0.5, 0.33)
+"""Point of the report's drawing that is clicked, likewise."""
 CLICKED_PX = (390, 330)
 """Point of the viewer that is clicked."""
 FIRST_PICTURE_S = 300
@@ -45,6 +52,9 @@ class BrowserPictures:
     """Point cloud of the run; without it, points are sampled from the model."""
     pictures: Path = Path("docs/images")
     """Folder of the pictures."""
+    only_object: bool = False
+    """Take only the report's card of the object, of --cloud, for which nothing is rendered; in dark mode and at a
+    phone's width as well."""
 
     def main(self) -> None:
         """Write the report, start the viewer, and take a picture of each."""
@@ -52,6 +62,11 @@ class BrowserPictures:
 
         with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
             chromium, report = launch(playwright), Path(folder) / "report.html"
+            if self.only_object and self.cloud is not None:
+                card = object_section(read_spectral_ply(self.cloud), PAGE_POINTS)
+                report.write_text(html_page("The report", "", {}, [card]), encoding="utf-8")
+                self._report(chromium, report)
+                return
             write_report(self.run, report, ReportSources(self.cloud))
             self._report(chromium, report)
             with viewer(self.run / "config.yml") as address:
@@ -62,11 +77,31 @@ class BrowserPictures:
         page.goto(report.as_uri())
         canvas = page.locator("#cloud[data-state=ready] canvas")
         canvas.scroll_into_view_if_needed()
-        for x, y in ON_THE_OBJECT:
-            box = canvas.bounding_box()
-            page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        box = canvas.bounding_box()
+
+        def at(x: float, y: float) -> tuple[float, float]:
+            return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+        page.mouse.click(*at(*ON_THE_OBJECT))
+        page.check("input[name=drawing]")
+        for name, (x, y, radius) in REGIONS.items():
+            turns = [2.0 * math.pi * step / 36 for step in range(37)]
+            places = [at(x + radius * math.cos(turn), y + radius * math.sin(turn)) for turn in turns]
+            page.mouse.move(*places[0])
+            page.mouse.down()
+            for place in places:
+                page.mouse.move(*place)
+            page.mouse.up()
+            page.locator(".regions input:not([type])").last.fill(name)
+            page.keyboard.press("Tab")
+        page.uncheck("input[name=drawing]")
         page.evaluate("scrollTo(0, 0)")
         page.screenshot(path=self.pictures / "report.png")
+        if self.only_object:
+            page.emulate_media(color_scheme="dark")
+            page.screenshot(path=self.pictures / "report_dark.png")
+            page.set_viewport_size({"width": PHONE_PX[0], "height": PHONE_PX[1]})
+            page.screenshot(path=self.pictures / "report_phone.png", full_page=True)
 
     def _viewer(self, chromium: Any, address: str) -> None:
         from playwright.sync_api import expect

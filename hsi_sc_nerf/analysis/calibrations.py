@@ -1,6 +1,6 @@
-"""Calibrations: regressions that were fitted elsewhere, read from a table or an ONNX model and applied to a surface.
+"""Calibrations that were fitted elsewhere: regressions and classifiers, applied to a surface.
 
-The table is described in docs/how-to/calibrations.md.
+They are read from a table, which may name an ONNX model. It is described in docs/how-to/calibrations.md.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.preprocessing import Step, preprocessed, read_steps
@@ -23,7 +23,7 @@ from hsi_sc_nerf.spectra import nearest_bands
 
 _KEYS = {
     *("name", "unit", "preprocessing", "intercept", "error"),
-    *("t2_limit", "q_limit", "score_variances", "model", "column"),
+    *("t2_limit", "q_limit", "score_variances", "model", "column", "classes"),
 }
 _SAME_BAND_NM = 0.05
 """Tables round wavelengths."""
@@ -64,7 +64,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A regression on spectra.
+    """A regression on spectra, or a classifier of them.
 
     Attributes:
         name: of what it tells.
@@ -74,8 +74,9 @@ class Calibration:
         steps: of the pre-processing.
         used: bands that the model takes after it.
         reference: spectrum of the scatter correction.
-        predict: the model, from pre-processed spectra.
+        predict: the model, from pre-processed spectra; of a classifier the probability of each class.
         domain: what it was fitted on; None if that is not known.
+        classes: of a classifier, in the order of its probabilities; empty for a regression.
     """
 
     name: str
@@ -85,31 +86,51 @@ class Calibration:
     steps: tuple[Step, ...]
     used: Bool[np.ndarray, "bands"]
     reference: Float[np.ndarray, "bands"]
-    predict: Callable[[Float[np.ndarray, "n used"]], Float[np.ndarray, "n"]]
+    predict: Callable[[Float[np.ndarray, "n used"]], Float[np.ndarray, "n outputs"]]
     domain: Domain | None = None
+    classes: tuple[str, ...] = ()
 
-    def values(self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False) -> Float[np.ndarray, "n"]:
-        """Predictions of spectra at its wavelengths; NaN where there is none.
+    def predictions(
+        self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False
+    ) -> Float[np.ndarray, "n outputs"]:
+        """What the model says of spectra at its wavelengths: one number, or the probability of each class.
+
+        NaN where it says nothing.
 
         Args:
             spectra: reflectance.
-            only_inside: none outside the domain either.
+            only_inside: nothing outside the domain either.
         """
-        values = np.full(len(spectra), np.nan)
+        found = np.full((len(spectra), max(1, len(self.classes))), np.nan)
         for start in range(0, len(spectra), _CHUNK_SPECTRA):
             chunk = preprocessed(spectra[start : start + _CHUNK_SPECTRA], self.steps, self.used, self.reference)
             known = np.isfinite(chunk).all(axis=1)
             if only_inside and self.domain is not None:
                 known[known] = self.domain.holds(chunk[known])
             if known.any():
-                values[start + np.flatnonzero(known)] = self.predict(chunk[known])
-        return values
+                found[start + np.flatnonzero(known)] = self.predict(chunk[known])
+        return found
+
+    def values(self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False) -> Float[np.ndarray, "n"]:
+        """Predictions of a regression, numbers of the most probable classes of a classifier (`predictions`)."""
+        found = self.predictions(spectra, only_inside)
+        return np.where(np.isnan(found[:, 0]), np.nan, found.argmax(axis=1)) if self.classes else found[:, 0]
 
     def of(
         self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"], only_inside: bool = False
     ) -> Float[np.ndarray, "n"]:
-        """Predictions of spectra at wavelengths ``nm``, interpolated linearly to its own (`values`)."""
-        return self.values(spectra.astype(float) @ self.interpolation(nm), only_inside)
+        """`values` of spectra at wavelengths ``nm``, interpolated linearly to its own."""
+        return self.values(self.resampled(spectra, nm), only_inside)
+
+    def resampled(
+        self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"]
+    ) -> Float[np.ndarray, "n bands"]:
+        """Spectra at wavelengths ``nm``, interpolated linearly to its own.
+
+        Raises:
+            InputError: its own reach beyond.
+        """
+        return spectra.astype(float) @ self.interpolation(nm)
 
     def interpolation(self, nm: Float[np.ndarray, "others"]) -> Float[np.ndarray, "others bands"]:
         """The matrix that interpolates spectra at wavelengths ``nm`` to its own.
@@ -127,12 +148,20 @@ class Calibration:
         order = np.argsort(nm)
         return np.stack([np.interp(wanted, nm[order], row[order]) for row in np.eye(len(nm))])
 
+    def coarser(self, nm: Float[np.ndarray, "others"]) -> Int[np.ndarray, "half"] | None:
+        """Every second of the bands ``nm``, and the last; None where its own are among them.
+
+        What a prediction changes if it is interpolated from these tells the error of interpolation: linear
+        interpolation errs four times as much over twice the distance, so that the change is three times the error.
+        """
+        if np.isin(self.interpolation(nm), (0.0, 1.0)).all():
+            return None
+        order = np.argsort(nm)
+        return np.union1d(order[::2], order[-1:])
+
 
 def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceMap:
-    """A calibration's value at each vertex; NaN outside its domain.
-
-    Spectra are interpolated linearly to the calibration's wavelengths. The error of that is estimated from every
-    second band: linear interpolation errs four times as much over twice the distance.
+    """A regression's value at each vertex; NaN outside its domain.
 
     Raises:
         InputError: the calibration needs wavelengths that the surface's bands do not reach.
@@ -140,9 +169,7 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
     nm = surface.wavelengths_nm
     of = partial(calibration.of, nm=nm)
     values, resampling_error = of(surface.spectra, only_inside=True), 0.0
-    if not np.isin(calibration.interpolation(nm), (0.0, 1.0)).all():
-        order = np.argsort(nm)
-        coarse = np.union1d(order[::2], order[-1:])
+    if (coarse := calibration.coarser(nm)) is not None:
         other = calibration.of(surface.spectra[:, coarse], nm[coarse])
         change = (other - values)[surface.seen & np.isfinite(other - values)]
         resampling_error = float(np.sqrt(np.mean(change**2))) / 3.0 if len(change) else math.nan
@@ -182,19 +209,22 @@ def read_calibration(path: Path | str) -> Calibration:
             raise ValueError("its intercept and error are no finite numbers, or it has no coefficient")
         domain = _domain(head, {name: column[used] for name, column in columns.items()})
         column = int(head.get("column", 0))
+        classes = tuple(word.strip() for word in head.get("classes", "").split(",") if word.strip())
+        if classes and (len(classes) < 2 or len(set(classes)) < len(classes) or "model" not in head):
+            raise ValueError("classes needs two names or more, each once, and a model that gives their probabilities")
     except (ValueError, OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: is no table of a calibration ({error}); {_REMEDY}.") from error
     if "model" in head:
-        predict = _onnx_model(path, head["model"], int(used.sum()), column)
+        predict = _onnx_model(path, head["model"], int(used.sum()), slice(column, column + max(1, len(classes))))
     elif "coefficient" in columns:
         slopes, intercept = coefficients[used], numbers["intercept"]
 
         def predict(spectra: np.ndarray) -> np.ndarray:
-            return spectra @ slopes + intercept
+            return spectra @ slopes[:, None] + intercept
     else:
         raise InputError(f"{path}: has neither a column coefficient nor a '# model:'; {_REMEDY}.")
     name, unit = head.get("name", path.stem), head.get("unit", "")
-    return Calibration(name, unit, numbers["error"], nm, steps, used, reference, predict, domain)
+    return Calibration(name, unit, numbers["error"], nm, steps, used, reference, predict, domain, classes)
 
 
 def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
@@ -236,8 +266,8 @@ def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | No
     return Domain(columns["mean"], scale, weights, loadings, variances, *limits)
 
 
-def _onnx_model(table: Path, name: str, bands: int, column: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A column of the last output of an ONNX model in the folder of the table.
+def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[[np.ndarray], np.ndarray]:
+    """Columns of the last output of an ONNX model in the folder of the table.
 
     Raises:
         InputError: onnxruntime is not installed, or the model cannot be used.
@@ -246,7 +276,7 @@ def _onnx_model(table: Path, name: str, bands: int, column: int) -> Callable[[np
         import onnxruntime
     except ImportError as error:
         raise InputError(f"{name} needs onnxruntime; install it: pip install 'hsi-sc-nerf[calibrations]'.") from error
-    path = table.with_name(Path(name).name)
+    path, wanted = table.with_name(Path(name).name), columns.stop - columns.start
     try:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         takes, gives = session.get_inputs()[0], session.get_outputs()[-1].name
@@ -254,12 +284,13 @@ def _onnx_model(table: Path, name: str, bands: int, column: int) -> Callable[[np
 
         def predict(spectra: np.ndarray) -> np.ndarray:
             (found,) = session.run([gives], {takes.name: spectra.astype(kind)})
-            return np.asarray(found, float).reshape(len(spectra), -1)[:, column]
+            return np.asarray(found, float).reshape(len(spectra), -1)[:, columns]
 
-        predict(np.zeros((2, bands)))
+        if (given := predict(np.zeros((2, bands))).shape[1]) != wanted:
+            raise ValueError(f"it gives {given} of {wanted}")
     except Exception as error:  # onnxruntime's exceptions have no common class
         raise InputError(
-            f"{path}: is no ONNX model of spectra of {bands} bands with numbers in column {column} of its last "
-            f"output ({error}); {_REMEDY}."
+            f"{path}: is no ONNX model of spectra of {bands} bands with {wanted} numbers from column {columns.start} "
+            f"of its last output on ({error}); {_REMEDY}."
         ) from error
     return predict

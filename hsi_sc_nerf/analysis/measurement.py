@@ -12,6 +12,7 @@ from rich.console import Console
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.calibrations import Calibration, calibration_map, read_calibration
+from hsi_sc_nerf.analysis.class_maps import class_map
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.components import Components, find_components
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
@@ -130,8 +131,10 @@ def measure_traits(
         surface = with_spectra(closed, cloud, config.smoothing_radius_m, max_incidence_deg)
         classes = classified(surface, library, angle_rad, smallest_region_cm2 * 1e-4) if library else None
         pixel_m = None if dataset is None else pixel_on_object_m(dataset)
-        maps = [*index_maps(surface, found_indices), *(calibration_map(surface, one) for one in read)]
-        traits = analyse(surface, [*picked, *drawn_regions], classes, pixel_m, maps)
+        maps = index_maps(surface, found_indices)
+        maps += [calibration_map(surface, one) for one in read if not one.classes]
+        class_maps = [class_map(surface, one) for one in read if one.classes]
+        traits = analyse(surface, [*picked, *drawn_regions], classes, pixel_m, maps, class_maps)
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)

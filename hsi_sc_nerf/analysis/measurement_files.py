@@ -38,6 +38,10 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> N
         ):
             pictures.draw_classes(folder / picture, found.names, labels, surface, views)
             drawn[caption], extra[column] = picture, labels.astype("float32")
+    for one in traits.class_maps:
+        picture = f"{one.column}.png"
+        pictures.draw_classes(folder / picture, one.classes, one.labels, surface, views, pictures.OUTSIDE)
+        drawn[f"Classes by {one.name}"], extra[one.column] = picture, one.labels.astype("float32")
     drawn["Spectra of regions"] = "region_spectra.png"
     pictures.draw_region_spectra(folder / "region_spectra.png", surface.wavelengths_nm, traits)
     if available_composites(surface.wavelengths_nm):

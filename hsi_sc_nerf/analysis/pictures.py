@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib import colormaps, rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
@@ -27,6 +27,9 @@ GREY = 0.85
 """Grey value of unseen surface."""
 _NEAR_WHITE = 0.97
 """Grey value of surface in no class."""
+_STRIPES, _STRIPES_PX = (0.45, 0.95), 12
+"""Grey values of surface without a value, and the stripes' period."""
+NO_CLASS, OUTSIDE = "in no class", "outside of what the classifier knows"
 
 
 class SideViews:
@@ -54,12 +57,22 @@ class SideViews:
             triangle = np.where(hit, hits["primitive_ids"].numpy(), 0).astype(np.int64)
             self.sides.append((hit, triangle, np.stack([1.0 - u - v, u, v], axis=-1)))
 
-    def on_white(self, colours: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "h w 3"]]:
-        """Pictures of the vertices' colours, one a side, interpolated within triangles; white beside the object."""
+    def on_white(
+        self, colours: Float[np.ndarray, "v 3"], striped: Bool[np.ndarray, "v"] | None = None
+    ) -> list[Float[np.ndarray, "h w 3"]]:
+        """Pictures of the vertices' colours, one a side, interpolated within triangles; white beside the object.
+
+        Vertices that are ``striped`` have grey stripes, which no colour map has.
+        """
         pictures = []
         for hit, triangle, barycentric in self.sides:
-            mixed = np.einsum("hwc,hwcj->hwj", barycentric, colours[self._mesh.triangles[triangle]])
+            corners = self._mesh.triangles[triangle]
+            mixed = np.einsum("hwc,hwcj->hwj", barycentric, colours[corners])
             mixed[~hit] = 1.0
+            if striped is not None:
+                on = hit & (np.einsum("hwc,hwc->hw", barycentric, striped[corners]) > 0.5)
+                dark = np.indices(hit.shape).sum(axis=0) % _STRIPES_PX < _STRIPES_PX // 2
+                mixed[on] = np.where(dark[on], *_STRIPES)[:, None]
             pictures.append(mixed)
         return pictures
 
@@ -81,25 +94,37 @@ def draw_composites(path: Path, surface: SpectralMesh, views: SideViews) -> None
 def draw_maps(
     path: Path, maps: Mapping[str, Float[np.ndarray, "v"]], surface: SpectralMesh, views: SideViews
 ) -> None:
-    """Maps by their labels in colours in rows, the sides in columns; surface that is unseen or has no value is grey.
+    """Maps by their labels in colours in rows, the sides in columns; unseen surface is grey, seen surface without a
+    value striped.
 
     The scale of each goes from its 1st to its 99th percentile on this surface.
     """
-    rows, scales = {}, []
+    rows, scales, any_striped = {}, [], False
     for label, values in maps.items():
         known = surface.seen & np.isfinite(values)
         low, high = usual_range(values[known])
         coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / (high - low), 0.0, 1.0))[:, :3]
         coloured[~known] = GREY
-        rows[label] = views.on_white(coloured)
+        rows[label] = views.on_white(coloured, striped := surface.seen & ~known)
         scales.append((low, high, INDEX_COLOURS))
-    draw_rows(path, rows, scales)
+        any_striped |= bool(striped.any())
+    draw_rows(path, rows, scales, [_striped("no value is known here")] if any_striped else [])
 
 
 def draw_rows(
-    path: Path, rows: Mapping[str, Sequence[np.ndarray]], scales: Sequence[tuple[float, float, str] | None] = ()
+    path: Path,
+    rows: Mapping[str, Sequence[np.ndarray]],
+    scales: Sequence[tuple[float, float, str] | None] = (),
+    key: Sequence[Patch] = (),
 ) -> None:
-    """Pictures of the four sides in labelled rows; ``scales`` are ends and colours of the first rows' bars."""
+    """Pictures of the four sides in labelled rows.
+
+    Args:
+        path: to write.
+        rows: pictures by their label.
+        scales: ends and colours of the first rows' bars.
+        key: of the legend.
+    """
     first = next(iter(rows.values()))[0]
     width_in = 1.75
     row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
@@ -116,18 +141,29 @@ def draw_rows(
             low, high, colours = scale
             shown = ScalarMappable(Normalize(low, high), colours)
             figure.colorbar(shown, ax=line.tolist(), extend="both", fraction=0.04, aspect=18, pad=0.02)
+    if key:
+        figure.legend(handles=list(key), loc="outside lower center", fontsize=8)
     save_figure(figure, path)
 
 
 @rc_context(STYLE)
 def draw_classes(
-    path: Path, names: Sequence[str], labels: Int[np.ndarray, "v"], surface: SpectralMesh, views: SideViews
+    path: Path,
+    names: Sequence[str],
+    labels: Int[np.ndarray, "v"],
+    surface: SpectralMesh,
+    views: SideViews,
+    unlabelled: str = NO_CLASS,
 ) -> None:
-    """The classes on the surface, with their areas; white is in no class, grey is unseen."""
+    """The classes on the surface, with their areas; grey is unseen.
+
+    Seen surface without a label is white if it is in no class, and striped if it is `OUTSIDE`.
+    """
+    none = surface.seen & (labels == UNCLASSIFIED)
     colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = GREY
-    pictures = views.on_white(painted)
+    pictures = views.on_white(painted, none if unlabelled == OUTSIDE else None)
     height, width = pictures[0].shape[:2]
     figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
@@ -139,12 +175,16 @@ def draw_classes(
         for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
         if area > 0
     ]
-    patches += [
-        Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=f"in no class: {areas_cm2[-1]:.2f} cm²"),
-        Patch(color=str(GREY), label="not seen"),
-    ]
+    rest = f"{unlabelled}: {areas_cm2[-1]:.2f} cm²"
+    white = Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest)
+    patches += [_striped(rest) if unlabelled == OUTSIDE else white, Patch(color=str(GREY), label="not seen")]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)
+
+
+def _striped(label: str) -> Patch:
+    dark, light = map(str, _STRIPES)
+    return Patch(facecolor=light, edgecolor=dark, hatch="/////", linewidth=0.0, label=label)
 
 
 @rc_context(STYLE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.analysis.class_maps import ClassAreas
 from hsi_sc_nerf.analysis.components import Components
 from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, RegionTraits, Traits
@@ -65,6 +66,7 @@ def trait_content(
         settings: of the command.
     """
     classes = traits.classes
+    relative_sd = combined(uncertainty).area_m2 / size.area_m2 if uncertainty else 0.0
     return {
         "settings": dict(settings),
         "size": asdict(size),
@@ -77,6 +79,10 @@ def trait_content(
             one.name: {"unit": one.unit, "error": one.error, "resampling_error": one.resampling_error}
             for one in traits.maps
             if not one.definition
+        },
+        "classifiers": {
+            one.name: {"classes": list(one.classes), "resampling_error": one.resampling_error}
+            for one in traits.class_maps
         },
         "classes": None
         if classes is None
@@ -94,6 +100,10 @@ def trait_content(
                 "indices": {one.name: _plain(region.maps[one.name]) for one in traits.maps if one.definition},
                 "calibrations": {
                     one.name: _plain(region.maps[one.name]) for one in traits.maps if not one.definition
+                },
+                "classifiers": {
+                    one.name: _plain_areas(one.classes, region.class_areas[one.name], relative_sd)
+                    for one in traits.class_maps
                 },
                 "reflectance": _plain_reflectance(region),
             }
@@ -141,6 +151,8 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
         tables.append(TraitTable("Indices", _MAP_NOTE, ["region", *names], rows))
     if calibrations := content.get("calibrations"):
         tables.append(_calibration_table(calibrations, content["regions"]))
+    if classifiers := content.get("classifiers"):
+        tables.append(_classifier_table(classifiers, content["regions"]))
     if components := content.get("components"):
         pairs = zip(components["variance_fractions"], components["mean_fractions"], strict=True)
         rows = [[str(number), f"{a:.2%}", f"{b:.1%}"] for number, (a, b) in enumerate(pairs, 1)]
@@ -166,6 +178,28 @@ def _calibration_table(calibrations: Mapping[str, Any], regions: Mapping[str, An
                 f" Its bands are not the cloud's: resampling changes {name} by {of['resampling_error']:.2g} (RMS)."
             )
     return TraitTable("Calibrations", note, ["region", "calibration", "unit", "value", "outside"], rows)
+
+
+def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]) -> TraitTable:
+    rows = []
+    for region, values in regions.items():
+        for name, found in values["classifiers"].items():
+            for label, area in (found["areas_m2"] | {"outside": found["outside_m2"]}).items():
+                sd = found["area_sds_m2"].get(label)
+                shown = f"{_CM2_PER_M2 * area:.2f}" if sd is None else _with_sd(_CM2_PER_M2 * area, _CM2_PER_M2 * sd)
+                rows.append([region, name, label, shown, f"{area / values['area_m2']:.1%}"])
+    note = (
+        "Area of the surface whose most probable class is each; ± is its standard deviation by the classifier's own "
+        "doubt, the noise of the spectra and the size of the mesh, and is left out where the dataset (--data) is not "
+        "known. Outside: area whose spectra the classifier does not know."
+    )
+    for name, of in classifiers.items():
+        if of["resampling_error"]:
+            note += (
+                f" Its bands are not the cloud's: resampling changes the class by {name} of "
+                f"{of['resampling_error']:.1%} of the area."
+            )
+    return TraitTable("Classifiers", note, ["region", "classifier", "class", "area, cm²", "of the region"], rows)
 
 
 def _map_mean(value: Mapping[str, float | None]) -> str:
@@ -270,6 +304,16 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
         values |= {"measured": light.measured.mean.mean(), "irradiance": light.irradiance.mean}
         values["irradiance_std"] = light.irradiance_std
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+
+
+def _plain_areas(names: Sequence[str], found: ClassAreas, relative_sd: float) -> dict[str, Any]:
+    """Ready for JSON, with the mesh's own uncertainty, which all areas share."""
+    stds_m2 = np.hypot(found.stds_m2, relative_sd * found.areas_m2)
+    return {
+        "areas_m2": dict(zip(names, found.areas_m2.tolist(), strict=True)),
+        "area_sds_m2": {name: std for name, std in zip(names, stds_m2.tolist(), strict=True) if math.isfinite(std)},
+        "outside_m2": found.outside_m2,
+    }
 
 
 def _plain(value: MapMean) -> dict[str, float | None]:

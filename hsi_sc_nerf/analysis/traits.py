@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.analysis.class_maps import ClassAreas, ClassMap, class_areas
 from hsi_sc_nerf.analysis.classes import (
     UNCLASSIFIED,
     ConnectedRegion,
@@ -140,6 +141,7 @@ class RegionTraits:
         maps: mean of each map on the surface by name.
         reflectance_std: standard deviation of the spectrum's mean over the bands; NaN where it is not known.
         light: where the two are told apart.
+        class_areas: of each classifier by its name.
     """
 
     name: str
@@ -148,15 +150,18 @@ class RegionTraits:
     maps: Mapping[str, MapMean]
     reflectance_std: float = math.nan
     light: RegionLight | None = None
+    class_areas: Mapping[str, ClassAreas] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Traits:
-    """Traits of a surface from its spectra: of its regions, the whole seen surface first, its classes, its maps."""
+    """Traits of a surface from its spectra: of its regions, the whole seen surface first, its classes, its maps, and
+    the maps of classifiers."""
 
     regions: list[RegionTraits]
     classes: Classes | None = None
     maps: Sequence[SurfaceMap] = ()
+    class_maps: Sequence[ClassMap] = ()
 
     @property
     def seen_m2(self) -> float:
@@ -170,8 +175,9 @@ def analyse(
     classes: Classes | None = None,
     pixel_m: float | None = None,
     maps: Sequence[SurfaceMap] = (),
+    class_maps: Sequence[ClassMap] = (),
 ) -> Traits:
-    """Spectra of the whole seen surface, its classes and the regions of interest, and the means of maps.
+    """Spectra of the whole seen surface, its classes and the regions of interest, means of maps, areas of class maps.
 
     Args:
         surface: the mesh with its spectra.
@@ -179,6 +185,7 @@ def analyse(
         classes: of its vertices.
         pixel_m: side of a pixel on the object; None if it is not known, and with it how far means scatter.
         maps: of the surface.
+        class_maps: of the surface.
 
     Raises:
         InputError: two regions or maps have one name, a region holds no seen surface, or nothing was seen.
@@ -186,8 +193,9 @@ def analyse(
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
-    for number, one in enumerate(maps):
-        if any(one.name == other.name or one.column == other.column for other in maps[:number]):
+    every: list[SurfaceMap | ClassMap] = [*maps, *class_maps]
+    for number, one in enumerate(every):
+        if any(one.name == other.name or one.column == other.column for other in every[:number]):
             raise InputError(f"two indices or calibrations are named {one.name}; give each a name of its own.")
     if classes is not None:
         chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
@@ -207,9 +215,10 @@ def analyse(
             {one.name: _map_mean(one, where, surface, spectrum, noise) for one in maps},
             _reflectance_std(surface, where, pixel_m, noise, spectrum, light),
             light,
+            {one.name: class_areas(one, where, surface, pixel_m) for one in class_maps},
         )
 
-    return Traits([of_region(name, where) for name, where in chosen.items()], classes, maps)
+    return Traits([of_region(name, where) for name, where in chosen.items()], classes, maps, class_maps)
 
 
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:

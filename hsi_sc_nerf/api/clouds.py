@@ -56,7 +56,9 @@ class Cloud(SpectralCloud):
         return index_values(index, self._analysed(), self.wavelengths_nm)
 
     def calibration(self, calibration: Path | str | Calibration) -> Float[np.ndarray, "n"]:
-        """A calibration's prediction at each point; NaN outside of what it was fitted on.
+        """A regression's prediction, or the number of a classifier's class (from 0), at each point.
+
+        NaN outside of what it was fitted on.
 
         Args:
             calibration: a table (docs/how-to/calibrations.md), or what `read_calibration` read of it.

@@ -134,6 +134,11 @@ def calibration_columns(name: str, unit: str) -> tuple[Column, ...]:
     return measured(name, unit, f"prediction of the calibration {name}: mean over the seen surface", "index", _SPREAD)
 
 
+def classifier_columns(name: str, label: str) -> tuple[Column, ...]:
+    """Area of a classifier's class on the seen surface, and its standard deviation."""
+    return measured(f"{name} {label} area", "cm²", f"area of the class {label} by {name}", "class", _SD)
+
+
 def class_columns(name: str) -> tuple[Column, Column, Column]:
     """Area of a class by spectral angle, and its fractions of the seen area by angle and by mixture."""
     part = f"part of the seen area in the class {name}"

@@ -132,6 +132,11 @@ def _traits(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
     for name, found in regions[WHOLE]["calibrations"].items():
         of = columns.calibration_columns(name, str(content["calibrations"][name]["unit"]))
         yield from zip(of, (_number(found["mean"]), _number(found["sd"])), strict=True)
+    for name, found in regions[WHOLE].get("classifiers", {}).items():
+        for label, area_m2 in found["areas_m2"].items():
+            area, sd = columns.classifier_columns(name, label)
+            yield area, _number(area_m2, _CM2_PER_M2)
+            yield sd, _number(found["area_sds_m2"].get(label), _CM2_PER_M2)
     if content["classes"]:
         yield from _classes(content["classes"], float(content["seen_area_m2"]))
     for name, region in regions.items():

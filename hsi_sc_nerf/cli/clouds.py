@@ -104,14 +104,14 @@ class TraitsCommand:
     roi_file: Path | None = None
     """Regions that were drawn on the object in the report's 3D view and saved there (regions.json)."""
     propose_regions: bool = False
-    """Write regions_proposed.json as well: stem, calyx, husk and body, by shape and spectrum. Load it in the report's
-    3D view to correct it, and give it to --roi-file."""
+    """Write regions_proposed.json as well: stem, calyx, leaf, husk, body and other parts, by shape and spectrum. Load
+    it in the report's 3D view to correct it, and give it to --roi-file."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to map and to average, by its name (docs/how-to/indices.md), or as a formula of reflectances:
     --index "CRI = 1/R510 - 1/R550". May be repeated. Default: NDVI, NDVI705 and WI, where the bands allow."""
     calibration: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A regression that was fitted elsewhere, to map and to average (docs/how-to/calibrations.md): a table (CSV) of
-    coefficients, or one that names an ONNX model. May be repeated."""
+    """A regression or a classifier that was fitted elsewhere, for a map with means or areas
+    (docs/how-to/calibrations.md): a table (CSV) of coefficients, or one that names an ONNX model. May be repeated."""
     components: int = between(0, math.inf, default=0)
     """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
 
@@ -160,6 +160,6 @@ class TraitsCommand:
                 write_drawn_regions(path := self.output_dir / "regions_proposed.json", proposed)
             found = ", ".join(one.name for one in proposed)
             if len(proposed) == 1:
-                found += " alone, for neither end of the object differs from the rest in shape or spectrum"
+                found += " alone, for no end or side of the object differs from the rest in shape or spectrum"
             console.print(f"Proposed regions, to correct in the report: {found}: {escape(str(path))}", soft_wrap=True)
         console.print(f"Traits, with pictures: {escape(str(self.output_dir / 'traits.md'))}", soft_wrap=True)

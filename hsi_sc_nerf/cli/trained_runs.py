@@ -231,6 +231,12 @@ class ReportCommand:
     """Number of held-out views to render, evenly spread. Default: all."""
     points: int = 50_000
     """Number of points to show; 50 000 need about 5 MB."""
+    index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An index to show on the object, by its name (docs/how-to/indices.md), or as a formula of reflectances. May be
+    repeated. Default: those that the traits were measured with, else NDVI, NDVI705 and WI."""
+    calibration: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """The table of a regression or a classifier to show on the object (docs/how-to/calibrations.md). May be
+    repeated."""
 
     def main(self) -> None:
         """Write the report and print its path.
@@ -243,7 +249,9 @@ class ReportCommand:
         run = self.run.parent if self.run.name == "config.yml" else self.run
         output = self.output or run / "report.html"
         require_writable(output.parent)
-        sources = ReportSources(self.cloud, self.comparison, self.traits, self.views, self.points)
+        sources = ReportSources(
+            self.cloud, self.comparison, self.traits, self.views, self.points, self.index, self.calibration
+        )
         write_report(run, output, sources)
         size_mb = output.stat().st_size / 1e6
         Console().print(f"{escape(str(output))} ({size_mb:.1f} MB)", soft_wrap=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsi_sc_nerf.analysis.calibrations import Calibration, read_calibration
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
@@ -61,6 +62,8 @@ class ReportSources:
         traits: ``traits.json``; likewise.
         views: how many held-out views to render; None for all.
         points: how many points of the cloud to show.
+        indices: to show on it, as `find_indices` reads them; none: those that the traits were measured with.
+        calibrations: tables (`read_calibration`) to show on it.
     """
 
     cloud: Path | None = None
@@ -68,6 +71,8 @@ class ReportSources:
     traits: Path | None = None
     views: int | None = None
     points: int = PAGE_POINTS
+    indices: Sequence[str] = ()
+    calibrations: Sequence[Path] = ()
 
 
 def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
@@ -87,17 +92,19 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     comparison, traits = read_known(comparison_path), read_known(traits_path)
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
     with content_of(traits_path, "traits"):
-        indices = [str(word) for word in (traits or {}).get("indices", ())]
+        indices = [*sources.indices] or [str(word) for word in (traits or {}).get("indices", ())]
+    calibrations = [read_calibration(path) for path in sources.calibrations]
 
     from hsi_sc_nerf.models.trained_run import open_run
 
     run = open_run(folder / "config.yml")
     cloud = _cloud(run, folder, sources)
+    shown = object_section(cloud, sources.points, indices, calibrations)
     views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset
     scores, white = [view.scores for view in views], white_of(views)
     sections = [
         *inspection_section(dataset),
-        object_section(cloud, sources.points, indices),
+        shown,
         views_section(views, held_out, white),
         bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
         spectra_section(views[len(views) // 2], dataset.wavelengths_nm, white),
@@ -118,17 +125,18 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         temporary.write_text(page, encoding="utf-8")
 
 
-def object_section(cloud: SpectralCloud, points: int, indices: Sequence[str] = ()) -> Section:
-    """The cloud in 3D, thinned to ``points``, with the indices that its traits were measured with."""
+def object_section(
+    cloud: SpectralCloud, points: int, indices: Sequence[str] = (), calibrations: Sequence[Calibration] = ()
+) -> Section:
+    """The cloud in 3D, thinned to ``points``, with indices and calibrations."""
     shown = points_of_page(cloud, points)
     spectra = compress_spectra(shown.spectra)
     caption = (
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
         f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
-    return Section(
-        "object", "The object", [CloudViewer(cloud_payload(shown, spectra, indices), caption)], judge_cloud(cloud)
-    )
+    payload = cloud_payload(shown, spectra, indices, calibrations)
+    return Section("object", "The object", [CloudViewer(payload, caption)], judge_cloud(cloud))
 
 
 def judge_cloud(cloud: SpectralCloud) -> list[Finding]:

@@ -22,7 +22,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from hsi_sc_nerf.plotting import STYLE, new_figure
 
-_SERIES = ("#0072b2", "#d55e00", "#00805f", "#b0568c", "#b07800", "#2f93cf", "#1c2126")
+_SERIES = ("#0072b2", "#d55e00", "#00805f", "#b0568c", "#603a00", "#2f93cf", "#1c2126")
 _TEXT, _FAINT, _RULE = "#1c2126", "#5b6670", "#d9dee3"
 # Colours that are drawn, and the variables of the style sheet that stand in the page instead.
 _VARIABLES = {_FAINT: "faint", _RULE: "rule"} | {colour: f"s{i}" for i, colour in enumerate(_SERIES)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,8 @@ from jaxtyping import Float, Int16, UInt16
 from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.analysis.calibrations import Calibration
+from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names, material_spectra
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.plotting import INDEX_COLOURS, usual_range
@@ -98,28 +99,56 @@ def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequen
     return {"name": name, "tells": tells, "data": _base64(counts), "range": ends, "drawn": drawn or ends}
 
 
-def cloud_payload(cloud: SpectralCloud, spectra: CompressedSpectra, indices: Sequence[str] = ()) -> dict[str, Any]:
+def _measures(
+    cloud: SpectralCloud, indices: Sequence[str], calibrations: Sequence[Calibration]
+) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float]]]:
+    """Name, meaning, values and ends of the colours of what spectra tell, of the material's where they are known."""
+    nm, material = cloud.wavelengths_nm, material_spectra(cloud)
+    spectra, of_what = (cloud.spectra, "") if material is None else (material, ", of the material")
+    for index in find_indices(indices, nm):
+        values = index_values(index, spectra, nm)
+        drawn = index.drawn_range if index.has_range else usual_range(values)
+        yield index.name, f"{index.expression}: {index.tells}{of_what}", values, drawn
+    for one in calibrations:
+        found = one.predictions(one.resampled(spectra, nm), only_inside=True)
+        for label, values in zip(one.classes or ("",), found.T, strict=True):
+            drawn = (0.0, 1.0) if label else usual_range(values)
+            tells = f"probability by {one.name}" if label else one.unit or "calibration"
+            yield f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn
+
+
+def cloud_payload(
+    cloud: SpectralCloud,
+    spectra: CompressedSpectra,
+    indices: Sequence[str] = (),
+    calibrations: Sequence[Calibration] = (),
+) -> dict[str, Any]:
     """Data of the page's viewer (``templates/cloud_data.js``), for JSON.
 
     Args:
         cloud: the points to show (`points_of_page`).
         spectra: of the same points.
         indices: to offer, as `find_indices` reads them.
+        calibrations: to offer; of a classifier the probability of each class.
 
     Raises:
-        InputError: an index cannot be computed.
+        InputError: an index or a calibration cannot be computed.
     """
     order = np.argsort(cloud.wavelengths_nm)
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
-    scalars = []
-    for index in find_indices(indices, cloud.wavelengths_nm):
-        values = index_values(index, cloud.spectra, cloud.wavelengths_nm)
-        drawn = index.drawn_range if index.has_range else usual_range(values)
-        scalars.append(_scalar(index.name, f"{index.expression}: {index.tells}", values, drawn) | {"index": True})
-    scalars += [_scalar(name, "column of the cloud", values, None) for name, values in cloud.extra.items()]
+    scalars = [
+        _scalar(name, tells, values, drawn) | {"index": True}
+        for name, tells, values, drawn in _measures(cloud, indices, calibrations)
+    ]
+    of_material = set(band_property_names(cloud.wavelengths_nm, "material"))
+    scalars += [
+        _scalar(name, "column of the cloud", values, None)
+        for name, values in cloud.extra.items()
+        if name not in of_material
+    ]
     return {
         "count": len(cloud.points),
         "centre_m": centre.tolist(),

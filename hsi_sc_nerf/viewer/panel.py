@@ -18,6 +18,7 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerClick,
     ViewerDropdown,
     ViewerSlider,
+    ViewerText,
 )
 from torch import Tensor
 from viser.transforms import SO3
@@ -26,9 +27,8 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import FRAME_INDEX
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.indices.catalogue import CATALOGUE, available_indices
-from hsi_sc_nerf.indices.formula import index_values
-from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, INDEX_COLOURS, coloured
+from hsi_sc_nerf.indices.catalogue import available_indices
+from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, coloured
 from hsi_sc_nerf.spectra import (
     COMPOSITES,
     available_composites,
@@ -36,6 +36,7 @@ from hsi_sc_nerf.spectra import (
     nearest_bands,
 )
 from hsi_sc_nerf.viewer.drawings import BrowserControl, ViewerMarkdown, colour_bar, inline_image, spectra_plot
+from hsi_sc_nerf.viewer.index_choice import IndexChoice, index_legend
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
@@ -44,11 +45,14 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle
 
+    from hsi_sc_nerf.indices.formula import SpectralIndex
     from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 Outputs = dict[str, Tensor]
 _POINT_RADIUS = 0.01  # scene units: about a millimetre
 _POINT_RGB = (213, 94, 0)
+_SHOWN = 0.5
+"""Opacity of a pixel that shows the object."""
 # How far behind the first training camera a browser starts, as a fraction of the camera's distance to the object.
 _START_BEHIND = 0.1
 
@@ -99,7 +103,15 @@ class SpectralPanel(torch.nn.Module):
         )
         self.composite = self._dropdown("Composite", [one.name for one in available_composites(wavelengths_nm)])
         self.index = self._dropdown("Index", [one.name for one in available_indices(wavelengths_nm)])
+        self.index_formula = ViewerText(
+            "Own index",
+            "",
+            cb_hook=self._explain,
+            hint="Shown by output 'index' in place of the list's: a name of the catalogue, or a formula of "
+            "reflectances such as CRI = 1/R510 - 1/R550; with [0, 15] behind it for the ends of the colours",
+        )
         self.legend = ViewerMarkdown(self._legend)
+        self._choice = IndexChoice(wavelengths_nm)
         self.measured_view = ViewerSlider(
             "Training view",
             default_value=0,
@@ -141,10 +153,10 @@ class SpectralPanel(torch.nn.Module):
         if self.composite is not None:
             chosen = COMPOSITES[self.composite.value]
             pictures["composite"] = composite(spectral, self.wavelengths_nm, chosen.wavelengths_nm).clamp(0.0, 1.0)
-        if self.index is not None:
-            index = CATALOGUE[self.index.value]
-            values = index_values(index, spectral, self.wavelengths_nm)
-            pictures["index"] = coloured(values, index.drawn_range, INDEX_COLOURS)
+        index, _ = self._index()
+        pictures["index"], new_ends = self._choice.picture(index, spectral, outputs["accumulation"][..., 0] > _SHOWN)
+        if new_ends:
+            self.legend.show(self._legend())
         angles = torch.full(spectral.shape[:2], torch.nan, device=spectral.device)
         if view is not None and self._shown(viewer, "spectral_angle"):
             directions = camera.generate_rays(camera_indices=0, keep_shape=True).directions
@@ -200,7 +212,11 @@ class SpectralPanel(torch.nn.Module):
         hint = f"What output '{label.lower()}' shows"
         return ViewerDropdown(label, names[0], names, cb_hook=self._explain, hint=hint) if names else None
 
-    def _explain(self, _: ViewerDropdown) -> None:
+    def _index(self) -> tuple[SpectralIndex | None, str]:
+        """The chosen index, and what is wrong with a typed one."""
+        return self._choice.find(None if self.index is None else self.index.value, self.index_formula.value)
+
+    def _explain(self, _: ViewerDropdown | ViewerText) -> None:
         self.legend.show(self._legend())
 
     def _legend(self) -> str:
@@ -210,11 +226,7 @@ class SpectralPanel(torch.nn.Module):
             chosen = COMPOSITES[self.composite.value]
             shown = ", ".join(f"{nm:g}" for nm in chosen.wavelengths_nm)
             parts.append(f"**composite** {chosen.name}: {shown} nm as red, green, blue ({chosen.shows})")
-        if self.index is not None:
-            index = CATALOGUE[self.index.value]
-            bar = colour_bar(index.drawn_range, INDEX_COLOURS, index.name)
-            parts.append(f"**index** {index.name} = {index.expression}: {index.tells}")
-            parts.append(inline_image(bar, "colours {:g} to {:g}".format(*index.drawn_range)))
+        parts += index_legend(*self._index())
         bar = colour_bar(ANGLE_DRAWN_RAD, ANGLE_COLOURS, "spectral angle (rad)")
         parts.append("**spectral_angle** between rendering and measurement, at a training view only")
         parts.append(inline_image(bar, "colours {:g} to {:g} rad".format(*ANGLE_DRAWN_RAD)))

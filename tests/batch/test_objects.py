@@ -62,6 +62,16 @@ def test_a_row_has_what_the_files_say_in_the_columns_units(tmp_path):
     assert (row["brix_percent"], row["brix_sd_percent"]) == (12.5, 0.4)
 
 
+def test_areas_by_classifiers_have_columns_with_their_deviations(tmp_path):
+    traits = traits_of()
+    areas = {"areas_m2": {"sound": 0.0196, "bruised": 0.0004}, "area_sds_m2": {"bruised": 5e-5}, "outside_m2": 0.0}
+    traits["regions"]["whole surface"]["classifiers"] = {"tissue": areas}
+    write_object(tmp_path / "pear", traits)
+    row, _ = row_of(tmp_path / "pear")
+    found = [row[f"tissue_{name}_cm2"] for name in ("bruised_area", "bruised_area_sd", "sound_area", "sound_area_sd")]
+    assert found == [pytest.approx(4.0), pytest.approx(0.5), pytest.approx(196.0), None]
+
+
 def test_a_mesh_with_holes_has_no_volume(tmp_path):
     write_object(tmp_path / "pear", traits_of(watertight=False))
     row, _ = row_of(tmp_path / "pear")

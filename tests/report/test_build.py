@@ -13,7 +13,12 @@ import pytest
 from headless_browser import needs_browser, quiet_page
 from PIL import Image
 
-from hsi_sc_nerf.analysis.drawn_regions import propose_regions, read_drawn_regions, write_drawn_regions
+from hsi_sc_nerf.analysis.drawn_regions import (
+    DrawnRegion,
+    propose_regions,
+    read_drawn_regions,
+    write_drawn_regions,
+)
 from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.measurement import measure_traits
 from hsi_sc_nerf.analysis.report import trait_content
@@ -24,7 +29,7 @@ from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, write_spe
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.report.build import ReportSources, write_report
+from hsi_sc_nerf.report.build import ReportSources, object_section, write_report
 from hsi_sc_nerf.report.dataset_sections import (
     calibration_section,
     inspection_section,
@@ -94,7 +99,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(run):
-    write_report(run, run / "report.html", ReportSources())
+    write_report(run, run / "report.html", ReportSources(indices=("NDVI", "own = R550 / R670")))
     return run / "report.html"
 
 
@@ -133,6 +138,8 @@ def test_the_page_is_complete_and_names_from_outside_stay_text(report, tmp_path_
     assert "<img src=x" not in text
     assert text.count("{{ 7 * 7 }}") > 5
     assert len(page.all("script")) == 2
+    assert '"name": "own"' in text
+    assert '"tells": "R550 / R670: own formula"' in text
     for shown in ("96.2 %", "F-score at 2.0 mm", "1.230", "229.0 ± 1.0", "250.0 ± 2.0", "cm²", "mL"):
         assert shown in text
     assert "run <code>ns-train" in text  # it has no log
@@ -186,6 +193,8 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no JSON object"),
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
+        (ReportSources(indices=("own = R1240",)), "1240 nm"),
+        (ReportSources(calibrations=(run / "no.csv",)), r"no\.csv: is no table of a calibration"),
     ):
         with pytest.raises(InputError, match=sentence):
             write_report(run, tmp_path / "report.html", sources)
@@ -317,6 +326,36 @@ def test_regions_are_drawn_named_saved_and_measured_on_the_cloud(browser, run, r
     assert found["a, south"].area_m2 * 1e4 == pytest.approx(true_cm2, rel=0.1)
     np.testing.assert_allclose(found["a, south"].spectrum.mean, np.linspace(0.2, 0.4, 12), atol=2e-3)
     np.testing.assert_allclose(found[north.name].spectrum.mean, np.linspace(0.4, 0.8, 12), atol=4e-3)
+
+
+@contextmanager
+def opened_with(browser, cloud, path, points, **options):
+    """A page of the object alone."""
+    path.write_text(html_page("", "", {}, [object_section(cloud, points, **options)]), encoding="utf-8")
+    with opened(browser, path, viewport={"width": 700, "height": 900}) as page:
+        yield page
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.parametrize("points", [500, 20_000])
+def test_regions_fit_a_page_of_other_points_and_are_refused_on_another_object(browser, tmp_path, points):
+    """Proposed on 4000 points. A region is where the nearest of these is in it."""
+    whole = ball(factory.WAVELENGTHS_NM, 40_000)
+    drawn_on = ball(factory.WAVELENGTHS_NM, 4000).points
+    upper = DrawnRegion("upper", drawn_on, drawn_on[:, 2] > 0.01)
+    write_drawn_regions(tmp_path / "proposed.json", [upper, DrawnRegion("spot", drawn_on, drawn_on[:, 2] > 0.0299)])
+    with opened_with(browser, whole, tmp_path / "page.html", points) as page:
+        page.set_input_files("input[name=loadRegions]", tmp_path / "proposed.json")
+        page.locator(".regions li").first.wait_for()
+        found = region_mm(page, tmp_path / "again.json")["upper"]
+        assert len(found) == pytest.approx(points / 3.0, rel=0.12)
+        assert found[:, 2].min() > 9.0
+        beside = [DrawnRegion("upper", drawn_on + np.array([0.05, 0.0, 0.0]), upper.chosen)]
+        write_drawn_regions(tmp_path / "other.json", beside)
+        page.set_input_files("input[name=loadRegions]", tmp_path / "other.json")
+        page.locator(".told:not([hidden])", has_text="drawn on another object").wait_for()
+        assert page.locator(".regions li").count() <= 2
 
 
 def brush_over(page, *places):

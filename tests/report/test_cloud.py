@@ -1,11 +1,13 @@
 """The cloud inside the report: what is lost on the way into the page."""
 
 import base64
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.analysis.calibrations import Calibration, Domain
+from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names
 from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise
 
 
@@ -92,3 +94,41 @@ def test_the_payload_holds_the_cloud_with_its_bands_in_order():
     ratio = cloud.spectra[:, np.abs(cloud.wavelengths_nm - 800).argmin()]
     ratio = ratio / cloud.spectra[:, np.abs(cloud.wavelengths_nm - 670).argmin()]
     assert own["drawn"] == pytest.approx(np.percentile(ratio, (1, 99)), rel=1e-5)
+
+
+def test_calibrations_and_indices_are_of_the_material_where_it_is_known(tmp_path):
+    """What a calibration does not know is no number; of a classifier there is a probability a class."""
+    cloud = ball()
+    names = band_property_names(cloud.wavelengths_nm, "material")
+    lit = replace(cloud, extra=dict(zip(names, 2.0 * cloud.spectra.T, strict=True)) | {"views": np.ones(500)})
+
+    def predict(spectra):
+        return np.stack([spectra.mean(axis=1), 1.0 - spectra.mean(axis=1)], axis=1)
+
+    every, none = np.ones(20, bool), np.full(20, np.nan)
+    known = Domain(np.zeros(20), np.ones(20), np.eye(20)[:, :1], np.eye(20)[:, :1], np.ones(1), np.inf, 5.0)
+    sugar = Calibration(
+        "sugar", "°Brix", 0.0, cloud.wavelengths_nm, (), every, none, lambda s: predict(s)[:, :1], known
+    )
+    spots = replace(sugar, name="spots", predict=predict, domain=None, classes=("sound", "spot"))
+    for one, factor in ((cloud, 1.0), (lit, 2.0)):
+        payload = cloud_payload(one, compress_spectra(one.spectra), ["own = R800"], [sugar, spots])["scalars"]
+        assert [scalar["name"] for scalar in payload if scalar.get("index")] == [
+            "own",
+            "sugar",
+            "spots sound",
+            "spots spot",
+        ]
+        assert [scalar["name"] for scalar in payload][4:] == list(one.extra)[20:]  # not the material's bands
+
+        def values(scalar):
+            counts = np.frombuffer(base64.b64decode(scalar["data"]), "<u2").astype(float)
+            low, high = scalar["range"]
+            return np.where(counts == 65535, np.nan, low + counts / 65534 * (high - low))
+
+        spectra = factor * cloud.spectra
+        inside = (spectra[:, 1:] ** 2).sum(axis=1) <= 5.0
+        expected = np.where(inside, spectra.mean(axis=1), np.nan)
+        np.testing.assert_allclose(values(payload[1]), expected, atol=1e-3)
+        np.testing.assert_allclose(values(payload[3]), 1.0 - spectra.mean(axis=1), atol=1e-3)
+        assert payload[3]["drawn"] == (0.0, 1.0)

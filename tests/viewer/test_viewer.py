@@ -137,7 +137,7 @@ def attached(pipeline):
         toggle_cameravis_button=lambda: calls.append("button switched"),
     )
     found = [path for path, _ in parse_object(panel, ViewerElement, "panel")]
-    names = ("band", "composite", "index", "legend", "measured_view", "picking", "spectrum")
+    names = ("band", "composite", "index", "index_formula", "legend", "measured_view", "picking", "spectrum")
     assert found == [f"panel/{name}" for name in names]
     for _, control in parse_object(panel, ViewerControl, "panel"):
         control._setup(viewer)
@@ -149,13 +149,14 @@ def truth_of(pipeline, view):
     return unpack(pipeline.datamanager.train_dataset.frames[view].cube())
 
 
-def rendered_as(spectral):
+def rendered_as(spectral, opacity=1.0):
     """A stand-in for nerfstudio's rendering that remembers the camera and gives these spectra."""
 
     def render(camera):
         render.camera = camera
         image = torch.from_numpy(spectral)
-        return {"rgb": 2.0 * image[..., :3], "spectral": image, "depth": torch.ones(*image.shape[:2], 1)}
+        ones = torch.ones(*image.shape[:2], 1)
+        return {"rgb": 2.0 * image[..., :3], "spectral": image, "depth": ones, "accumulation": ones * opacity}
 
     return render
 
@@ -166,10 +167,10 @@ def test_nothing_changes_without_a_viewer_and_for_frames(attached, pipeline):
     spectral = np.full((4, 4, 12), 0.5, np.float32)
     panel.measured_view.cb_hook(SimpleNamespace(value=1))
     camera, frame = server.moved_camera(), pipeline.datamanager.train_dataset.cameras[2:3]
-    assert set(panel.render(frame, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
+    assert set(panel.render(frame, rendered_as(spectral))) == {"rgb", "spectral", "depth", "accumulation"}
     before = pipeline.state_dict().keys()
     alone = attach_spectral_panel(pipeline)
-    assert set(alone.render(camera, rendered_as(spectral))) == {"rgb", "spectral", "depth"}
+    assert set(alone.render(camera, rendered_as(spectral))) == {"rgb", "spectral", "depth", "accumulation"}
     found = [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements")]
     assert "Custom Elements/spectral_panel/band" in found
     assert pipeline.state_dict().keys() == before  # checkpoints stay as they are
@@ -193,11 +194,10 @@ def test_a_viewer_gets_pictures_of_one_or_three_channels(attached, pipeline):
         assert 0.0 <= outputs[name].min() <= outputs[name].max() <= 1.0
 
 
-def test_controls_choose_band_composite_and_index(attached):
+def test_controls_choose_band_composite_and_index(attached, spectral):
     panel, server, _ = attached
     panel.legend.install(server)
     panel.measured_view.cb_hook(SimpleNamespace(value=0))
-    spectral = np.random.default_rng(0).uniform(0.05, 0.9, (24, 36, 12)).astype(np.float32)
 
     def nearest(nm):
         return spectral[..., np.abs(panel.wavelengths_nm - nm).argmin()]
@@ -215,6 +215,70 @@ def test_controls_choose_band_composite_and_index(attached):
     values = nearest(900.0) / nearest(970.0)
     expected = matplotlib.colormaps["viridis"]((values - 0.9) / 0.4)
     np.testing.assert_allclose(outputs["index"], expected[..., :3], atol=0.02)
+
+
+@pytest.fixture
+def index_of(attached):
+    """The output `index` of spectra, before the first training camera."""
+    panel, server, _ = attached
+    panel.legend.install(server)
+    panel.measured_view.cb_hook(SimpleNamespace(value=0))
+    return lambda spectral, **options: panel.render(server.moved_camera(), rendered_as(spectral, **options))["index"]
+
+
+def type_in(panel, text):
+    panel.index_formula.value = text
+    panel.index_formula.cb_hook(panel.index_formula)
+    return panel.legend.gui_handle.content
+
+
+@pytest.fixture
+def spectral():
+    return np.random.default_rng(0).uniform(0.05, 0.9, (24, 36, 12)).astype(np.float32)
+
+
+def test_a_typed_formula_is_shown_in_place_of_the_list_until_it_is_deleted(attached, index_of, spectral):
+    panel = attached[0]
+    from_list = index_of(spectral)
+    told = type_in(panel, "own = R970 / R900 [0.5, 2]")
+    assert "own = R970 / R900" in told
+    assert "colours 0.5 to 2" in told
+    bands = [np.abs(panel.wavelengths_nm - nm).argmin() for nm in (970.0, 900.0)]
+    values = spectral[..., bands[0]] / spectral[..., bands[1]]
+    shown = index_of(spectral)
+    expected = matplotlib.colormaps["viridis"]((values - 0.5) / 1.5)
+    np.testing.assert_allclose(shown, expected[..., :3], atol=0.02)
+    assert "**index** `WI" in type_in(panel, " wi ")
+    type_in(panel, " ")
+    np.testing.assert_array_equal(index_of(spectral), from_list)
+
+
+def test_a_formula_without_ends_keeps_the_colours_of_its_first_picture_of_the_object(attached, index_of, spectral):
+    panel = attached[0]
+    assert "colours" not in type_in(panel, "own = R970 / R900").split("**spectral_angle**")[0]
+    index_of(spectral, opacity=0.1)  # shows no object
+    assert "colours" not in panel.legend.gui_handle.content.split("**spectral_angle**")[0]
+    first = index_of(spectral)
+    told = panel.legend.gui_handle.content
+    assert "colours" in told.split("**spectral_angle**")[0]
+    other = spectral.copy()
+    other[12:] = np.linspace(0.1, 2.0, 12)
+    np.testing.assert_array_equal(first[:12], index_of(other)[:12])
+    assert panel.legend.gui_handle.content == told
+
+
+@pytest.mark.parametrize("text", ["R970 /", "own = __import__('os')", "own = R1240", "<b>", "{own}", "own = R970**"])
+def test_a_wrong_formula_is_answered_by_a_sentence_and_the_list_stays(attached, index_of, spectral, text):
+    panel = attached[0]
+    before = type_in(panel, "")
+    expected = index_of(spectral)
+    told = type_in(panel, text)
+    assert told.endswith(before[before.index("**index**") :])
+    sentence = told[len(before.split("**index**")[0]) : -len(before[before.index("**index**") :])].strip()
+    assert sentence.startswith("**`")  # as code, in which the browser reads no markup
+    assert sentence.endswith("`**")
+    assert "\n" not in sentence
+    np.testing.assert_array_equal(index_of(spectral), expected)
 
 
 def test_what_the_bands_do_not_reach_is_not_offered():

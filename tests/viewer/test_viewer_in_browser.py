@@ -101,6 +101,23 @@ def test_pictures_and_spectra_of_a_ball_from_the_state_it_opens_in(page):
 
 @pytest.mark.slow
 @needs_browser
+def test_an_index_is_typed_in_and_a_wrong_one_is_answered(page):
+    assert shows(page, [LOW, LOW, LOW])
+    choose(page, "Output type", "index")
+    # viser binds no label to a box for text.
+    box = page.get_by_text("Own index", exact=True).locator("xpath=ancestor::*[.//input or .//textarea][1]")
+    box = box.locator("input, textarea").first
+    box.fill("own = R670 / R670 [0, 2]")
+    assert shows(page, 255 * np.array(matplotlib.colormaps["viridis"](0.5)[:3]), beside_it=None)
+    box.fill("own = R670 / R67")
+    page.get_by_text("the index 'own = R670 / R67' cannot be computed").wait_for()
+    box.fill("own = {R670} / <b>")
+    page.get_by_text("the index 'own = {R670} / <b>' cannot be computed").wait_for()
+    assert page.get_by_text("Show Train Cams").is_visible()
+
+
+@pytest.mark.slow
+@needs_browser
 def test_a_reload_shows_the_object_while_the_last_picture_is_still_rendered(page, ball_viewer):
     """At full size a render may take minutes; that of the browser that was closed must not keep the model."""
     assert shows(page, [LOW, LOW, LOW])

@@ -2,6 +2,7 @@
 
 const FRONT_DEPTH = 0.05;
 const FILE_KIND = "hsi-sc-nerf regions";
+const FAR_SPACINGS = 2;
 
 /** Whether a place lies inside a closed line, by the number of its sides to the right (even-odd rule). */
 function inside([x, y], line) {
@@ -59,17 +60,47 @@ function regionFile(cloud, regions) {
   });
 }
 
-/** Names and points of the regions in a file that was saved from a page with the same points. */
+/** The nearest of some places (metres) for each of the page's points, within a reach; -1 where there is none. */
+function nearestOf(cloud, places, reach) {
+  const cells = new Map(), key = (x, y, z) => (x * 65536 + y) * 65536 + z;
+  const cellOf = (place) => place.map((part) => Math.floor(part / reach));
+  places.forEach((place, i) => {
+    const at = key(...cellOf(place));
+    if (cells.has(at)) cells.get(at).push(i); else cells.set(at, [i]);
+  });
+  const around = [-1, 0, 1].flatMap((x) => [-1, 0, 1].flatMap((y) => [-1, 0, 1].map((z) => [x, y, z])));
+  return Array.from({ length: cloud.count }, (_, point) => {
+    const own = cloud.millimetres(point).map((mm) => mm / 1000), cell = cellOf(own);
+    let nearest = -1, least = reach * reach;
+    for (const step of around) {
+      for (const i of cells.get(key(...cell.map((part, axis) => part + step[axis]))) ?? []) {
+        const squared = own.reduce((sum, part, axis) => sum + (part - places[i][axis]) ** 2, 0);
+        if (squared <= least) [nearest, least] = [i, squared];
+      }
+    }
+    return nearest;
+  });
+}
+
+/** Names and points of the regions in a file: of the page's points those whose nearest one there is in the region. */
 function regionsOf(cloud, text) {
   let content;
   try { content = JSON.parse(text); } catch { throw new Error("the file is no JSON; give one that was saved here"); }
-  if (content?.kind !== FILE_KIND || !Array.isArray(content.regions)) {
+  const places = content?.points_m, isPlace = (place) => place?.length === 3 && place.every(Number.isFinite);
+  if (content?.kind !== FILE_KIND || !Array.isArray(content.regions) || !places?.length || !places.every(isPlace)) {
     throw new Error("the file holds no regions; give one that was saved here");
   }
-  const fits = content.points_m?.length === cloud.count && [0, cloud.count - 1].every((point) => cloud
-    .millimetres(point).every((mm, axis) => Math.abs(mm / 1000 - content.points_m[point][axis]) < 1e-4));
-  if (!fits) throw new Error("the regions were drawn on another cloud");
-  return content.regions.map(({ name, points }) => ({
-    name: String(name), points: points.filter((point) => Number.isInteger(point) && point >= 0 && point < cloud.count),
-  })).filter(({ points }) => points.length);
+  // The spacing of as many points on this surface as the file has.
+  const spacing = cloud.spacing * cloud.reach * Math.sqrt(cloud.count / places.length);
+  const nearest = nearestOf(cloud, places, FAR_SPACINGS * spacing);
+  if (nearest.filter((i) => i >= 0).length <= cloud.count / 2) {
+    throw new Error("the regions were drawn on another object, or in another position");
+  }
+  const every = Array.from({ length: cloud.count }, (_, point) => point);
+  const found = content.regions.map(({ name, points }) => {
+    const chosen = new Set(points);
+    return { name: String(name), points: every.filter((point) => chosen.has(nearest[point])) };
+  }).filter(({ points }) => points.length);
+  if (!found.length) throw new Error("its regions hold none of this page's points; write the report with more --points");
+  return found;
 }
