@@ -54,13 +54,14 @@ def rows_of(written, **wanted):
         return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in wanted.items())]
 
 
+def bruise_cm2(day):
+    fruit = fruit_of(day, NM)
+    of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
+    return 1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum()
+
+
 def true_growth_cm2():
-    areas = []
-    for name in ("monday", "friday"):
-        fruit = fruit_of(DAYS[name], NM)
-        of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
-        areas.append(1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum())
-    return areas[1] - areas[0]
+    return bruise_cm2(DAYS["friday"]) - bruise_cm2(DAYS["monday"])
 
 
 @pytest.mark.slow
@@ -102,6 +103,46 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     assert "![Spectrum, 3 friday](spectrum_2.png)" in page
 
 
+ROUGH = CloudErrors(smooth_over_m=0.01, session=0.02, at_base=5.0)
+"""Of sessions whose lamps differ, and of trained runs at the base."""
+CAPTURES = {
+    "first": SetDown(bruise_diameter_m=0.012),
+    "same_day": SetDown(bruise_diameter_m=0.012, turn_deg=120.0, tip_deg=2.0),
+    "later": SetDown(bruise_diameter_m=0.024, turn_deg=40.0, tip_deg=3.0),
+    "again": SetDown(bruise_diameter_m=0.012, turn_deg=250.0, tip_deg=4.0),
+}
+
+
+@pytest.fixture(scope="module")
+def repeated(tmp_path_factory):
+    """Changes of a rough second capture of a day and of a bruise, with another capture of the first day."""
+    folder = tmp_path_factory.mktemp("repeated")
+    for seed, (name, day) in enumerate(CAPTURES.items(), start=20):
+        write_spectral_ply(folder / f"{name}.ply", cloud_of(fruit_of(day, NM), day, ROUGH, 25_000, seed))
+    first, same_day, later, again = (folder / f"{name}.ply" for name in CAPTURES)
+    ChangeCommand((first, same_day, later), folder / "out", MeshConfig(octree_depth=6), repeat=again).main()
+    return folder / "out"
+
+
+@pytest.mark.slow
+def test_what_is_no_larger_than_between_two_captures_of_the_first_day_is_no_change(repeated):
+    rows = rows_of(repeated, after="2 same_day", kind="change")
+    assert {row["name"] for row in rows} >= {"spectrum", "brightness", "NDVI", "WI", "surface"}
+    assert all(row["region"] == "whole surface" and float(row["p"]) > 0.01 for row in rows)
+    page = (repeated / "change.md").read_text()
+    assert "repeat again" in page
+    repeat = json.loads((repeated / "change.json").read_text())["repeat"]
+    assert repeat["attitude"]["turn_deg"] == pytest.approx(-110.0, abs=0.5)
+    assert len(json.loads((repeated / "change.json").read_text())["days"]) == 2
+
+
+@pytest.mark.slow
+def test_a_bruise_is_found_beside_a_second_capture_of_the_first_day(repeated):
+    _, *regions = rows_of(repeated, after="3 later", kind="change", name="brightness")
+    true_cm2 = bruise_cm2(CAPTURES["later"]) - bruise_cm2(CAPTURES["first"])
+    assert [float(row["area_after_cm2"]) for row in regions] == [pytest.approx(true_cm2, rel=0.1)]
+
+
 @pytest.mark.slow
 def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, monkeypatch):
     config = ball_run.write_untrained_run(ball_run.write_ball_dataset(tmp_path / "data"), tmp_path / "runs")
@@ -128,6 +169,16 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
     assert change._file_of(config) == change._file_of(config.parent) == config.parent / "point_cloud.ply"
 
 
+@pytest.mark.parametrize("name", ["brightness", "Surface", "spectrum", "r670", "mine"])
+def test_an_index_with_the_name_of_another_quantity_is_one_sentence(clouds, tmp_path, name):
+    """One of the two would silently take the place of the other."""
+    days, indices = (clouds / "monday", clouds / "friday"), (f"{name} = R800 / R600", "Mine = R900 / R600")
+    with pytest.raises(InputError, match="name of another quantity") as refused:
+        ChangeCommand(days, tmp_path / "out", band_nm=(670.0,), index=indices).main()
+    assert f"{name} = " in str(refused.value) or name == "mine"
+    assert not (tmp_path / "out").exists()
+
+
 def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     first, out = clouds / "monday", tmp_path / "out"
     with pytest.raises(InputError, match="two clouds or more"):
@@ -139,6 +190,8 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     write_spectral_ply(other, type(cloud)(*list(vars(cloud).values())[:3], cloud.spectra[:, :4], NM[:4]))
     with pytest.raises(InputError, match="2 other: has other bands than 1 monday"):
         ChangeCommand((first, other), out).main()
+    with pytest.raises(InputError, match="is one of the days itself"):
+        ChangeCommand((first, clouds / "friday"), out, repeat=first / "point_cloud.ply").main()
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()
     assert not out.exists()
