@@ -113,6 +113,7 @@ if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve(sys.argv[2])
     with socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(600)
         asking.connect(sys.argv[2])
         asking.sendall(json.dumps({"folder": os.getcwd(), "name": sys.argv[3], "step": sys.argv[4]}).encode() + b"\n")
         sys.exit(int(asking.recv(16) or 1))
