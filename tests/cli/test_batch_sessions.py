@@ -24,7 +24,7 @@ from hsi_sc_nerf.simulate.session import WHITE_REFERENCE, simulate_session
 
 pytestmark = pytest.mark.slow
 
-FAILED = ["done", "failed", *["skipped"] * 6]
+SKIPPED = ["skipped"] * 6
 WHOLE = ["apple", "pear_1", "pear_2", "tomato"]
 ROWS = [
     # A pear of 20 steps; the others have fewer.
@@ -47,7 +47,9 @@ TRAIN = " ".join(
 def simulate(folder, name, kind, seed):
     """Eight frames in which the markers are just large enough."""
     scene = override(load_scene(kind), frames=8, size_px=64, bands=8, seed=seed)
-    scene = replace(scene, camera=replace(load_scene("pear").camera, size_px=64))
+    if kind == "apple":
+        # Its own camera sees the markers at less favourable pixels.
+        scene = replace(scene, camera=override(load_scene("pear"), size_px=64).camera)
     if name == "unmarked":
         scene = replace(scene, markers=replace(scene.markers, on_container=0, on_disc=0))
     simulate_session(scene, folder / name, progress=False)
@@ -101,7 +103,11 @@ def season(tmp_path_factory):
 def test_whole_sessions_have_results_and_the_others_a_sentence(season):
     folder, printed = season
     statuses = {name: [status for status, _ in steps] for name, steps in states(folder).items()}
-    assert statuses == {name: ["done"] * 8 for name in WHOLE} | {"broken": FAILED, "unmarked": FAILED}
+    assert statuses == {
+        **dict.fromkeys(WHOLE, ["done"] * 8),
+        "broken": ["failed", "failed", *SKIPPED],
+        "unmarked": ["done", "failed", *SKIPPED],
+    }
     assert "4 of 6 objects are done." in printed
     rows = table(folder)
     assert list(rows) == [name for name, *_ in ROWS]
