@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
@@ -26,6 +27,8 @@ from hsi_sc_nerf.spectra import require_bands
 SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
 MISPLACED_M = 0.0003
 """How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
+RIM_M = 0.006
+"""Patches this near to what is not seen lie at its rim: seen at grazing angles, beside what the object stands on."""
 _LEAST_PATCHES = 20
 _NOISE_RATIO = 3.0
 """Stated noise further from the usual one than this is not believed."""
@@ -105,6 +108,10 @@ def changes(
             )
     misplaced_m = _misplaced_m(before, after, one.mesh.vertices)
     noise = _relative_noise(before, after, patches)
+    hidden = one.mesh.vertices[~np.all([day.surface.seen for day in days], axis=0)]
+    rim = np.zeros(len(patches.areas_m2), bool)
+    if len(hidden):
+        rim = cKDTree(hidden).query(patches.centres_m)[0] < RIM_M
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
 
@@ -120,7 +127,7 @@ def changes(
         of_patches, *of_repeat = (patches.means(each - first, one.areas_m2) for each in (last, *again))
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
-        test = significance(of_patches, patches.centres_m, noise, off, shared, *of_repeat)
+        test = significance(of_patches, patches.centres_m, noise, off, shared, *of_repeat, rim=rim)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(

@@ -107,6 +107,7 @@ def significance(
     misplaced: Float[np.ndarray, "p k"],
     session_sd: Float[np.ndarray, "k"],
     repeat: Float[np.ndarray, "p k"] | None = None,
+    rim: Bool[np.ndarray, "p"] | None = None,
 ) -> Significance:
     """Test each patch's change against the errors that the changes of all patches show.
 
@@ -116,9 +117,9 @@ def significance(
     ratios, is compared with Hotelling's distribution for as many observations as there are independent parts.
 
     The changes ``repeat`` between two captures of one day are errors alone. No noise is less than theirs: neither
-    that of all patches, nor half of the largest error around a patch, nor what a whole session shares. Errors are as
-    smooth as the smoother of the two. A patch has then changed if its change is significant in itself, and beyond
-    that of the whole surface.
+    that of all patches, nor half of the largest error around a patch (for one at the rim of what is seen, anywhere at
+    the rim), nor what a whole session shares. Errors are as smooth as the smoother of the two. A patch has then
+    changed if its change is significant in itself, and beyond that of the whole surface.
 
     Args:
         change: after less before, NaN where it is not known.
@@ -127,6 +128,7 @@ def significance(
         misplaced: change of each patch that an error of the registration would make.
         session_sd: standard deviation of errors that a whole session shares.
         repeat: change of each patch from the first day to another capture of it, NaN where it is not known.
+        rim: which patches lie at the rim of what is seen; none by default.
 
     Example:
         >>> centres_m = np.random.default_rng(0).random((400, 3))
@@ -153,7 +155,8 @@ def significance(
         noise = np.maximum(noise, _noise(errors[both], spread[both]))
         session_sd = np.maximum(session_sd, np.abs(shared))
         sd = np.hypot(noise * spread, misplaced[known])
-        sd *= np.maximum(_largest_around(errors / sd, centres_m[known], both) / _LARGEST, 1.0)
+        at_rim = np.zeros(len(used), bool) if rim is None else rim[known]
+        sd *= np.maximum(_largest_around(errors / sd, centres_m[known], both, at_rim) / _LARGEST, 1.0)
         found = correlation(beyond / sd, centres_m[known]), correlation((errors / sd)[both], centres_m[known][both])
         length_m, independent = max(one for one, _ in found), min(one for _, one in found)
         in_itself = np.square(used / np.hypot(sd, session_sd)).sum(axis=1)
@@ -172,11 +175,17 @@ def _noise(beyond: Float[np.ndarray, "n k"], spread: Float[np.ndarray, "n 1"]) -
 
 
 def _largest_around(
-    ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n 3"], known: Bool[np.ndarray, "n"]
+    ratio: Float[np.ndarray, "n k"],
+    centres_m: Float[np.ndarray, "n 3"],
+    known: Bool[np.ndarray, "n"],
+    rim: Bool[np.ndarray, "n"],
 ) -> Float[np.ndarray, "n k"]:
-    """Largest size of the known ratios around each patch; 0 where none is known."""
+    """Largest size of the known ratios around each patch, or at the whole rim; 0 where none is known."""
     size = np.where(known[:, None], np.abs(ratio), 0.0)
-    return np.stack([size[near].max(axis=0) for near in cKDTree(centres_m).query_ball_point(centres_m, _NEAR_M)])
+    around = cKDTree(centres_m).query_ball_point(centres_m, _NEAR_M)
+    largest = np.stack([size[near].max(axis=0) for near in around])
+    largest[rim] = np.maximum(largest[rim], size[rim].max(axis=0, initial=0.0))
+    return largest
 
 
 def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
