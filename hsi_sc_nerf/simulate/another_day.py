@@ -19,7 +19,7 @@ from hsi_sc_nerf.simulate.true_surface import TrueSurface
 
 STAND_M = 0.07
 """Height of the container."""
-BASE_M = 0.012
+BASE_M = 0.006
 """Height of what counts as the base."""
 _SMOOTH_SD = 0.7
 """Of `smooth_noise`."""

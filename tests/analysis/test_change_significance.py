@@ -89,6 +89,21 @@ def test_what_two_captures_of_a_day_share_is_no_change_of_the_whole_surface():
     assert outcome(change + 20.0, centres_m, repeat=repeat).whole_p < 1e-6
 
 
+def test_at_the_rim_errors_anywhere_at_the_rim_count():
+    """An object that is set down anew leans to another side."""
+    centres_m, rng = ball_patches(), np.random.default_rng(0)
+    change, repeat = rng.normal(size=(2, len(centres_m), 1))
+    rim = centres_m[:, 2] < -0.03
+    change[np.argmin(np.where(rim, centres_m[:, 0], 1.0))] = 14.0
+    repeat[np.argmax(np.where(rim, centres_m[:, 0], -1.0))] = -12.0
+    assert (outcome(change, centres_m, repeat=repeat).p < FALSE_DISCOVERIES).sum() == 1
+    assert not (outcome(change, centres_m, repeat=repeat, rim=rim).p < FALSE_DISCOVERIES).any()
+    spot = np.argmax(centres_m[:, 2])
+    change[spot] = 14.0
+    found = outcome(change, centres_m, repeat=repeat, rim=rim).p < FALSE_DISCOVERIES
+    assert np.flatnonzero(found).tolist() == [spot]
+
+
 def test_a_second_capture_that_does_not_see_a_part_says_nothing_of_it():
     centres_m, rng = ball_patches(), np.random.default_rng(0)
     change, repeat = rng.normal(size=(2, len(centres_m), 1))
