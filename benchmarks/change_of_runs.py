@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from change_over_time import AGAIN, GROWN, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
+from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.analysis.change import Comparison, compare_days
 from hsi_sc_nerf.analysis.change_days import Day, days_on_one_mesh
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
-from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -35,6 +34,8 @@ from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import write_mesh
 
 BANDS, FRAMES, SIZE_PX, POINTS = 25, 36, 128, 200_000
+EVERY = 4
+"""So many points for each one that is compared, to save time."""
 EFFECTS = ("photon_noise", "read_noise", "{lamp: {fraction: 0.3}}", "{lamp_drift: {percent: -3.0}}")
 NM = np.linspace(400.0, 1000.0, BANDS)
 DAYS = {
@@ -55,18 +56,23 @@ class ChangeOfRuns:
     """For sessions and runs."""
     fruits: tuple[int, ...] = (3, 4, 5)
     """Seeds, each of another apple."""
+    days: tuple[str, ...] = tuple(DAYS)
+    """Of `DAYS`; the first day and its repeat must be among them."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print, write."""
         rows = [row for fruit in track(self.fruits, "Fruits") for row in self._rows(fruit)]
-        write_results("change_of_runs", COLUMNS, rows, seed=" ".join(map(str, self.fruits)), folder=self.results)
+        write_results(
+            "change_of_runs", COLUMNS, rows, keys=3, seed=" ".join(map(str, self.fruits)), folder=self.results
+        )
 
     def _rows(self, fruit: int) -> list[list[str]]:
-        each = enumerate(DAYS.values())
-        clouds = [session_cloud(self.folder / f"{fruit}-{at}", day, fruit, 10 * fruit + at) for at, day in each]
-        first, repeat, *later = days_on_one_mesh(clouds, list(DAYS), MeshConfig(), MAX_INCIDENCE_DEG)
+        each = [(at, name, day) for at, (name, day) in enumerate(DAYS.items()) if name in self.days]
+        clouds = [session_cloud(self.folder / f"{fruit}-{at}", day, fruit, 10 * fruit + at) for at, _, day in each]
+        names = [name for _, name, _ in each]
+        first, repeat, *later = days_on_one_mesh(clouds, names, MESH, MAX_INCIDENCE_DEG)
         rows = []
         for given in (None, repeat):
             # Without a second capture of the first day, that one is a day as well.
@@ -124,7 +130,7 @@ def session_cloud(folder: Path, day: SetDown, fruit_seed: int, session_seed: int
     for name, left, words in steps:
         if not left.exists():
             run_step(name, typed_command(words), folder / f"{name}.log")
-    return read_spectral_ply(cloud)
+    return read_spectral_ply(cloud).select(slice(None, None, EVERY))
 
 
 if __name__ == "__main__":
