@@ -19,6 +19,8 @@ from hsi_sc_nerf.simulate.true_surface import TrueSurface
 
 STAND_M = 0.07
 """Height of the container."""
+BASE_M = 0.006
+"""Height of what counts as the base."""
 _SMOOTH_SD = 0.7
 """Standard deviation of `smooth_noise`."""
 
@@ -56,6 +58,8 @@ class CloudErrors:
         smooth_over_m: size of the smooth errors' features.
         session: of reflectance, relative, common to the whole session, and its slope from one end of the bands to
             the other.
+        at_base: the smooth errors at the base, which cameras see at grazing angles, relative to those elsewhere;
+            they fall to the latter within `BASE_M`.
     """
 
     position_m: float = 0.0002
@@ -64,6 +68,7 @@ class CloudErrors:
     smooth: float = 0.015
     smooth_over_m: float = 0.02
     session: float = 0.005
+    at_base: float = 1.0
 
 
 def fruit_of(
@@ -73,14 +78,18 @@ def fruit_of(
     rng = np.random.default_rng(seed)
     fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
     shape = (apple if kind == "apple" else pear)(fruit.height_m, rng)
-    dried: dict[str, Material] = {
+    weights = fruit_weights(shape, fruit, rng)
+    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
+    return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
+
+
+def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:
+    """The fruit's tissues with the water that they have left on that day, by name."""
+    return {
         name: replace(tissue, water=tissue.water * (1.0 - day.dried))
         for name in FRUIT_MATERIALS[kind]
         if isinstance(tissue := MATERIALS[name], PlantTissue)
     }
-    weights = fruit_weights(shape, fruit, rng)
-    spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried)
-    return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
 
 
 def cloud_of(true: TrueSurface, day: SetDown, errors: CloudErrors, points: int, seed: int) -> SpectralCloud:
@@ -97,9 +106,11 @@ def cloud_of(true: TrueSurface, day: SetDown, errors: CloudErrors, points: int, 
     if not day.keeps_stem:
         cloud = cloud.select(there.nearest(cloud.points)[1][:, there.materials.index("stem")] < 0.5)
     at, count = cloud.points.astype(float), len(cloud)
+    base = np.clip(1.0 - (at[:, 2] - at[:, 2].min()) / BASE_M, 0.0, 1.0)
 
     def smooth() -> np.ndarray:
-        return smooth_noise(at, errors.smooth_over_m, rng) / _SMOOTH_SD
+        factor = 1.0 + (errors.at_base - 1.0) * base
+        return factor * smooth_noise(at, errors.smooth_over_m, rng) / _SMOOTH_SD
 
     along = np.linspace(-1.0, 1.0, len(cloud.wavelengths_nm))
     level, slope = (errors.smooth * smooth()[:, None] for _ in range(2))

@@ -161,22 +161,24 @@ def _row(kind: str, name: str, day: SetDown, first: TrueSurface, now: TrueSurfac
     water_found = f"{whole:+.4f} ± {whole_sd:.4f}"
     water = f"{_water_change(first, now):+.4f}"
     if day.bruise_diameter_m != AGAIN:
-        true_cm2 = _bruise_cm2(now) - _bruise_cm2(first)
+        true_cm2 = bruise_cm2(now) - bruise_cm2(first)
         largest = brightness.regions[0] if brightness.regions else None
         of_class = one.classes["bruise"][0]
         grew = f"{true_cm2:.2f}"
-        by_brightness = _beside(1e4 * largest.area_m2, true_cm2) if largest else "none"
-        by_class = _beside(1e4 * (of_class.after_m2 - of_class.before_m2), true_cm2)
+        by_brightness = beside(1e4 * largest.area_m2, true_cm2) if largest else "none"
+        by_class = beside(1e4 * (of_class.after_m2 - of_class.before_m2), true_cm2)
     cells = [f"{day.turn_deg:g}", f"{attitude.turn_deg % 360:.2f} ± {attitude.turn_sd_deg:.2f}", f"{day.growth:g}"]
     cells += [f"{attitude.growth:.4f} ± {attitude.growth_sd:.4f}", grew, by_brightness, by_class]
     return [kind, name, *cells, water, water_found, f"{_false_cm2(first, now, day, one):.2f}"]
 
 
-def _beside(found: float, true: float) -> str:
+def beside(found: float, true: float) -> str:
+    """An area and by how much it differs from the true one."""
     return f"{found:.2f} ({100 * (found / true - 1):+.0f} %)"
 
 
-def _bruise_cm2(fruit: TrueSurface) -> float:
+def bruise_cm2(fruit: TrueSurface) -> float:
+    """True area of the bruise."""
     return float(1e4 * _areas_m2(fruit)[fruit.weights[:, fruit.materials.index("bruise")] > BRUISED].sum())
 
 

@@ -47,6 +47,7 @@ def compare_days(
     smallest_m2: float,
     library: SpectralLibrary | None = None,
     angle_rad: float = np.inf,
+    repeat: Day | None = None,
 ) -> Iterable[Comparison]:
     """Compare each day with the first, one after the other.
 
@@ -58,6 +59,7 @@ def compare_days(
         smallest_m2: smaller regions are left out.
         library: spectra to classify the surface by.
         angle_rad: largest spectral angle of a class.
+        repeat: another capture of the first day, `hsi_sc_nerf.analysis.change_maps.changes`.
 
     Raises:
         InputError: too little is seen on both days, or the library or a wavelength does not fit the bands.
@@ -66,7 +68,7 @@ def compare_days(
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
     at_first = None if library is None else classified(first.surface, library, angle_rad, smallest_m2)
     for before, after in pairwise(days):
-        quantities = changes(first, after, bands_nm, indices, session_sd, smallest_m2)
+        quantities = changes(first, after, bands_nm, indices, session_sd, smallest_m2, repeat)
         grown = {}
         for name, quantity in quantities.items():
             then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
@@ -26,6 +27,8 @@ from hsi_sc_nerf.spectra import require_bands
 SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
 MISPLACED_M = 0.0003
 """How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
+RIM_M = 0.006
+"""Patches this near to what is not seen lie at its rim: seen at grazing angles, beside what the object stands on."""
 _LEAST_PATCHES = 20
 _NOISE_RATIO = 3.0
 """Stated noise further from the usual one than this is not believed."""
@@ -74,6 +77,7 @@ def changes(
     indices: Sequence[SpectralIndex],
     session_sd: float,
     smallest_m2: float,
+    repeat: Day | None = None,
 ) -> dict[str, Quantity]:
     """The change of each quantity from one day to another, tested patch by patch, by name.
 
@@ -85,34 +89,45 @@ def changes(
         session_sd: relative standard deviation of the reflectance that the white references of two sessions make
             alike for the whole surface, as a level and as a slope over the bands.
         smallest_m2: smaller regions are left out.
+        repeat: another capture of the day before, on the same mesh. What is no larger than between these two is no
+            change.
 
     Raises:
-        InputError: too little of the surface is seen on both days, or a wavelength has no band near it.
+        InputError: too little of the surface is seen on both days, a wavelength has no band near it, or an index has
+            the name of another quantity.
     """
+    require_own_names(bands_nm, indices)
     one, other = before.surface, after.surface
+    days = [before, after] if repeat is None else [before, after, repeat]
     seen = one.seen & other.seen
     patches = surface_patches(one.mesh.vertices, one.areas_m2, seen)
-    if len(patches.areas_m2) < _LEAST_PATCHES:
-        raise InputError(
-            f"{after.name} beside {before.name}: hardly any surface is seen on both days; give clouds of one object."
-        )
+    for day in days[1:]:
+        if len(np.unique(patches.of_vertex[seen & day.surface.seen])) < _LEAST_PATCHES:
+            raise InputError(
+                f"{day.name} beside {before.name}: hardly any surface is seen in both; give clouds of one object."
+            )
     misplaced_m = _misplaced_m(before, after, one.mesh.vertices)
     noise = _relative_noise(before, after, patches)
+    hidden = one.mesh.vertices[~np.all([day.surface.seen for day in days], axis=0)]
+    rim = np.zeros(len(patches.areas_m2), bool)
+    if len(hidden):
+        rim = cKDTree(hidden).query(patches.centres_m)[0] < RIM_M
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
 
     def tested(
         name: str,
         unit: str,
-        values: tuple[Float[np.ndarray, "v k"], Float[np.ndarray, "v k"]],
+        values: Sequence[Float[np.ndarray, "v k"]],
         shared: Float[np.ndarray, "k"],
         shown: Float[np.ndarray, "v"] | None = None,
     ) -> Quantity:
-        first, last = (np.where(seen[:, None], each, np.nan) for each in values)
-        of_patches = patches.means(last - first, one.areas_m2)
+        each_day = zip(days, values, strict=True)
+        first, last, *again = (np.where(day.surface.seen[:, None], each, np.nan) for day, each in each_day)
+        of_patches, *of_repeat = (patches.means(each - first, one.areas_m2) for each in (last, *again))
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
-        test = significance(of_patches, patches.centres_m, noise, off, shared)
+        test = significance(of_patches, patches.centres_m, noise, off, shared, *of_repeat, rim=rim)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
@@ -123,25 +138,52 @@ def changes(
 
     found: dict[str, Quantity] = {}
     if len(one.wavelengths_nm) > 1:
-        units = [unit_spectra(surface.spectra) for surface in (one, other)]
+        units = [unit_spectra(day.surface.spectra) for day in days]
         axes = _axes((units[1] - units[0])[seen])
         shared = unit_spectra(typical * (1.0 + modes)) - unit_spectra(typical)
         angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(units[1] - units[0], axis=1) / 2.0, 0.0, 1.0))
         found[SPECTRUM] = tested(
-            SPECTRUM, "rad", (units[0] @ axes.T, units[1] @ axes.T), np.linalg.norm(shared @ axes.T, axis=0), angle
+            SPECTRUM, "rad", [each @ axes.T for each in units], np.linalg.norm(shared @ axes.T, axis=0), angle
         )
-    measured, then, usual = (
-        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (one.spectra, other.spectra, typical)
+    usual, *moved = (
+        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (typical, *(typical * (1.0 + m) for m in modes))
     )
-    moved = [_scalars(typical * (1.0 + mode), one.wavelengths_nm, bands_nm, indices) for mode in modes]
-    for name, values in measured.items():
+    measured = [_scalars(day.surface.spectra, one.wavelengths_nm, bands_nm, indices) for day in days]
+    for name in usual:
+        values = [each[name][:, None] for each in measured]
         # An index of hardly any light is not defined.
-        if np.isfinite(patches.means((then[name] - values)[:, None], one.areas_m2)).sum() >= _LEAST_PATCHES:
+        known = [np.isfinite(patches.means(each - values[0], one.areas_m2)).sum() for each in values[1:]]
+        if min(known) >= _LEAST_PATCHES:
             shared = np.linalg.norm([each[name] - usual[name] for each in moved], axis=0)
-            found[name] = tested(name, "1", (values[:, None], then[name][:, None]), shared)
-    raised_mm = 1e3 * before.raised_m[:, None], 1e3 * after.raised_m[:, None]
-    found[SURFACE] = tested(SURFACE, "mm", raised_mm, np.zeros(1))
+            found[name] = tested(name, "1", values, shared)
+    found[SURFACE] = tested(SURFACE, "mm", [1e3 * day.raised_m[:, None] for day in days], np.zeros(1))
     return found
+
+
+def require_own_names(bands_nm: Sequence[float], indices: Sequence[SpectralIndex]) -> None:
+    """Check that no index has the name of another quantity, which one of the two would replace.
+
+    Names of files and columns are in lower case, so that names may not differ in case only.
+
+    Args:
+        bands_nm: wavelengths whose reflectance is compared.
+        indices: that are compared.
+
+    Raises:
+        InputError: an index has the name of another quantity.
+    """
+    taken = {name.casefold(): name for name in (SPECTRUM, BRIGHTNESS, SURFACE, *map(_band_name, bands_nm))}
+    for index in indices:
+        if other := taken.get(index.name.casefold()):
+            raise InputError(
+                f"the index '{index.definition}' has the name of another quantity that is compared, {other}; give it "
+                "a name of its own (--index)."
+            )
+        taken[index.name.casefold()] = index.name
+
+
+def _band_name(wavelength_nm: float) -> str:
+    return f"R{wavelength_nm:g}"
 
 
 def _scalars(
@@ -154,7 +196,7 @@ def _scalars(
     values = {BRIGHTNESS: np.log(np.maximum(spectra.mean(axis=1), 1e-4))}
     for wavelength in bands_nm:
         (band,) = require_bands(nm, [wavelength], "--band-nm")
-        values[f"R{wavelength:g}"] = spectra[:, band]
+        values[_band_name(wavelength)] = spectra[:, band]
     return values | {index.name: index_values(index, spectra, nm) for index in indices}
 
 

@@ -71,9 +71,20 @@ def _areas(before_m2: float, after_m2: float, centre_m: Sequence[float] = ()) ->
 
 
 def write_tables(
-    folder: Path, comparisons: Sequence[Comparison], settings: Mapping[str, Any], pictures: Mapping[str, str]
+    folder: Path,
+    comparisons: Sequence[Comparison],
+    settings: Mapping[str, Any],
+    pictures: Mapping[str, str],
+    repeat: Day | None = None,
 ) -> None:
     """Write change.csv, change.md, and last change.json; NaN is null or empty.
+
+    Args:
+        folder: for the files.
+        comparisons: of the days.
+        settings: that are kept in change.json.
+        pictures: names of files by title.
+        repeat: another capture of the first day, if the noise is also taken from it.
 
     Raises:
         InputError: a file cannot be written.
@@ -86,7 +97,7 @@ def write_tables(
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         writer.writerows([_cell(row[column]) for column in COLUMNS] for row in rows)
-    parts = ["# Change over time", *_set_down(comparisons)]
+    parts = ["# Change over time", *_set_down(comparisons, repeat)]
     parts += ["## What changed", *_table([row for row in rows if row["kind"] == "change"])]
     for kind, heading in (("grown", "Areas since the day before"), ("class", "Areas of classes")):
         if some := [row for row in rows if row["kind"] == kind]:
@@ -95,17 +106,17 @@ def write_tables(
     parts.append("[The days as a film](change.mp4)")
     with atomic_write(folder / "change.md") as (temporary,):
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    write_json(folder / "change.json", _content(comparisons, rows, settings))
+    write_json(folder / "change.json", _content(comparisons, rows, settings, repeat))
 
 
 def _content(
-    comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]
+    comparisons: Sequence[Comparison],
+    rows: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any],
+    repeat: Day | None,
 ) -> dict[str, Any]:
     days = []
     for one in comparisons:
-        assert one.after.attitude is not None
-        attitude = asdict(one.after.attitude)
-        attitude["transform"] = one.after.attitude.transform.matrix().tolist()
         noise = {
             name: {
                 "noise": quantity.test.noise.tolist(),
@@ -115,23 +126,30 @@ def _content(
             }
             for name, quantity in one.quantities.items()
         }
-        days.append({"name": one.after.name, "attitude": _plain(attitude), "noise": noise})
+        days.append(_placed(one.after) | {"noise": noise})
     return {
         "settings": dict(settings),
         "first_day": comparisons[0].before,
+        "repeat": None if repeat is None else _placed(repeat),
         "days": days,
         "rows": [_plain(row) for row in rows],
     }
 
 
-def _set_down(comparisons: Sequence[Comparison]) -> list[str]:
+def _placed(day: Day) -> dict[str, Any]:
+    assert day.attitude is not None
+    attitude = asdict(day.attitude) | {"transform": day.attitude.transform.matrix().tolist()}
+    return {"name": day.name, "attitude": _plain(attitude)}
+
+
+def _set_down(comparisons: Sequence[Comparison], repeat: Day | None) -> list[str]:
     rows = []
-    for one in comparisons:
-        found = one.after.attitude
+    for day in (*(one.after for one in comparisons), *([] if repeat is None else [repeat])):
+        found = day.attitude
         assert found is not None
         rows.append(
             [
-                *(one.after.name, f"{found.turn_deg:.2f} ± {found.turn_sd_deg:.2f}", f"{found.tip_deg:.1f}"),
+                *(day.name, f"{found.turn_deg:.2f} ± {found.turn_sd_deg:.2f}", f"{found.tip_deg:.1f}"),
                 *(f"{found.growth:.4f} ± {found.growth_sd:.4f}", f"{1e3 * found.residual_m:.2f}"),
                 "none" if math.isnan(found.rival_p) else f"{found.rival_turn_deg:.0f}° away, p = {found.rival_p:.1g}",
             ]
@@ -141,6 +159,8 @@ def _set_down(comparisons: Sequence[Comparison]) -> list[str]:
         f"Compared with {markdown_text(comparisons[0].before)}. The turn is about the table's axis, ± is a standard "
         "deviation, and p the probability that another attitude fits so much worse by chance."
     )
+    if repeat is not None:
+        note += f" What is no larger than between it and {markdown_text(repeat.name)} is no change."
     return ["## How the object was set down", markdown_table([*header, "next best attitude"], rows), note]
 
 

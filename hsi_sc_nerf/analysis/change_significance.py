@@ -26,6 +26,10 @@ _BIWEIGHT_EFFICIENCY = 0.87
 _CLIPPED = 3.0
 _ROUNDING = 1e-5
 """In every unit that is compared: radians, reflectance, millimetres."""
+_NEAR_M = 0.015
+"""Within this distance of a place, errors are of one size."""
+_LARGEST = 2.0
+"""The largest of some ten normal errors, in standard deviations."""
 _BINS = 24
 _MOST_PATCHES = 1500
 """Patches that the correlation is found from."""
@@ -102,6 +106,8 @@ def significance(
     relative_noise: Float[np.ndarray, "p"],
     misplaced: Float[np.ndarray, "p k"],
     session_sd: Float[np.ndarray, "k"],
+    repeat: Float[np.ndarray, "p k"] | None = None,
+    rim: Bool[np.ndarray, "p"] | None = None,
 ) -> Significance:
     """Test each patch's change against the errors that the changes of all patches show.
 
@@ -110,12 +116,19 @@ def significance(
     patches; patches that changed hardly count in it while they are fewer than half. T², the sum of the k squared
     ratios, is compared with Hotelling's distribution for as many observations as there are independent parts.
 
+    The changes ``repeat`` between two captures of one day are errors alone. No noise is less than theirs: neither
+    that of all patches, nor half of the largest error around a patch (for one at the rim of what is seen, anywhere at
+    the rim), nor what a whole session shares. Errors are as smooth as the smoother of the two. A patch has then
+    changed if its change is significant in itself, and beyond that of the whole surface.
+
     Args:
         change: after less before, NaN where it is not known.
         centres_m: of the patches.
         relative_noise: stated noise of each patch relative to that of the usual one.
         misplaced: change of each patch that an error of the registration would make.
         session_sd: standard deviation of errors that a whole session shares.
+        repeat: change of each patch from the first day to another capture of it, NaN where it is not known.
+        rim: which patches lie at the rim of what is seen; none by default.
 
     Example:
         >>> centres_m = np.random.default_rng(0).random((400, 3))
@@ -130,18 +143,49 @@ def significance(
     spread = np.sqrt((1.0 + np.square(relative_noise[known, None])) / 2.0)
     whole = np.median(used, axis=0)
     beyond = used - whole
-    noise = np.array([biweight_scale(column) for column in (beyond / spread).T])
-    ratio = beyond / np.sqrt(np.square(noise * spread) + np.square(misplaced[known]))
-    length_m, independent = correlation(ratio, centres_m[known])
+    noise = _noise(beyond, spread)
+    if repeat is None:
+        sd = np.hypot(noise * spread, misplaced[known])
+        length_m, independent = correlation(beyond / sd, centres_m[known])
+        squares = np.square(beyond / sd).sum(axis=1)
+    else:
+        both = np.isfinite(repeat[known]).all(axis=1)
+        shared = np.median(repeat[known][both], axis=0)
+        errors = repeat[known] - shared
+        noise = np.maximum(noise, _noise(errors[both], spread[both]))
+        session_sd = np.maximum(session_sd, np.abs(shared))
+        sd = np.hypot(noise * spread, misplaced[known])
+        at_rim = np.zeros(len(used), bool) if rim is None else rim[known]
+        sd *= np.maximum(_largest_around(errors / sd, centres_m[known], both, at_rim) / _LARGEST, 1.0)
+        found = correlation(beyond / sd, centres_m[known]), correlation((errors / sd)[both], centres_m[known][both])
+        length_m, independent = max(one for one, _ in found), min(one for _, one in found)
+        in_itself = np.square(used / np.hypot(sd, session_sd)).sum(axis=1)
+        squares = np.minimum(np.square(beyond / sd).sum(axis=1), in_itself)
     observations = max(independent * _BIWEIGHT_EFFICIENCY, dimensions + 2.0)
     p = np.ones(len(change))
-    p[known] = stats.false_discovery_control(
-        hotelling_p(np.square(ratio).sum(axis=1), dimensions, observations), method="by"
-    )
+    p[known] = stats.false_discovery_control(hotelling_p(squares, dimensions, observations), method="by")
     # The median of normal errors has pi / 2 times the variance of the mean.
     whole_sd = np.sqrt(np.pi / 2.0 * np.square(noise) / independent + np.square(session_sd))
     whole_p = hotelling_p(np.square(whole / whole_sd).sum(), dimensions, observations)
     return Significance(p, noise, length_m, independent, whole, whole_sd, float(whole_p))
+
+
+def _noise(beyond: Float[np.ndarray, "n k"], spread: Float[np.ndarray, "n 1"]) -> Float[np.ndarray, "k"]:
+    return np.array([biweight_scale(column) for column in (beyond / spread).T])
+
+
+def _largest_around(
+    ratio: Float[np.ndarray, "n k"],
+    centres_m: Float[np.ndarray, "n 3"],
+    known: Bool[np.ndarray, "n"],
+    rim: Bool[np.ndarray, "n"],
+) -> Float[np.ndarray, "n k"]:
+    """Largest size of the known ratios around each patch, or at the whole rim; 0 where none is known."""
+    size = np.where(known[:, None], np.abs(ratio), 0.0)
+    around = cKDTree(centres_m).query_ball_point(centres_m, _NEAR_M)
+    largest = np.stack([size[near].max(axis=0) for near in around])
+    largest[rim] = np.maximum(largest[rim], size[rim].max(axis=0, initial=0.0))
+    return largest
 
 
 def biweight_scale(values: Float[np.ndarray, "n"]) -> float:

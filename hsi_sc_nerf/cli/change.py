@@ -42,6 +42,9 @@ class ChangeCommand:
     """Folder to write the results to."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """Settings of the mesh, which is made from the first day."""
+    repeat: Path | None = None
+    """Another capture of the first day, for which the object was set down anew: a cloud, folder or run as for the
+    days. It tells what setting down, poses and lamps alone make of the object; what is no larger is no change."""
     band_nm: tuple[float, ...] = ()
     """Wavelengths (nm) whose reflectance is compared, beside spectra and indices."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -69,7 +72,7 @@ class ChangeCommand:
         from hsi_sc_nerf.analysis import change_pictures, change_report
         from hsi_sc_nerf.analysis.change import compare_days
         from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
-        from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM
+        from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, require_own_names
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.pictures import SideViews
         from hsi_sc_nerf.indices.catalogue import find_indices
@@ -79,11 +82,19 @@ class ChangeCommand:
             raise InputError("a change needs two clouds or more; give the one before and those after.")
         require_writable(self.output_dir)
         library = read_library(self.library) if self.library else None
-        files = [_file_of(path) for path in self.clouds]
+        paths = [*self.clouds, self.repeat] if self.repeat else [*self.clouds]
+        files = [_file_of(path) for path in paths]
         names = [f"{day} {_day_name(path)}" for day, path in enumerate(self.clouds, start=1)]
+        if self.repeat:
+            names.append(f"repeat {_day_name(self.repeat)}")
+            if files[-1].resolve() in [file.resolve() for file in files[:-1]]:
+                raise InputError(
+                    f"{self.repeat}: is one of the days itself; give --repeat another capture of the first."
+                )
         console = Console(stderr=True)
         clouds = [_read(path) for path in track(files, "Reading", console=console, transient=True)]
         indices = find_indices(self.index, clouds[0].wavelengths_nm)
+        require_own_names(self.band_nm, indices)
         if library is not None:
             library = library.at(clouds[0].wavelengths_nm)
         days = days_on_one_mesh(
@@ -93,8 +104,10 @@ class ChangeCommand:
             self.max_incidence_deg,
             lambda starts: track(starts, "Registering", console=console, transient=True),
         )
+        repeat = days.pop() if self.repeat else None
+        smallest_m2 = self.smallest_region_cm2 * 1e-4
         compared = compare_days(
-            days, self.band_nm, indices, self.session_std, self.smallest_region_cm2 * 1e-4, library, self.angle_rad
+            days, self.band_nm, indices, self.session_std, smallest_m2, library, self.angle_rad, repeat
         )
         steps = track(compared, "Comparing", total=len(days) - 1, console=console, transient=True)
         comparisons = list(steps)
@@ -114,7 +127,7 @@ class ChangeCommand:
             change_report.write_change_ply(self.output_dir / "change.ply", days[0], comparisons)
             settings = {"band_nm": list(self.band_nm), "session_std": self.session_std, **asdict(self.mesh)}
             settings |= {"max_incidence_deg": self.max_incidence_deg, "smallest_region_cm2": self.smallest_region_cm2}
-            change_report.write_tables(self.output_dir, comparisons, settings, pictures)
+            change_report.write_tables(self.output_dir, comparisons, settings, pictures, repeat)
         page = escape(str(self.output_dir / "change.md"))
         console.print(f"Changes, with pictures: {page}", soft_wrap=True)
 

@@ -51,6 +51,69 @@ def test_a_spot_that_stands_out_of_smooth_errors_is_found_and_nothing_else(smoot
         assert found[~spot].sum() <= 1
 
 
+def errors_of_a_capture(centres_m, seed, at_base=1.0):
+    """Smooth errors, larger by a factor at the base."""
+    low = centres_m[:, 2] < -0.75 * np.abs(centres_m).max()
+    return smooth_noise(centres_m, 0.01, np.random.default_rng(seed))[:, None] * np.where(low, at_base, 1.0)[:, None]
+
+
+def test_errors_that_are_larger_at_the_base_are_no_change_where_a_second_capture_shows_them():
+    centres_m, alone, told = ball_patches(), 0, 0
+    spot = np.linalg.norm(centres_m - centres_m[300], axis=1) < 0.012
+    for seed in range(20):
+        first, again, later = (errors_of_a_capture(centres_m, 3 * seed + day, 6.0) for day in range(3))
+        alone += (outcome(later - first, centres_m).p < FALSE_DISCOVERIES).any()
+        told += (outcome(later - first, centres_m, repeat=again - first).p < FALSE_DISCOVERIES).any()
+        bruised = later - first + 15.0 * spot[:, None]
+        found = outcome(bruised, centres_m, repeat=again - first).p < FALSE_DISCOVERIES
+        assert found[spot].all()
+    assert alone > 10
+    assert told <= 1
+
+
+def test_with_a_second_capture_what_did_not_change_itself_is_no_change():
+    """Where most of the surface changed, the rest stands out from it."""
+    centres_m, rng = ball_patches(), np.random.default_rng(0)
+    change, repeat = rng.normal(size=(2, len(centres_m), 1))
+    kept = centres_m[:, 0] > 0.025
+    change[~kept] += 30.0
+    assert (outcome(change, centres_m).p[kept] < FALSE_DISCOVERIES).all()
+    assert not (outcome(change, centres_m, repeat=repeat).p < FALSE_DISCOVERIES).any()
+
+
+def test_what_two_captures_of_a_day_share_is_no_change_of_the_whole_surface():
+    centres_m, rng = ball_patches(), np.random.default_rng(0)
+    change, repeat = rng.normal(3.0, 1.0, size=(2, len(centres_m), 1))
+    assert outcome(change, centres_m).whole_p < 1e-6
+    assert outcome(change, centres_m, repeat=repeat).whole_p > 0.1
+    assert outcome(change + 20.0, centres_m, repeat=repeat).whole_p < 1e-6
+
+
+def test_at_the_rim_errors_anywhere_at_the_rim_count():
+    """An object that is set down anew leans to another side."""
+    centres_m, rng = ball_patches(), np.random.default_rng(0)
+    change, repeat = rng.normal(size=(2, len(centres_m), 1))
+    rim = centres_m[:, 2] < -0.03
+    change[np.argmin(np.where(rim, centres_m[:, 0], 1.0))] = 14.0
+    repeat[np.argmax(np.where(rim, centres_m[:, 0], -1.0))] = -12.0
+    assert (outcome(change, centres_m, repeat=repeat).p < FALSE_DISCOVERIES).sum() == 1
+    assert not (outcome(change, centres_m, repeat=repeat, rim=rim).p < FALSE_DISCOVERIES).any()
+    spot = np.argmax(centres_m[:, 2])
+    change[spot] = 14.0
+    found = outcome(change, centres_m, repeat=repeat, rim=rim).p < FALSE_DISCOVERIES
+    assert np.flatnonzero(found).tolist() == [spot]
+
+
+def test_a_second_capture_that_does_not_see_a_part_says_nothing_of_it():
+    centres_m, rng = ball_patches(), np.random.default_rng(0)
+    change, repeat = rng.normal(size=(2, len(centres_m), 1))
+    hidden = centres_m[:, 0] > 0.0
+    repeat[hidden] = np.nan
+    change[np.argmax(centres_m[:, 0])] += 12.0
+    found = outcome(change, centres_m, repeat=repeat)
+    assert np.flatnonzero(found.p < FALSE_DISCOVERIES).tolist() == [np.argmax(centres_m[:, 0])]
+
+
 def test_white_errors_are_tested_as_students_test_does():
     random = np.random.default_rng(0)
     centres_m = random.random((1200, 3))

@@ -3,8 +3,10 @@
 The real commands are those of `run` (test_workflows.py); benchmarks/batch_slurm.py runs both together.
 """
 
+import ast
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -19,6 +21,7 @@ from hsi_sc_nerf.cli.batch import SNAKEFILE, BatchCommand
 from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.errors import InputError
 
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "batch.md"
 START = "from hsi_sc_nerf.cli import batch, main; batch.SNAKEFILE = batch.Path({!r}); main.main()"
 """A process with the quick commands."""
 
@@ -80,17 +83,27 @@ def test_without_snakemake_one_sentence_says_what_to_install(tmp_path, monkeypat
         BatchCommand(sessions=tmp_path, output_dir=tmp_path / "out").main()
 
 
+def test_each_step_states_what_the_page_says_that_it_needs():
+    """Threads, memory and GPU of the rules, as a table of docs/how-to/batch.md."""
+    (needs,) = re.findall(r"^NEEDS = (\{.*?^\})", SNAKEFILE.read_text(), re.DOTALL | re.MULTILINE)
+    told = {}
+    for row in re.findall(r"^\| ([a-z, ]+) \| (\d) \| (\d+) \| (1?) ?\|$", PAGE.read_text(), re.MULTILINE):
+        told |= dict.fromkeys(row[0].split(", "), (int(row[1]), int(row[2]), bool(row[3])))
+    assert ast.literal_eval(needs) == told
+    assert list(told) == list(STEPS)
+
+
 def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch):
     found = []
     monkeypatch.setattr(batch, "_snakemake", lambda given: found.append(given) or 0)
     make_sessions(tmp_path / "sessions", ["a"])
-    for more in (["--retries", "2"], ["--executor", "slurm", "--jobs", "50"]):
+    for more in (["--retries", "2"], ["--executor", "slurm", "--jobs", "50"], ["--profile=kubernetes"]):
         monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path, *more), "--gpu"])
         main()
         assert found[-1][-3 - len(more) :] == ["objects", "--cores", "1", *more]
         assert "gpu=True" in found[-1]
     # How much may run at once is this machine's affair only where the jobs run there.
-    assert ("all" in found[0], "all" in found[1]) == (True, False)
+    assert ["all" in one for one in found] == [True, False, False]
 
 
 @pytest.mark.slow

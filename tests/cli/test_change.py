@@ -23,13 +23,15 @@ DAYS = {
     "monday_again": SetDown(bruise_diameter_m=0.012, turn_deg=120.0),
     "friday": SetDown(bruise_diameter_m=0.024, dried=0.3, turn_deg=40.0, keeps_stem=False),
 }
+REPEAT = SetDown(bruise_diameter_m=0.012, turn_deg=250.0, tip_deg=2.0)
+"""Another capture of Monday."""
 LIBRARY = ("apple_skin", "apple_blush", "lenticel", "bruise")
 
 
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("days")
-    for seed, (name, day) in enumerate(DAYS.items()):
+    for seed, (name, day) in enumerate({**DAYS, "repeat": REPEAT}.items()):
         cloud = cloud_of(fruit_of(day, NM), day, CloudErrors(), 25_000, seed)
         (folder / name).mkdir()
         write_spectral_ply(folder / name / "point_cloud.ply", cloud)
@@ -45,7 +47,8 @@ def written(clouds, tmp_path_factory):
     out = tmp_path_factory.mktemp("change")
     days = tuple(clouds / name for name in DAYS)
     mesh = MeshConfig(octree_depth=6)
-    ChangeCommand(days, out, mesh, band_nm=(670.0,), library=clouds / "library.csv").main()
+    library = clouds / "library.csv"
+    ChangeCommand(days, out, mesh, band_nm=(670.0,), library=library, repeat=clouds / "repeat").main()
     return out
 
 
@@ -54,13 +57,14 @@ def rows_of(written, **wanted):
         return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in wanted.items())]
 
 
+def bruise_cm2(day):
+    fruit = fruit_of(day, NM)
+    of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
+    return 1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum()
+
+
 def true_growth_cm2():
-    areas = []
-    for name in ("monday", "friday"):
-        fruit = fruit_of(DAYS[name], NM)
-        of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
-        areas.append(1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum())
-    return areas[1] - areas[0]
+    return bruise_cm2(DAYS["friday"]) - bruise_cm2(DAYS["monday"])
 
 
 @pytest.mark.slow
@@ -90,6 +94,8 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     again, friday = (day["attitude"] for day in content["days"])
     assert again["turn_deg"] == pytest.approx(120.0, abs=0.5)
     assert friday["turn_deg"] == pytest.approx(40.0, abs=0.5)
+    assert content["repeat"]["name"] == "repeat repeat"
+    assert content["repeat"]["attitude"]["turn_deg"] == pytest.approx(-110.0, abs=0.5)
     mesh = read_spectral_ply(written / "change.ply")
     assert {"ndvi_change_1", "spectrum_p_2", "surface_region_2", "r670_change_2"} <= set(mesh.extra)
     changed = mesh.extra["brightness_region_2"] > 0
@@ -100,6 +106,7 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     page = (written / "change.md").read_text()
     assert all((written / name).is_file() for name in ("wi_1.png", "spectrum_2.png"))
     assert "![Spectrum, 3 friday](spectrum_2.png)" in page
+    assert "and repeat repeat is no change" in page
 
 
 @pytest.mark.slow
@@ -128,6 +135,16 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
     assert change._file_of(config) == change._file_of(config.parent) == config.parent / "point_cloud.ply"
 
 
+@pytest.mark.parametrize("name", ["brightness", "Surface", "spectrum", "r670", "mine"])
+def test_an_index_with_the_name_of_another_quantity_is_one_sentence(clouds, tmp_path, name):
+    """One of the two would silently take the place of the other."""
+    days, indices = (clouds / "monday", clouds / "friday"), (f"{name} = R800 / R600", "Mine = R900 / R600")
+    with pytest.raises(InputError, match="name of another quantity") as refused:
+        ChangeCommand(days, tmp_path / "out", band_nm=(670.0,), index=indices).main()
+    assert f"{name} = " in str(refused.value) or name == "mine"
+    assert not (tmp_path / "out").exists()
+
+
 def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     first, out = clouds / "monday", tmp_path / "out"
     with pytest.raises(InputError, match="two clouds or more"):
@@ -139,6 +156,8 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     write_spectral_ply(other, type(cloud)(*list(vars(cloud).values())[:3], cloud.spectra[:, :4], NM[:4]))
     with pytest.raises(InputError, match="2 other: has other bands than 1 monday"):
         ChangeCommand((first, other), out).main()
+    with pytest.raises(InputError, match="is one of the days itself"):
+        ChangeCommand((first, clouds / "friday"), out, repeat=first / "point_cloud.ply").main()
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()
     assert not out.exists()

@@ -1,0 +1,137 @@
+"""What `hsi-sc-nerf change` finds between trained runs of a fruit: a bruise that grows, and no change where none is.
+
+    uv run python benchmarks/change_of_runs.py FOLDER
+
+Each fruit has four sessions: of the first day, of the same day set down anew twice, and of a day when its bruise has
+grown. They are simulated with a lamp at one side that grows weaker, photon and read noise, processed, trained by the
+preset fast and exported by the commands that a user would type; what is there is not done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
+from results_table import RESULTS, write_results
+from rich.progress import track
+from scipy.spatial import cKDTree
+
+from hsi_sc_nerf.analysis.change import Comparison, compare_days
+from hsi_sc_nerf.analysis.change_days import Day, days_on_one_mesh
+from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
+from hsi_sc_nerf.benchmark.steps import run_step, typed_command
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.indices.catalogue import find_indices
+from hsi_sc_nerf.simulate.another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
+from hsi_sc_nerf.simulate.render import Part
+from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
+from hsi_sc_nerf.simulate.session import simulate_session
+from hsi_sc_nerf.simulate.truth import write_mesh
+
+BANDS, FRAMES, SIZE_PX, POINTS = 25, 36, 128, 200_000
+EVERY = 4
+"""So many points for each one that is compared, to save time."""
+EFFECTS = ("photon_noise", "read_noise", "{lamp: {fraction: 0.3}}", "{lamp_drift: {percent: -3.0}}")
+NM = np.linspace(400.0, 1000.0, BANDS)
+DAYS = {
+    "first": SetDown(AGAIN),
+    "repeat": SetDown(AGAIN, turn_deg=90.0, tip_deg=2.0),
+    "second capture": SetDown(AGAIN, turn_deg=200.0, tip_deg=4.0),
+    "grown, 10 % dried": SetDown(GROWN, dried=0.1, turn_deg=30.0, tip_deg=3.0),
+}
+COLUMNS = ("fruit", "day", "second capture of the first day", "turn, °", "turn found, °", "bruise grew, cm²")
+COLUMNS += ("by brightness, cm²", "false change, cm²", "in quantities")
+
+
+@dataclass(frozen=True)
+class ChangeOfRuns:
+    """Train the runs, compare them, and write the table."""
+
+    folder: tyro.conf.Positional[Path]
+    """For sessions and runs."""
+    fruits: tuple[int, ...] = (3, 4, 5)
+    """Seeds, each of another apple."""
+    days: tuple[str, ...] = tuple(DAYS)
+    """Of `DAYS`; the first day and its repeat must be among them."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
+
+    def main(self) -> None:
+        """Measure, print, write."""
+        rows = [row for fruit in track(self.fruits, "Fruits") for row in self._rows(fruit)]
+        write_results(
+            "change_of_runs", COLUMNS, rows, keys=3, seed=" ".join(map(str, self.fruits)), folder=self.results
+        )
+
+    def _rows(self, fruit: int) -> list[list[str]]:
+        each = [(at, name, day) for at, (name, day) in enumerate(DAYS.items()) if name in self.days]
+        clouds = [session_cloud(self.folder / f"{fruit}-{at}", day, fruit, 10 * fruit + at) for at, _, day in each]
+        names = [name for _, name, _ in each]
+        first, repeat, *later = days_on_one_mesh(clouds, names, MESH, MAX_INCIDENCE_DEG)
+        rows = []
+        for given in (None, repeat):
+            # Without a second capture of the first day, that one is a day as well.
+            days = later if given else [repeat, *later]
+            indices = find_indices((), first.surface.wavelengths_nm)
+            found = compare_days([first, *days], (), indices, SESSION_SD, SMALLEST_M2, repeat=given)
+            rows += [_row(fruit, one, given) for one in found]
+        return rows
+
+
+def _row(fruit: int, one: Comparison, repeat: Day | None) -> list[str]:
+    day, attitude, regions = DAYS[one.after.name], one.after.attitude, one.quantities[BRIGHTNESS].regions
+    assert attitude is not None
+    grew = by_brightness = ""
+    before, after = (fruit_of(each, NM, seed=fruit) for each in (DAYS["first"], day))
+    if day.bruise_diameter_m != AGAIN:
+        true_cm2 = bruise_cm2(after) - bruise_cm2(before)
+        grew, by_brightness = f"{true_cm2:.2f}", beside(1e4 * regions[0].area_m2, true_cm2) if regions else "none"
+    surface = one.after.surface
+    # A simulated session has its object on the axis.
+    placed = set_down(DAYS["first"], before.mesh.vertices)(before.mesh.vertices)
+    centre = (placed.min(axis=0) + placed.max(axis=0)) / 2.0
+    placed += [-centre[0], -centre[1], STAND_M - placed[:, 2].min()]
+    bruise = before.materials.index("bruise")
+    differs = np.abs(after.weights[:, bruise] - before.weights[:, bruise]) > 0.02
+    far = cKDTree(placed[differs]).query(surface.mesh.vertices)[0] > NEAR_M if differs.any() else True
+    false = {name: one.changed & far for name, one in one.quantities.items()}
+    false_cm2 = 1e4 * surface.areas_m2[np.any([*false.values()], axis=0)].sum()
+    named = ", ".join(name for name, inside in false.items() if inside.any())
+    cells = [f"{day.turn_deg:g}", f"{attitude.turn_deg % 360:.2f} ± {attitude.turn_sd_deg:.2f}", grew, by_brightness]
+    return [f"apple {fruit}", one.after.name, "yes" if repeat else "no", *cells, f"{false_cm2:.2f}", named]
+
+
+def session_cloud(folder: Path, day: SetDown, fruit_seed: int, session_seed: int) -> SpectralCloud:
+    """The cloud of a short training on a simulated session of the fruit on that day."""
+    session, data, run = folder / "session", folder / "data", folder / "training" / "hsi-sc-nerf" / "run"
+    cloud = folder / "export" / "point_cloud.ply"
+    if not session.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        fruit = fruit_of(day, NM, seed=fruit_seed)
+        placed = Mesh(set_down(day, fruit.mesh.vertices)(fruit.mesh.vertices), fruit.mesh.triangles)
+        write_mesh(folder / "fruit.ply", Part(placed, fruit.materials, fruit.weights))
+        own = OwnMesh("mesh", folder / "fruit.ply", fruit.materials)
+        scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, "apple"))
+        scene = override(scene, frames=FRAMES, size_px=SIZE_PX, bands=BANDS, seed=session_seed, effects=EFFECTS)
+        simulate_session(scene, session)
+    training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder, "--experiment-name", "training"]
+    training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", "fast", "--evaluate-stages", "False"]
+    exporting = ["ns-export", "pointcloud", "--load-config", run / "config.yml", "--output-dir", cloud.parent]
+    steps: Sequence[tuple[str, Path, Sequence[object]]] = (
+        ("process", data / "transforms.json", ["hsi-sc-nerf", "process", session, "--output-dir", data]),
+        ("train", run / "stage-masked", training),
+        ("export", cloud, [*exporting, "--num-points", POINTS]),
+    )
+    for name, left, words in steps:
+        if not left.exists():
+            run_step(name, typed_command(words), folder / f"{name}.log")
+    return read_spectral_ply(cloud).select(slice(None, None, EVERY))
+
+
+if __name__ == "__main__":
+    tyro.cli(ChangeOfRuns).main()
