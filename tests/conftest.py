@@ -52,6 +52,16 @@ def one_blas_thread():
         yield
 
 
+@pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Devices that tensors are tested on; ``pytest -m gpu`` runs what needs a GPU alone."""
+    import torch
+
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU: CUDA is not available here")
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def browser():
     """For the tests that look at pages as users do."""

@@ -26,6 +26,9 @@ def blob() -> torch.Tensor:
     return (rows - 3) ** 2 + (columns - 9) ** 2 < 40
 
 
+IN_PRECISIONS = pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str
+)
 MASKS = pytest.mark.parametrize("mask", [None, blob()], ids=["full", "masked"])
 
 
@@ -33,8 +36,12 @@ def pixels(image: torch.Tensor, mask: torch.Tensor | None) -> np.ndarray:
     return image.double().numpy()[np.ones((H, W), bool) if mask is None else mask.numpy()]
 
 
+def on(device: str, *images: torch.Tensor | None) -> list[torch.Tensor | None]:
+    return [None if image is None else image.to(device) for image in images]
+
+
 @MASKS
-def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
+def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None, device: str) -> None:
     predicted, target = pair()
     p, t = pixels(predicted, mask), pixels(target, mask)
     angles = [math.acos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) for a, b in zip(p, t, strict=True)]
@@ -50,7 +57,7 @@ def test_metrics_are_the_papers_formulas(mask: torch.Tensor | None) -> None:
             / ((x.mean() ** 2 + y.mean() ** 2 + 1e-4) * (x.var() + y.var() + 9e-4))
         )
         ratio.append(10 * math.log10(1 / (np.mean((x - y) ** 2) + 1e-10)))
-    found = metrics.spectral_metrics(predicted, target, mask)
+    found = metrics.spectral_metrics(*on(device, predicted, target, mask))
     assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
     assert found["rmse"] == pytest.approx(math.sqrt(mse), rel=1e-5)
     assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
@@ -102,20 +109,21 @@ def test_ssim_of_the_whole_mask_ignores_where_pixels_lie_and_the_windowed_one_do
 
 
 @MASKS
-def test_identical_images_score_full_marks(mask: torch.Tensor | None) -> None:
-    target = pair()[1]
+@IN_PRECISIONS
+def test_identical_images_score_full_marks(mask: torch.Tensor | None, dtype: torch.dtype, device: str) -> None:
+    target, mask = on(device, pair()[1].to(dtype), mask)
     found = metrics.spectral_metrics(target, target, mask)
     assert found == pytest.approx(
         {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}, abs=1e-6
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
-def test_an_empty_mask_scores_like_identical_images(dtype: torch.dtype) -> None:
-    predicted, target = (image.to(dtype) for image in pair())
-    assert metrics.spectral_metrics(predicted, target, torch.zeros(H, W, dtype=torch.bool)) == pytest.approx(
-        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
-    )
+@IN_PRECISIONS
+def test_an_empty_mask_scores_like_identical_images(dtype: torch.dtype, device: str) -> None:
+    predicted, target = (image.to(device, dtype) for image in pair())
+    assert metrics.spectral_metrics(
+        predicted, target, torch.zeros(H, W, dtype=torch.bool, device=device)
+    ) == pytest.approx({"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100})
 
 
 def test_variance_survives_a_large_offset_in_float32() -> None:
@@ -127,14 +135,13 @@ def test_variance_survives_a_large_offset_in_float32() -> None:
     assert contrast == pytest.approx((9e-4 - 2 * variance) / (9e-4 + 2 * variance), rel=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 3e38])
-def test_metrics_are_finite(scale: float, dtype: torch.dtype) -> None:
-    predicted, target = pair()
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-42, 1e-30, 3e38])
+def test_metrics_are_finite(scale: float, dtype: torch.dtype, device: str) -> None:
+    predicted, target, mask = on(device, *pair(), blob())
     predicted[..., 1] = 0
     target[..., 1] = 0
     predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype)
-    mask = blob()
     for against in (target.to(dtype), predicted, torch.zeros_like(predicted)):
         assert np.isfinite(list(metrics.spectral_metrics(predicted, against, mask).values())).all()
         assert metrics.spectral_rmse(predicted, against, mask).dtype == torch.float32
@@ -187,7 +194,7 @@ def score_of_windows(
 
 
 @MASKS
-def test_only_valid_values_are_judged(mask: torch.Tensor | None) -> None:
+def test_only_valid_values_are_judged(mask: torch.Tensor | None, device: str) -> None:
     predicted, target = pair()
     valid = some_valid()
     chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
@@ -211,7 +218,7 @@ def test_only_valid_values_are_judged(mask: torch.Tensor | None) -> None:
         centres = list(zip(*np.nonzero(chosen & in_band), strict=True))
         images = (image[..., band].double().numpy() for image in (predicted, target))
         windowed.append(score_of_windows(*images, in_band, centres, reach=5))
-    found = metrics.spectral_metrics(predicted, target, mask, valid)
+    found = metrics.spectral_metrics(*on(device, predicted, target, mask, valid))
     assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
     assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
     assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
@@ -237,9 +244,9 @@ def test_flagged_values_may_be_anything(anything: float) -> None:
 
 
 @MASKS
-def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool)
+def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None, device: str) -> None:
+    predicted, target, mask = on(device, *pair(), mask)
+    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool, device=device)
     assert metrics.spectral_metrics(predicted, target, mask, nothing) == pytest.approx(
         {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
     )

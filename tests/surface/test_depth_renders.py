@@ -7,7 +7,6 @@ from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import visual_hull_region
 from hsi_sc_nerf.surface.surface_depth import MIN_COSINE
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 LENS = PinholeIntrinsics(64, 48, 80.0, 79.0, 33.0, 25.0)
 POSES = np.stack([turntable_camera_to_world(look_at(np.array([4.0, 0, 0.5]), np.zeros(3)), a) for a in (0, 90, 180)])
 SECOND_BALL = np.array([1.6, 0.0, 0.0])
@@ -48,7 +47,6 @@ def cosines(points: torch.Tensor) -> np.ndarray:
     return (to_cameras * points.cpu().numpy()).sum(axis=-1) / np.linalg.norm(to_cameras, axis=-1)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("cell_px", [1, 3])
 def test_a_ball_is_seen_where_it_faces_the_camera(device: str, cell_px: int) -> None:
     points = on_unit_ball(2000, device)
@@ -58,7 +56,6 @@ def test_a_ball_is_seen_where_it_faces_the_camera(device: str, cell_px: int) -> 
     assert 0.2 < seen.mean() < 0.6
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_what_stands_before_it_hides_it(device: str) -> None:
     points = on_unit_ball(2000, device)
     renders = ball_renders(device, [(np.zeros(3), 1.0), (SECOND_BALL, 0.3)])
@@ -75,7 +72,6 @@ def test_what_stands_before_it_hides_it(device: str) -> None:
     np.testing.assert_array_equal(seen[1], cosines(points)[1] > MIN_COSINE)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_image_coordinates_are_the_projection_and_nothing_outside_is_seen(device: str) -> None:
     points = 3.0 * on_unit_ball(500, device)
     renders = ball_renders(device, [])
@@ -88,7 +84,6 @@ def test_image_coordinates_are_the_projection_and_nothing_outside_is_seen(device
         assert 0 < inside.sum() < front.sum()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_nothing_is_seen_outside_the_mask(device: str) -> None:
     renders = ball_renders(device, [(np.zeros(3), 1.0)])
     renders.masks[:, :, : LENS.w // 2] = False
@@ -98,7 +93,6 @@ def test_nothing_is_seen_outside_the_mask(device: str) -> None:
         assert (view.xy_px[view.visible][:, 0] >= LENS.w // 2).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_most_frontal_frame_is_selected(device: str) -> None:
     points = on_unit_ball(1000, device)
     frames, xy_px, frontal_cosines = ball_renders(device, [(np.zeros(3), 1.0)]).most_frontal(points, points)
@@ -112,7 +106,6 @@ def test_the_most_frontal_frame_is_selected(device: str) -> None:
         np.testing.assert_allclose(xy_px.cpu().numpy()[mine], projected, atol=1e-2)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_points_that_most_frames_see_beside_the_mask_are_not_the_objects(device: str) -> None:
     points = on_unit_ball(4000, device)
     renders = ball_renders(device, [(np.zeros(3), 1.0)])
@@ -132,7 +125,6 @@ def test_points_that_most_frames_see_beside_the_mask_are_not_the_objects(device:
     assert (frames[seen[0] & seen[1]] == -1).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_beside_the_mask_only_the_space_before_the_support_is_known(device: str) -> None:
     """A ball on another one, which is what it stands on: the depth of the second says nothing of the first."""
     renders = ball_renders(device, [(np.zeros(3), 1.0), (SECOND_BALL, 0.3)])
@@ -147,7 +139,6 @@ def test_beside_the_mask_only_the_space_before_the_support_is_known(device: str)
     np.testing.assert_allclose(depths.cpu(), [support, np.nan], atol=0.02)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_points_beside_the_object_in_some_frames_are_outside_the_visual_hull(device: str) -> None:
     renders = ball_renders(device, [(np.zeros(3), 1.0)])
     renders.masks[:] = torch.isfinite(renders.depths)
