@@ -212,7 +212,7 @@ def main(
     Args:
         inputs: of all kinds together.
         seed: of the damages.
-        only: part of the names of the kinds to run, each with its share of the inputs; the table's other rows are kept.
+        only: part of the names of the kinds to run, each with its share of inputs; the table's other rows are kept.
         keep: folder for inputs that were neither refused nor read in time and memory.
         results: folder of the table.
     """

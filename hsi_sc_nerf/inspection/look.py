@@ -91,6 +91,7 @@ def look_at(capture: Capture, white: Float[np.ndarray, "bands"]) -> Look:
             for near in bands
         ],
         axis=-1,
+        dtype=np.float32,
     )
     top = read.max()
     return Look(
