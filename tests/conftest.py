@@ -1,6 +1,7 @@
 import fcntl
 import gc
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def one_blas_thread():
     """The tests' many small systems of equations are slower, and less alike, with more."""
     with threadpool_limits(limits=1, user_api="blas"):
         yield
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Commands that run in this process handle it in their own way."""
+    handler = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

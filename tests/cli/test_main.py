@@ -12,6 +12,7 @@ import pytest
 from hsi_sc_nerf.cli import main as entry
 from hsi_sc_nerf.cli.commands import COMMANDS
 from hsi_sc_nerf.cli.sessions import MarkersCommand
+from hsi_sc_nerf.errors import InputError
 
 MAIN = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
 
@@ -49,6 +50,38 @@ def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
     with pytest.raises(OSError, match="no file is named"):
         entry.main()
+
+
+@pytest.mark.parametrize("other", [ImportError("a library failed to import"), InputError("a: is damaged.")])
+def test_ctrl_c_that_a_library_turned_into_an_error_is_the_same_line(monkeypatch, capsys, other):
+    def interrupted(self):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise other from None
+
+    monkeypatch.setattr(MarkersCommand, "main", interrupted)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr() == ("", "Stopped.\n")
+
+
+def test_ctrl_c_after_all_is_done_changes_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(MarkersCommand, "main", lambda self: None)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    entry.main()
+    signal.raise_signal(signal.SIGINT)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_command_that_ignores_ctrl_c_from_its_start_goes_on_ignoring_it(monkeypatch):
+    monkeypatch.setattr(MarkersCommand, "main", lambda self: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as nohup has it
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    entry.main()
 
 
 @pytest.mark.slow
