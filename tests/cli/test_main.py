@@ -1,6 +1,7 @@
 """Whatever goes wrong that a user can mend is one line."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -118,6 +119,29 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
     subprocess.run([*MAIN, *words], check=True, capture_output=True)
     for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
         assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
+    """A limit to the size of files stands for the disk: a frame's cube has 300 kB."""
+    out = tmp_path / "data"
+    words = [*MAIN, "process", str(tiny_dataset[1]), "--output-dir", str(out)]
+    limit = (250_000, resource.RLIM_INFINITY)
+    ended = subprocess.run(
+        words,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TERM": "dumb"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )
+    assert ended.returncode == 2
+    told = [line for line in ended.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(told) == 1
+    assert "cannot be written" in told[0]
+    assert "Traceback" not in ended.stderr
+    assert not list(out.rglob("*.bip"))
+    assert not list(out.rglob(".partial-*"))
+    assert not (out / "transforms.json").exists()
 
 
 def test_help_loads_no_numerical_library_and_a_command_only_its_own():

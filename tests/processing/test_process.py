@@ -34,6 +34,7 @@ from hsi_sc_nerf.inspection import inspect
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing import process
+from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
 from hsi_sc_nerf.processing.posed_frames import known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
@@ -85,6 +86,22 @@ def test_pictures_of_the_inspection_and_maps_of_frames_are_not_kept(session, tmp
     monkeypatch.setattr(process, "foreground_masks", masked)
     run(session, tmp_path / "data")
     assert mapped == []
+
+
+@pytest.mark.slow
+def test_a_cube_that_vanishes_is_named_and_leaves_nothing_half_written(session, tmp_path, monkeypatch):
+    (cube,) = (path for path in session.rglob("*ball_3.raw") if "REF" not in path.name)
+
+    def packed(*args, **kwargs):
+        cube.unlink()
+        return pack_frames(*args, **kwargs)
+
+    monkeypatch.setattr(process, "pack_frames", packed)
+    # The entry makes one line of both kinds.
+    with pytest.raises((InputError, FileNotFoundError), match=re.escape(cube.name)):
+        run(session, tmp_path / "data")
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    assert not list(tmp_path.rglob(".partial-*"))
 
 
 @pytest.mark.slow
