@@ -71,10 +71,9 @@ def whole(tiny_dataset, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_same_seed_gives_the_same_weights_and_another_does_not(tiny_dataset, tmp_path, threads):
+def test_the_same_seed_gives_the_same_weights_and_another_does_not(tiny_dataset, tmp_path):
     usual = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(2)  # what is summed by several could depend on which is first
     try:
         weights = []
         for number, seed in enumerate((3, 3, 4)):
