@@ -37,7 +37,6 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
     from hsi_sc_nerf.analysis.library import read_library
     from hsi_sc_nerf.analysis.size import scale_uncertainty
-    from hsi_sc_nerf.api.clouds import read_cloud
     from hsi_sc_nerf.batch.objects import read_object
     from hsi_sc_nerf.batch.plan import outdated, read_plan
     from hsi_sc_nerf.batch.session_steps import SessionSettings, is_up_to_date, session_steps
@@ -153,7 +152,6 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("poses.json, for sizes", data / "poses.json", lambda: scale_uncertainty(data / "poses.json"), 0.5),
         Kind("steps of a run", files["steps"], every_step, 0.5),
         Kind("training curves (tfevents)", files["events"], lambda: read_scalars(files["events"].parent), 0.3),
-        Kind("point cloud (NetCDF)", files["netcdf"], lambda: read_cloud(files["netcdf"]), 0.3),
         Kind("inspection.json", data / "report" / "inspection.json", judged(inspection_section), 1.0),
         Kind("comparison.json", files["comparison"], lambda: comparison_section(*_json(files["comparison"])), 0.02),
         Kind("list of sessions (CSV)", files["season"] / "sessions.csv", every_object, 0.5),

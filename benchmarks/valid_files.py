@@ -14,7 +14,6 @@ import yaml
 from torch.utils.tensorboard import SummaryWriter
 
 from hsi_sc_nerf.analysis.drawn_regions import KIND
-from hsi_sc_nerf.api.clouds import Cloud
 from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, write_plan
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
 from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
@@ -106,7 +105,6 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "npy": "pixels.npy",
         "spectrum": "spectrum.csv",
         "steps": STEPS_NAME,
-        "netcdf": "cloud.nc",
     }
     files |= {name: folder / file for name, file in others.items()}
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
@@ -156,7 +154,6 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     )
     entry = {"command": "hsi-sc-nerf process", "fingerprint": "0", "finished": True, "seconds": 3.5}
     write_json(files["steps"], {name: entry | {"peak_memory_mib": 800.0} for name in STEPS})
-    Cloud.of(cloud).to_xarray().to_netcdf(files["netcdf"], engine="h5netcdf")
     with SummaryWriter(str(folder / "curves")) as writer:
         for step in range(20):
             writer.add_scalar("Train Loss", 1.0 / (1 + step), step)
