@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
+from hsi_sc_nerf.simulate.another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -27,7 +28,6 @@ from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.indices.catalogue import find_indices
-from hsi_sc_nerf.simulate.another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session

@@ -3,13 +3,18 @@
     uv run python benchmarks/command_memory.py --frames 6
     uv run python benchmarks/command_memory.py --frames 12
 
-Each command runs in a process of its own, whose largest resident memory counts. What a command needs for one more
-frame follows from sessions of different lengths. Needs 0.25 GB of disk a frame at the default size, freed at the end.
+Each command runs in a process of its own, whose largest resident memory counts, and the largest part of it that is
+anonymous: what the command itself holds. The rest are pages of files that the system takes back when it needs memory.
+What a command needs for one more frame follows from sessions of different lengths. Needs 0.25 GB of disk a frame at
+the default size, freed at the end.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import tempfile
+import threading
 from pathlib import Path
 
 import tyro
@@ -17,8 +22,9 @@ from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 
-COLUMNS = ["session", "command", "peak memory, MiB", "seconds"]
+COLUMNS = ["session", "command", "peak memory, MiB", "of it anonymous, MiB", "seconds"]
 HELD_OUT = 2
+SAMPLED_EVERY_S = 0.02
 
 
 def commands(folder: Path, frames: int, size_px: int, bands: int, steps: int, points: int) -> dict[str, str]:
@@ -49,6 +55,44 @@ def commands(folder: Path, frames: int, size_px: int, bands: int, steps: int, po
     }
 
 
+class AnonymousMemory:
+    """Context manager that samples the anonymous memory of all processes that this one starts; Linux alone."""
+
+    def __init__(self) -> None:
+        self.peak_mib = 0.0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def __enter__(self) -> AnonymousMemory:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(SAMPLED_EVERY_S):
+            self.peak_mib = max(self.peak_mib, sum(map(_anonymous_kib, _descendants(os.getpid()))) / 1024.0)
+
+
+def _descendants(pid: int) -> list[int]:
+    found: list[int] = []
+    with contextlib.suppress(OSError):  # processes end
+        for children in Path(f"/proc/{pid}/task").glob("*/children"):
+            for child in map(int, children.read_text().split()):
+                found += [child, *_descendants(child)]
+    return found
+
+
+def _anonymous_kib(pid: int) -> int:
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("RssAnon"):
+                return int(line.split()[1])
+    return 0
+
+
 def main(
     frames: int = 60,
     size_px: int = 512,
@@ -69,8 +113,9 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for name, line in commands(folder, frames, size_px, bands, steps, points).items():
-            cost = run_step(name, typed_command(line.split()), folder / "log")
-            row = [session, name, f"{cost.peak_memory_mib:.0f}", f"{cost.seconds:.0f}"]
+            with AnonymousMemory() as anonymous:
+                cost = run_step(name, typed_command(line.split()), folder / "log")
+            row = [session, name, f"{cost.peak_memory_mib:.0f}", f"{anonymous.peak_mib:.0f}", f"{cost.seconds:.0f}"]
             write_results("command_memory", COLUMNS, [row], keys=2, folder=results)
 
 

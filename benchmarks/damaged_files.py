@@ -29,7 +29,7 @@ from typing import Any
 
 import tyro
 from file_kinds import Kind, kinds
-from results_table import RESULTS, write_results
+from results_table import RESULTS, read_results, write_results
 
 from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError
 
@@ -212,18 +212,19 @@ def main(
     Args:
         inputs: of all kinds together.
         seed: of the damages.
-        only: part of the names of the kinds to run; then no table is written.
+        only: part of the names of the kinds to run, each with its share of inputs; the table's other rows are kept.
         keep: folder for inputs that were neither refused nor read in time and memory.
         results: folder of the table.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "valid"
-        found = [kind for kind in kinds(folder) if only in kind.name]
+        every_kind = kinds(folder)
+        found = [kind for kind in every_kind if only in kind.name]
         for kind in found:  # valid, and compiled and imported before memory is watched
             kind.read()
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM_BYTES, resource.RLIM_INFINITY))
-        shares, rows = sum(kind.share for kind in found), []
+        shares, rows = sum(kind.share for kind in every_kind), []
         for kind in found:
             started = time.monotonic()
             outcome = run_kind(kind, round(inputs * kind.share / shares), seed, keep)
@@ -232,10 +233,14 @@ def main(
             for told, count in outcome.errors.most_common(12):
                 print(f"    {count} x {told}", flush=True)
         print(f"written outside: {[path for path in folder.parent.iterdir() if path != folder] or 'nothing'}")
-        rows.append(["all", *(str(sum(int(row[i]) for row in rows)) for i in range(1, len(COLUMNS)))])
-        if not only:
-            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-            write_results("damaged_files", COLUMNS, rows, seed=str(seed), folder=results)
+        resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        kept = (
+            {row[0]: row[: len(COLUMNS)] for row in read_results(results / "damaged_files.csv")[1:]} if only else {}
+        )
+        merged = kept | {row[0]: row for row in rows}
+        counted = [merged[kind.name] for kind in every_kind if kind.name in merged]
+        total = ["all", *(str(sum(int(row[i]) for row in counted)) for i in range(1, len(COLUMNS)))]
+        write_results("damaged_files", COLUMNS, [*rows, total], keys=bool(only), seed=str(seed), folder=results)
 
 
 if __name__ == "__main__":

@@ -36,8 +36,10 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.analysis.calibrations import read_calibration
     from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
     from hsi_sc_nerf.analysis.library import read_library
+    from hsi_sc_nerf.analysis.size import scale_uncertainty
     from hsi_sc_nerf.batch.objects import read_object
     from hsi_sc_nerf.batch.plan import outdated, read_plan
+    from hsi_sc_nerf.batch.session_steps import SessionSettings, is_up_to_date, session_steps
     from hsi_sc_nerf.batch.tables import read_table
     from hsi_sc_nerf.calibration.white_source import read_panel
     from hsi_sc_nerf.capture.envi import CubeLines, open_cube
@@ -53,7 +55,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.processing.frames import FramePaths, read_cache
     from hsi_sc_nerf.rendering.views import views_of_path
     from hsi_sc_nerf.report.dataset_sections import calibration_section, inspection_section, poses_section
-    from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
+    from hsi_sc_nerf.report.run_sections import comparison_section, read_scalars, traits_section
     from hsi_sc_nerf.settings_file import read_yaml
     from hsi_sc_nerf.simulate.materials import read_spectrum
     from hsi_sc_nerf.simulate.own_mesh import load as load_mesh
@@ -103,6 +105,10 @@ def kinds(folder: Path) -> list[Kind]:
         finally:
             pixels.write_bytes(whole)
 
+    def every_step() -> None:
+        for step in session_steps(session, folder, SessionSettings()):
+            is_up_to_date(step, folder)
+
     def applied(table: Path) -> Callable[[], object]:
         return lambda: read_calibration(table).of(np.full((2, 31), 0.5), np.linspace(400.0, 1000.0, 31), True)
 
@@ -143,6 +149,9 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("camera path (JSON)", files["path"], lambda: views_of_path(files["path"]), 1.5),
         Kind("calibration.json", data / "calibration.json", judged(calibration_section), 0.02),
         Kind("poses.json", data / "poses.json", judged(poses_section), 0.02),
+        Kind("poses.json, for sizes", data / "poses.json", lambda: scale_uncertainty(data / "poses.json"), 0.5),
+        Kind("steps of a run", files["steps"], every_step, 0.5),
+        Kind("training curves (tfevents)", files["events"], lambda: read_scalars(files["events"].parent), 0.3),
         Kind("inspection.json", data / "report" / "inspection.json", judged(inspection_section), 1.0),
         Kind("comparison.json", files["comparison"], lambda: comparison_section(*_json(files["comparison"])), 0.02),
         Kind("list of sessions (CSV)", files["season"] / "sessions.csv", every_object, 0.5),

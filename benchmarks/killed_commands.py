@@ -89,6 +89,7 @@ def commands(inputs: Path) -> list[Command]:
             f"hsi-sc-nerf process {inputs / 'session'} --output-dir out",
             training,
             f"ns-export pointcloud --load-config {run / 'config.yml'} --output-dir out --num-points 2000",
+            f"hsi-sc-nerf export --load-config {run / 'config.yml'} --output-dir out --num-points 2000",
             f"hsi-sc-nerf traits {inputs / 'ns-export' / 'out' / cloud} --data {data} --splits 0 --output-dir out",
         )
     ]

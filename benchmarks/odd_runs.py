@@ -248,9 +248,12 @@ CASES = (
     Case("white object", _values(lambda values, masks: np.copyto(values, 1.0, where=masks[..., None]))),
     Case("reflectance up to 1.3", _values(lambda values, masks: np.multiply(values, 1.3 / values.max(), out=values))),
     Case("one frame", _keep_frames(0)),
-    Case("two frames, 180 degrees apart", _keep_frames(0, FRAMES // 2)),
+    # The last but one of two frames, and the middle one of three, are held out.
+    Case("one training view", _keep_frames(0, FRAMES // 2)),
+    Case("two training views, 180 degrees apart", _keep_frames(0, FRAMES // 4, FRAMES // 2)),
     Case("1 band", _bands(1)),
     Case("3 bands", _bands(3)),
+    Case("204 bands", _bands(204)),
     Case("1000 bands", _bands(1000)),
     Case("mixed precision", settings=_set("mixed_precision", True)),
     Case("learning rates times 10", settings=_rates(10.0)),

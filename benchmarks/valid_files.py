@@ -11,11 +11,12 @@ import numpy as np
 import torch
 import trimesh
 import yaml
+from torch.utils.tensorboard import SummaryWriter
 
 from hsi_sc_nerf.analysis.drawn_regions import KIND
 from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, write_plan
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
-from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
@@ -103,6 +104,7 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "regions": "regions.json",
         "npy": "pixels.npy",
         "spectrum": "spectrum.csv",
+        "steps": STEPS_NAME,
     }
     files |= {name: folder / file for name, file in others.items()}
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
@@ -150,6 +152,12 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     files["spectrum"].write_text(
         "\n".join(["wavelength_nm,reflectance", *(f"{nm},0.5" for nm in range(390, 1030, 20))])
     )
+    entry = {"command": "hsi-sc-nerf process", "fingerprint": "0", "finished": True, "seconds": 3.5}
+    write_json(files["steps"], {name: entry | {"peak_memory_mib": 800.0} for name in STEPS})
+    with SummaryWriter(str(folder / "curves")) as writer:
+        for step in range(20):
+            writer.add_scalar("Train Loss", 1.0 / (1 + step), step)
+    (files["events"],) = (folder / "curves").glob("events.out.tfevents.*")
     (folder / "run").mkdir()
     (folder / "run" / "config.yml").write_text(yaml.dump(hsi_sc_nerf.config))
     return files

@@ -137,6 +137,19 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     return content
 
 
+@contextmanager
+def content_of(path: Path, what: str, remedy: str = "make it again") -> Iterator[None]:
+    """Refuse a file in one sentence if reading figures from its content fails, however damaged that is.
+
+    Raises:
+        InputError: it does.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: holds no {what} ({error}); {remedy}.") from error
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` as indented JSON.
 

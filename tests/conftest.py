@@ -1,6 +1,7 @@
 import fcntl
 import gc
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -51,6 +52,24 @@ def one_blas_thread():
     """The tests' many small systems of equations are slower, and less alike, with more."""
     with threadpool_limits(limits=1, user_api="blas"):
         yield
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Commands that run in this process handle it in their own way."""
+    handler = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
+@pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Devices that tensors are tested on; ``pytest -m gpu`` runs what needs a GPU alone."""
+    import torch
+
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU: CUDA is not available here")
+    return request.param
 
 
 @pytest.fixture(scope="module")

@@ -72,6 +72,18 @@ def test_every_test_that_a_page_names_exists():
     assert found > 40
 
 
+def test_every_hard_case_says_what_happens_and_names_a_test():
+    cases = 0
+    for line in (ROOT / "docs" / "validation" / "hard_cases.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith("|") and not re.match(r"\| (case|---) ", line):
+            cases += 1
+            case, happens, tests = (cell.strip() for cell in line.strip("|").split(" | "))
+            assert case, line
+            assert happens, line
+            assert re.fullmatch(r"`[a-z_/]+::test_\w+`(, `[a-z_/]+::test_\w+`)*", tests), line
+    assert cases > 60
+
+
 def test_inspect_quotes_the_committed_figures_of_views():
     titles, *rows = documentation.read_results(documentation.RESULTS / "accuracy_and_time.csv")
     columns = [titles.index(title) for title in (" RMSE", "F at 0.5 mm, %", "volume, %", "bruise, %")]

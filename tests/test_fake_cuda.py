@@ -156,10 +156,6 @@ def test_own_backward_passes_stay_on_the_device():
         assert _Widen.backward(context, wide).device.type == "cuda"
 
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
-
-
-@pytest.mark.parametrize("device", DEVICES)
 def test_held_pixels_and_rays_equal_those_read_from_files(flagged_dataset, device):
     manager = small(hsi_sc_nerf, flagged_dataset).datamanager
     sampler = manager.train_pixel_sampler

@@ -64,9 +64,9 @@ CASES = {
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 
 
-def as_leaf(values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+def as_leaf(values: torch.Tensor, dtype: torch.dtype, device: str) -> torch.Tensor:
     largest = torch.finfo(dtype).max
-    return values.double().clamp(-largest, largest).to(dtype).requires_grad_()
+    return values.double().clamp(-largest, largest).to(device, dtype).requires_grad_()
 
 
 def assert_finite(value: torch.Tensor, *leaves: torch.Tensor) -> None:
@@ -94,27 +94,27 @@ def assert_finite(value: torch.Tensor, *leaves: torch.Tensor) -> None:
     ],
     ids=["angle", "cosine", "cosine floored", "ratio", "mean", "sqrt", "log10"],
 )
-def test_values_and_gradients_are_finite(function, case: str, dtype: torch.dtype) -> None:
-    a, b = (as_leaf(values, dtype) for values in CASES[case][:2])
+def test_values_and_gradients_are_finite(function, case: str, dtype: torch.dtype, device: str) -> None:
+    a, b = (as_leaf(values, dtype, device) for values in CASES[case][:2])
     assert_finite(function(a, b), a, b)
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("case", [name for name, case in CASES.items() if case[2] is not None])
-def test_closed_form_angles(case: str, dtype: torch.dtype) -> None:
-    a, b = (as_leaf(values, dtype) for values in CASES[case][:2])
+def test_closed_form_angles(case: str, dtype: torch.dtype, device: str) -> None:
+    a, b = (as_leaf(values, dtype, device) for values in CASES[case][:2])
     # Tripling rounds in half precision, which turns the spectrum by about the rounding unit.
     tolerance = {"rel": 1e-6, "abs": 2 * torch.finfo(dtype).eps if case == "scaled" else 0.0}
-    assert spectral_angle(a, b).detach().numpy() == pytest.approx(CASES[case][2], **tolerance)
-    assert one_minus_cosine(a, b).detach().numpy() == pytest.approx(1 - math.cos(CASES[case][2]), abs=1e-4, rel=1e-6)
+    assert spectral_angle(a, b).numpy(force=True) == pytest.approx(CASES[case][2], **tolerance)
+    assert one_minus_cosine(a, b).numpy(force=True) == pytest.approx(1 - math.cos(CASES[case][2]), abs=1e-4, rel=1e-6)
 
 
 @pytest.mark.parametrize("bands", [3, 204])
 @pytest.mark.parametrize("scale", [1.0, 0.37, 1e-30, 1e30])
 @pytest.mark.parametrize("angle", [1e-6, 1e-4, 1e-2, 1.0, 3.1, math.pi - 1e-4])
-def test_angle_is_accurate_in_float32(angle: float, scale: float, bands: int) -> None:
-    a = spectra(bands=bands, pixels=200).float()
-    b = (scale * turned(a.double(), angle)).float()
+def test_angle_is_accurate_in_float32(angle: float, scale: float, bands: int, device: str) -> None:
+    exact = spectra(bands=bands, pixels=200).float().double()
+    a, b = exact.float().to(device), (scale * turned(exact, angle)).float().to(device)
     # Rounding b to float32 turns it by up to 1e-7 rad: the truth is the angle of what is stored.
     u, v = (x.double() / x.double().norm(dim=-1, keepdim=True) for x in (a, b))
     truth = 2 * torch.atan2((u - v).norm(dim=-1), (u + v).norm(dim=-1))
@@ -127,28 +127,29 @@ def test_angle_is_accurate_in_float32(angle: float, scale: float, bands: int) ->
 @pytest.mark.parametrize(
     "function", [spectral_angle, one_minus_cosine, lambda a, b: one_minus_cosine(a, b, norm_floor=30.0), safe_ratio]
 )
-def test_gradients_match_finite_differences(function) -> None:
-    a, b = spectra(pixels=3, bands=7).requires_grad_(), spectra(1, pixels=3, bands=7).requires_grad_()
+def test_gradients_match_finite_differences(function, device: str) -> None:
+    a, b = (spectra(seed, pixels=3, bands=7).to(device).requires_grad_() for seed in (0, 1))
     assert torch.autograd.gradcheck(function, (a, b))
 
 
 @pytest.mark.parametrize("function", [safe_sqrt, safe_log10, masked_mean])
-def test_gradients_of_one_argument_match_finite_differences(function) -> None:
-    assert torch.autograd.gradcheck(function, (spectra(pixels=3, bands=7).requires_grad_(),))
+def test_gradients_of_one_argument_match_finite_differences(function, device: str) -> None:
+    assert torch.autograd.gradcheck(function, (spectra(pixels=3, bands=7).to(device).requires_grad_(),))
 
 
 @pytest.mark.parametrize("function", [spectral_angle, one_minus_cosine])
-def test_float32_gradient_near_identical_spectra(function) -> None:
-    a, b = spectra().float(), turned(spectra(), 1e-4).float()
+def test_float32_gradient_near_identical_spectra(function, device: str) -> None:
+    a, b = spectra().float().to(device), turned(spectra(), 1e-4).float().to(device)
     leaf, exact = a.clone().requires_grad_(), a.double().requires_grad_()
     function(leaf, b).sum().backward()
     function(exact, b.double()).sum().backward()
     torch.testing.assert_close(leaf.grad, exact.grad.float(), rtol=1e-4, atol=1e-7 * exact.grad.abs().max().item())
 
 
-def test_zero_spectrum_has_no_gradient() -> None:
+def test_zero_spectrum_has_no_gradient(device: str) -> None:
     for function in (spectral_angle, one_minus_cosine, lambda a, b: one_minus_cosine(a, b, norm_floor=1e-3)):
-        a, b = torch.zeros(2, BANDS, requires_grad=True), spectra(pixels=2).float().requires_grad_()
+        a = torch.zeros(2, BANDS, device=device, requires_grad=True)
+        b = spectra(pixels=2).float().to(device).requires_grad_()
         function(a, b).sum().backward()
         assert not a.grad.any()
         assert b.grad.abs().max() < 1e-15
@@ -181,15 +182,15 @@ def test_roots_and_logarithms_at_the_edges() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_non_finite_input_is_not_hidden(bad: float) -> None:
-    a, b = torch.full((1, 4), bad), torch.ones(1, 4)
+def test_non_finite_input_is_not_hidden(bad: float, device: str) -> None:
+    a, b = torch.full((1, 4), bad, device=device), torch.ones(1, 4, device=device)
     values = (spectral_angle(a, b), one_minus_cosine(a, b), safe_sqrt(a), safe_log10(a), masked_mean(a))
     for value in (*values, safe_ratio(a, b)):
         assert not torch.isfinite(value).any()
 
 
-def test_masked_mean_of_half_precision_accumulates_in_float32() -> None:
-    values = torch.full((300, 300), 0.1, dtype=torch.float16)
+def test_masked_mean_of_half_precision_accumulates_in_float32(device: str) -> None:
+    values = torch.full((300, 300), 0.1, dtype=torch.float16, device=device)
     assert masked_mean(values).item() == pytest.approx(values[0, 0].item(), rel=1e-6)
     assert masked_mean(torch.full((9,), 6e4, dtype=torch.float16)).item() == pytest.approx(6e4, rel=1e-3)
 

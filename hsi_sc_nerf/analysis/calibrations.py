@@ -28,6 +28,7 @@ _KEYS = {
 _SAME_BAND_NM = 0.05
 """Tables round wavelengths."""
 _CHUNK_SPECTRA = 1 << 13
+_FATAL = 4  # of onnxruntime's levels; it logs past Python, beside our sentences
 _REMEDY = "docs/how-to/calibrations.md shows such a table"
 
 
@@ -278,7 +279,12 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
         raise InputError(f"{name} needs onnxruntime; install it: pip install 'hsi-sc-nerf[calibrations]'.") from error
     path, wanted = table.with_name(Path(name).name), columns.stop - columns.start
     try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = _FATAL
+        # Its second try would print what went wrong in the first.
+        session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+        )
         takes, gives = session.get_inputs()[0], session.get_outputs()[-1].name
         kind = {"tensor(float)": np.float32, "tensor(double)": np.float64}[takes.type]
 

@@ -5,6 +5,7 @@ Uncertainty comes from the scatter of single points, and from what all points ha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed, closed_mesh, surface_and_base
-from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
@@ -186,7 +187,7 @@ def shared_errors(dataset: PackedDataset, *, base_known: bool) -> SharedErrors:
     """
     pixel_m = pixel_on_object_m(dataset)
     return SharedErrors(
-        scale=_scale_uncertainty(dataset.root / "poses.json"),
+        scale=scale_uncertainty(dataset.root / "poses.json"),
         surface_m=SURFACE_PX * pixel_m,
         base_m=0.0 if base_known else UNKNOWN_BASE_PX * pixel_m,
     )
@@ -206,9 +207,18 @@ def offset(mesh: Mesh, distance_m: float) -> Mesh:
     return Mesh(vertices, mesh.triangles)
 
 
-def _scale_uncertainty(path: Path) -> float:
-    """As a fraction; 0 where it is not known."""
+def scale_uncertainty(path: Path) -> float:
+    """Of a dataset's scale by its ``poses.json``, as a fraction; 0 where it is not known.
+
+    Raises:
+        InputError: the file cannot be read, or holds something else there.
+    """
     if not path.is_file():
         return 0.0
-    scale = read_json(path, "process the session again").get("scale") or {}
-    return float(scale.get("uncertainty_percent") or 0.0) / 100.0
+    again = "process the session again"
+    content = read_json(path, again)
+    with content_of(path, "uncertainty of the scale in percent", again):
+        percent = float((content.get("scale") or {}).get("uncertainty_percent") or 0.0)
+        if not 0.0 <= percent < math.inf:
+            raise ValueError("it is not 0 or more")
+    return percent / 100.0

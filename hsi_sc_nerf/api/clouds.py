@@ -115,9 +115,9 @@ def read_cloud(path: Path | str) -> Cloud:
         options: dict[str, Any] = zarr if kind == "zarr" else {"engine": "h5netcdf"}
         with xarray.open_dataset(path, **options) as table:
             return Cloud.of(from_xarray(table.load()))
-    except (ImportError, OSError, ValueError) as error:
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # those of the libraries' readers have no common class
         raise InputError(
             f"{path}: cannot be read ({error}); check the file, and run `pip install 'hsi-sc-nerf[formats]'`."
         ) from error
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

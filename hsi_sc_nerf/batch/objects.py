@@ -16,10 +16,9 @@ from hsi_sc_nerf.batch.columns import Column, Value
 from hsi_sc_nerf.batch.plan import STEPS
 from hsi_sc_nerf.batch.session_steps import OPTIONAL_STEPS
 from hsi_sc_nerf.errors import InputError, shown
-from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.findings import INSPECTION_NAME
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
-from hsi_sc_nerf.report.page import content_of
 
 _AGAIN = "delete it and start the batch again"
 _LEVELS = ("green", "amber", "red")

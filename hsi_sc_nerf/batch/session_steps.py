@@ -210,7 +210,7 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
 
 
 def _is_finished(step: Step, entry: dict[str, Any], fingerprint: str) -> bool:
-    finished = entry.get("fingerprint") == fingerprint and entry["finished"]
+    finished = entry.get("fingerprint") == fingerprint and entry.get("finished") is True
     return finished and all(path.is_file() for path in step.outputs)
 
 
@@ -219,6 +219,12 @@ def _cost(name: str, entry: dict[str, Any]) -> StepCost:
 
 
 def _entries(out: Path) -> dict[str, Any]:
-    """What the output folder says of its steps, by name."""
+    """What the output folder says of its steps, by name; what is damaged is not believed."""
     path = out / STEPS_NAME
-    return read_json(path, "delete it to make all steps again") if path.is_file() else {}
+    found = read_json(path, "delete it to make all steps again") if path.is_file() else {}
+    return {name: entry for name, entry in found.items() if isinstance(entry, dict) and _has_costs(entry)}
+
+
+def _has_costs(entry: dict[str, Any]) -> bool:
+    costs = [entry.get(name, 0.0) for name in ("seconds", "peak_memory_mib")]
+    return all(isinstance(cost, float | int) and 0.0 <= cost < 1e12 for cost in costs)

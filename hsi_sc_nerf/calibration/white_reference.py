@@ -109,7 +109,8 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
     dead = _dead(defects, samples, bands)[x0:x1]
     deviation = deviation_map(fill_no_data(counts, cube.ignore_value), dead)
     kernel_px = max(paper.WHITE_MORPHOLOGY_MIN_PX, min(counts.shape[:2]) // paper.WHITE_MORPHOLOGY_FRACTION)
-    mask = white_mask(deviation, percentile=paper.WHITE_PERCENTILE, kernel_px=kernel_px)
+    with np.errstate(invalid="ignore"):  # a white without counts deviates infinitely
+        mask = white_mask(deviation, percentile=paper.WHITE_PERCENTILE, kernel_px=kernel_px)
     if not mask.any() or not deviation[mask].mean() <= MAX_DEVIATION:
         raise InputError(
             f"{cube.header_path}: the tarp has no usable region, because no part of it is evenly bright; take it "

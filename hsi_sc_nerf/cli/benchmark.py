@@ -30,7 +30,7 @@ from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Job
 from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import TEMPORARY_PREFIX, make_folder, read_json, write_json
+from hsi_sc_nerf.files import TEMPORARY_PREFIX, content_of, make_folder, read_json, write_json
 from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
 from hsi_sc_nerf.settings_file import between, check_options
@@ -127,17 +127,12 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
 
 def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[BenchmarkRun]:
     """Those that are finished."""
-    return [
-        BenchmarkRun(
-            name,
-            job.method,
-            job.words,
-            content["setup_seconds"],
-            tuple(Checkpoint(**c) for c in content["checkpoints"]),
-        )
-        for name, job in jobs.items()
-        if (content := contents[name]) is not None
-    ]
+    return [_run_of(name, job, content) for name, job in jobs.items() if (content := contents[name]) is not None]
+
+
+def _run_of(name: str, job: Job, content: dict[str, Any]) -> BenchmarkRun:
+    checkpoints = tuple(Checkpoint(**one) for one in content["checkpoints"])
+    return BenchmarkRun(name, job.method, job.words, float(content["setup_seconds"]), checkpoints)
 
 
 def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -> None:
@@ -202,9 +197,14 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
     """Result of an earlier call for the same job, machine and data; None if there is none."""
     if not path.is_file():
         return None
-    content = read_json(path, "delete it to measure again")
+    again = "delete it to measure again"
+    content = read_json(path, again)
     expected = json.loads(json.dumps({"job": asdict(job), **identity}))
-    return content if expected.items() <= content.items() else None
+    if not expected.items() <= content.items():
+        return None
+    with content_of(path, "result", again):
+        _run_of("", job, content)
+    return content
 
 
 def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:

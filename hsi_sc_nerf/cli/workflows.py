@@ -26,7 +26,7 @@ from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_comm
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import atomic_write, make_folder
+from hsi_sc_nerf.files import atomic_write, content_of, make_folder
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -91,7 +91,8 @@ class RunCommand(SessionSettings):
                     raise
                 step.remove_outputs()
                 console.print(f"[yellow]{escape(str(error))} The other steps do without.")
-        _show_results(out, console)
+        with content_of(out, "results that can be shown", f"delete its {STEPS_NAME} to make them again"):
+            _show_results(out, console)
 
 
 def _show_results(out: Path, console: Console) -> None:

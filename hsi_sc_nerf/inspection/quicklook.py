@@ -90,6 +90,7 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
             for near in bands
         ],
         axis=-1,
+        dtype=np.float32,
     )
     top = read.max()
     return Quicklook(

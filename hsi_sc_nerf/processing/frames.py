@@ -13,7 +13,7 @@ import json
 import math
 import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields
@@ -70,13 +70,33 @@ class FrameCache:
 
     Attributes:
         gray: mean over the marker bands, in which markers are detected.
-        bins: smoothed spectra (`smoothed_bins`), read from disk where they are used.
+        bins_path: smoothed spectra (`smoothed_bins`), 16-bit floats.
+        bins_shape: bins, lines, samples.
         pixel_counts: numbers of clipped and flagged values by kept band.
     """
 
     gray: UInt8[np.ndarray, "lines samples"]
-    bins: Float16[np.ndarray, "bins lines samples"]
+    bins_path: Path
+    bins_shape: tuple[int, ...]
     pixel_counts: PixelCounts
+
+    @property
+    def bins(self) -> Float16[np.ndarray, "bins lines samples"]:
+        """The smoothed spectra, mapped anew: in memory while they are used."""
+        return np.memmap(self.bins_path, np.float16, "r", shape=self.bins_shape)
+
+
+class BinsOfFrames(Sequence[Float16[np.ndarray, "bins lines samples"]]):
+    """Smoothed spectra of frames. Used one after the other, they take memory for one frame."""
+
+    def __init__(self, caches: Sequence[FrameCache]) -> None:
+        self._caches = caches
+
+    def __len__(self) -> int:
+        return len(self._caches)
+
+    def __getitem__(self, frame: Any) -> Any:
+        return BinsOfFrames(self._caches[frame]) if isinstance(frame, slice) else self._caches[frame].bins
 
 
 def pack_frames(
@@ -195,7 +215,7 @@ def process_frame(
     np.savez(note, fingerprint=fingerprint, gray=gray, shape_of_bins=bins.shape, **vars(frame.pixel_counts))
     with atomic_write(paths.cache) as (temporary,):
         temporary.write_bytes(hashlib.sha256(note.getvalue()).digest() + note.getvalue())
-    return FrameCache(gray, _mapped(paths.bins, bins.shape), frame.pixel_counts)
+    return FrameCache(gray, paths.bins, bins.shape, frame.pixel_counts)
 
 
 def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
@@ -210,22 +230,13 @@ def read_cache(paths: FramePaths, fingerprint: str) -> FrameCache | None:
             if str(stored["fingerprint"]) != fingerprint:
                 return None
             pixel_counts = PixelCounts(**{f.name: stored[f.name] for f in fields(PixelCounts)})
-            cache = FrameCache(stored["gray"], _mapped(paths.bins, tuple(stored["shape_of_bins"])), pixel_counts)
+            shape = tuple(map(int, stored["shape_of_bins"]))
+            cache = FrameCache(stored["gray"], paths.bins, shape, pixel_counts)
         open_cube(paths.cube)
+        whole = paths.bins.stat().st_size == np.dtype(np.float16).itemsize * math.prod(shape)
     except (OSError, ValueError, KeyError, InputError):
         return None
-    return cache if paths.image.is_file() and paths.flags.is_file() else None
-
-
-def _mapped(path: Path, shape: tuple[int, ...]) -> Float16[np.ndarray, "bins lines samples"]:
-    """A file of 16-bit floats, in memory where it is used.
-
-    Raises:
-        ValueError: the file has another size.
-    """
-    if path.stat().st_size != np.dtype(np.float16).itemsize * math.prod(map(int, shape)):
-        raise ValueError(f"{path} has another size")
-    return np.memmap(path, np.float16, "r", shape=shape)
+    return cache if whole and paths.image.is_file() and paths.flags.is_file() else None
 
 
 def _digest(calibration: FrameCalibration) -> str:

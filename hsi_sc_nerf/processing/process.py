@@ -19,7 +19,7 @@ from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, Sessi
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import require_writable, write_png
-from hsi_sc_nerf.inspection.inspect import Inspection, inspect_session, suggestion
+from hsi_sc_nerf.inspection.inspect import inspect_session, suggestion
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import (
     TRANSFORMS_NAME,
@@ -35,7 +35,13 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
-from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FrameCache, pack_frames, session_fingerprint
+from hsi_sc_nerf.processing.frames import (
+    MARKER_RANGE_NM,
+    BinsOfFrames,
+    FrameCache,
+    pack_frames,
+    session_fingerprint,
+)
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
@@ -127,9 +133,7 @@ def process_session(
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    inspection = _inspect(session, config, console)
-    session = inspection.session
-    checks = SessionChecks(inspection, config.accept, output_dir)
+    session, checks = _inspect(session, config, output_dir, console)
     _remove_transforms(output_dir)
     checks.write()
 
@@ -193,7 +197,7 @@ def process_session(
     )
     with console.status("looking for the effects that the session calls for"):
         drift = calibration.drift, calibration.drift_corrected
-        effects = measure_effects(dataset, [cache.bins for cache in caches], masks, hull, drift, poses)
+        effects = measure_effects(dataset, BinsOfFrames(caches), masks, hull, drift, poses)
         draw_effects(output_dir / "report" / "effects.png", effects)
     show_effects(console, effects)
     write_transforms(replace(dataset, effects=effects))
@@ -201,8 +205,10 @@ def process_session(
     return output_dir
 
 
-def _inspect(session: Session, config: ProcessConfig, console: Console) -> Inspection:
-    """The findings of `inspect_session`, with the session upright; print a ``session.json`` where one is missing."""
+def _inspect(
+    session: Session, config: ProcessConfig, output_dir: Path, console: Console
+) -> tuple[Session, SessionChecks]:
+    """The session upright, and what its inspection found, whose pictures of all frames are not kept."""
     with console.status("checking the session"):
         scale_known = config.marker_side_m is not None or config.camera is not None
         inspection = inspect_session(
@@ -211,7 +217,7 @@ def _inspect(session: Session, config: ProcessConfig, console: Console) -> Inspe
     no_scale = any(finding.name == "scale" and finding.level == "red" for finding in inspection.findings)
     if no_scale and not session.info_path.is_file():
         console.print(suggestion(session, inspection.session_json), highlight=False, soft_wrap=True)
-    return inspection
+    return inspection.session, SessionChecks(inspection, config.accept, output_dir)
 
 
 def _named_files(config: ProcessConfig) -> list[Path]:
@@ -273,8 +279,9 @@ def _write_masks(
         distortion, overhang = np.array(poses.distortion, dtype=float), config.overhang
         regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
         lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
-    masks = foreground_masks([cache.bins for cache in caches], config, regions)
-    brightness = np.stack([cache.bins.mean(axis=0, dtype=np.float32) for cache in caches])
+    bins = BinsOfFrames(caches)
+    masks = foreground_masks(bins, config, regions)
+    brightness = np.stack([image.mean(axis=0, dtype=np.float32) for image in bins])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
     hull = voted_hull(masks, camera_to_worlds, lens, lid_z_m)

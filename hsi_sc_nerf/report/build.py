@@ -14,7 +14,7 @@ from hsi_sc_nerf.analysis.calibrations import Calibration, read_calibration
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
-from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.files import atomic_write, content_of
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.cloud import cloud_payload, compress_spectra
@@ -26,7 +26,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, content_of, html_page, read_known
+from hsi_sc_nerf.report.page import CloudViewer, Section, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
     comparison_section,

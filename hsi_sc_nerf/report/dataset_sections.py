@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from markupsafe import Markup
 
+from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.report.charts import Curve, line_chart
@@ -20,7 +21,6 @@ from hsi_sc_nerf.report.page import (
     Missing,
     Section,
     Table,
-    content_of,
     embedded_file,
     read_known,
 )

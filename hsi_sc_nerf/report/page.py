@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -119,19 +118,6 @@ def read_known(path: Path) -> dict[str, Any] | None:
         InputError: it is no JSON object.
     """
     return read_json(path, _AGAIN) if path.is_file() else None
-
-
-@contextmanager
-def content_of(path: Path, what: str, advice: str = _AGAIN) -> Iterator[None]:
-    """Refuse a file in one sentence if reading figures from its content fails, however damaged that is.
-
-    Raises:
-        InputError: it does.
-    """
-    try:
-        yield
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: holds no {what} ({error}); {advice}.") from error
 
 
 def html_page(title: str, subtitle: str, key_figures: Mapping[str, str], sections: Sequence[Section]) -> str:

@@ -13,9 +13,10 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.evaluation.comparison_report import comparison_tables
+from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.report.charts import Curve, line_chart
-from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, content_of, embedded_file
+from hsi_sc_nerf.report.page import Block, Figure, Folded, Missing, Section, Table, embedded_file
 
 _LOSSES, _RATES = "Train Loss Dict/", "learning_rate/"
 _CORRECTIONS = {

@@ -130,7 +130,7 @@ def test_a_calibration_beyond_the_bands_is_refused(fitted):
 
 
 @pytest.mark.parametrize(("model", "column", "rtol"), [("pls.onnx", 6, 1e-5), ("classes.onnx", 7, 1e-5)])
-def test_models_of_scikit_learn_as_onnx(tmp_path, model, column, rtol):
+def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
     pytest.importorskip("onnxruntime")
     expected = np.loadtxt(MODELS / "expected.csv", delimiter=",")
     (tmp_path / model).write_bytes((MODELS / model).read_bytes())
@@ -140,9 +140,14 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, model, column, rtol):
     assert calibration.name == "own"
     with pytest.raises(InputError, match="is no ONNX model of spectra of 7 bands"):
         read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:7]}))
-    (tmp_path / model).write_bytes(b"no model")
-    with pytest.raises(InputError, match=f"{model}: is no ONNX model"):
-        read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
+    names_in_latin_1 = (
+        (MODELS / model).read_bytes().replace(b"variable", b"variabl\xe9").replace(b"label", b"lab\xe9l")
+    )
+    for damaged in (b"no model", names_in_latin_1):
+        (tmp_path / model).write_bytes(damaged)
+        with pytest.raises(InputError, match=f"{model}: is no ONNX model"):
+            read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
+    assert capfd.readouterr() == ("", "")  # one sentence, and nothing of onnxruntime's beside it
 
 
 @pytest.mark.parametrize(

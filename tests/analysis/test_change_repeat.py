@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from hsi_sc_nerf.simulate.another_day import STAND_M, CloudErrors, SetDown, cloud_of, fruit_of
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.indices.catalogue import find_indices
-from hsi_sc_nerf.simulate.another_day import STAND_M, CloudErrors, SetDown, cloud_of, fruit_of
 
 pytestmark = pytest.mark.slow
 

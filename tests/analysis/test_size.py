@@ -14,11 +14,13 @@ from hsi_sc_nerf.analysis.size import (
     Size,
     combined,
     offset,
+    scale_uncertainty,
     shared_errors,
     size_of,
     size_uncertainty,
     sizes_to_find,
 )
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.dataset import open_packed
 
@@ -97,3 +99,16 @@ def test_a_dataset_tells_scale_and_pixels(tmp_path):
     assert unknown.base_m > known.base_m
     write_json(dataset.root / "poses.json", {"scale": {"uncertainty_percent": 0.5}})
     assert shared_errors(dataset, base_known=True).scale == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(
+    "scale", [5, "wide", [1], {"uncertainty_percent": "a"}, {"uncertainty_percent": [1]}, {"uncertainty_percent": -1}]
+)
+def test_a_damaged_scale_is_refused_and_a_missing_one_is_not_known(tmp_path, scale):
+    path = tmp_path / "poses.json"
+    assert scale_uncertainty(path) == 0.0
+    write_json(path, {"scale": None})
+    assert scale_uncertainty(path) == 0.0
+    write_json(path, {"scale": scale})
+    with pytest.raises(InputError, match=r"^[^\n]*poses\.json: holds no uncertainty of the scale[^\n]*\.$"):
+        scale_uncertainty(path)

@@ -30,7 +30,6 @@ from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 TINY = " ".join(
     (
         "--pipeline.datamanager.train-num-rays-per-batch 64",
@@ -166,7 +165,6 @@ def command(tiny_dataset, folder, device="cpu", **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", DEVICES)
 def test_two_configurations_are_trained_timed_and_compared(tiny_dataset, tmp_path, in_this_process, device):
     command(tiny_dataset, tmp_path, device).main()
     with (tmp_path / "benchmark.csv").open(encoding="utf-8") as file:

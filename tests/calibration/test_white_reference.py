@@ -184,6 +184,23 @@ def test_tarp_with_no_usable_region(tmp_path, counts):
         white_reference(capture(tmp_path, "white", counts))
 
 
+def test_white_of_one_pixel_is_that_pixel(tmp_path):
+    counts = np.random.default_rng(0).uniform(0.0, 5000.0, (40, 60, 7))
+    counts[10, 20] = LAMP
+    white = white_reference(capture(tmp_path, "white", counts), (20, 10, 21, 11), defects())
+    assert white.pixels == 1
+    np.testing.assert_allclose(white.measured, LAMP[None])
+    assert np.isfinite(white.spectrum).all()
+
+
+@pytest.mark.parametrize("roi", [None, (3, 4, 30, 15), (3, 4, 4, 5)])
+@pytest.mark.parametrize("level", [10.0, 9.0, 0.0])
+def test_a_white_at_or_below_dark_is_refused(tmp_path, level, roi):
+    tarp = capture(tmp_path, "white", np.full((20, 60, 7), level), np.full((2, 60, 7), 10.0))
+    with pytest.raises(InputError, match=r"white\.hdr: the (white|tarp) [^\n]*\.$"):
+        white_reference(tarp, roi, defects())
+
+
 def test_bands_without_light_are_bad_and_not_smoothed_into_others(tmp_path):
     counts = tarp_scene()
     counts[..., 3] = 10.0

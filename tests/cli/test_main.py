@@ -1,6 +1,7 @@
 """Whatever goes wrong that a user can mend is one line."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from hsi_sc_nerf.cli import main as entry
 from hsi_sc_nerf.cli.commands import COMMANDS
 from hsi_sc_nerf.cli.sessions import MarkersCommand
+from hsi_sc_nerf.errors import InputError
 
 MAIN = [sys.executable, "-m", "hsi_sc_nerf.cli.main"]
 
@@ -51,6 +53,38 @@ def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
         entry.main()
 
 
+@pytest.mark.parametrize("other", [ImportError("a library failed to import"), InputError("a: is damaged.")])
+def test_ctrl_c_that_a_library_turned_into_an_error_is_the_same_line(monkeypatch, capsys, other):
+    def interrupted(self):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise other from None
+
+    monkeypatch.setattr(MarkersCommand, "main", interrupted)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr() == ("", "Stopped.\n")
+
+
+def test_ctrl_c_after_all_is_done_changes_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(MarkersCommand, "main", lambda self: None)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    entry.main()
+    signal.raise_signal(signal.SIGINT)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_command_that_ignores_ctrl_c_from_its_start_goes_on_ignoring_it(monkeypatch):
+    monkeypatch.setattr(MarkersCommand, "main", lambda self: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as nohup has it
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    entry.main()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
 def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(after_s):
@@ -85,6 +119,29 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
     subprocess.run([*MAIN, *words], check=True, capture_output=True)
     for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
         assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
+    """A limit to the size of files stands for the disk: a frame's cube has 300 kB."""
+    out = tmp_path / "data"
+    words = [*MAIN, "process", str(tiny_dataset[1]), "--output-dir", str(out)]
+    limit = (250_000, resource.RLIM_INFINITY)
+    ended = subprocess.run(
+        words,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TERM": "dumb"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )
+    assert ended.returncode == 2
+    told = [line for line in ended.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(told) == 1
+    assert "cannot be written" in told[0]
+    assert "Traceback" not in ended.stderr
+    assert not list(out.rglob("*.bip"))
+    assert not list(out.rglob(".partial-*"))
+    assert not (out / "transforms.json").exists()
 
 
 def test_help_loads_no_numerical_library_and_a_command_only_its_own():

@@ -25,6 +25,9 @@ def blob() -> torch.Tensor:
     return (rows - 3) ** 2 + (columns - 9) ** 2 < 40
 
 
+IN_PRECISIONS = pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str
+)
 MASKS = pytest.mark.parametrize("mask", [None, blob()], ids=["full", "masked"])
 
 
@@ -35,6 +38,10 @@ def some_valid() -> torch.Tensor:
     valid[3, 9:11] = False
     valid[3, 9, 2] = True
     return valid
+
+
+def on(device: str, *images: torch.Tensor | None) -> list[torch.Tensor | None]:
+    return [None if image is None else image.to(device) for image in images]
 
 
 def score_of_windows(
@@ -65,7 +72,7 @@ def score_of_pixels(x: np.ndarray, y: np.ndarray) -> float:
 @pytest.mark.parametrize("valid", [None, some_valid()], ids=["all valid", "some valid"])
 @MASKS
 def test_metrics_are_the_papers_formulas_over_valid_values(
-    mask: torch.Tensor | None, valid: torch.Tensor | None
+    mask: torch.Tensor | None, valid: torch.Tensor | None, device: str
 ) -> None:
     predicted, target = pair()
     chosen = np.ones((H, W), bool) if mask is None else mask.numpy()
@@ -87,7 +94,7 @@ def test_metrics_are_the_papers_formulas_over_valid_values(
         ratio.append(-10 * math.log10(np.mean((a - b) ** 2) + 1e-10))
         centres = list(zip(*np.nonzero(in_band), strict=True))
         windowed.append(score_of_windows(x[..., band], y[..., band], judged[..., band], centres, reach=5))
-    found = metrics.spectral_metrics(predicted, target, mask, valid)
+    found = metrics.spectral_metrics(*on(device, predicted, target, mask, valid))
     assert found["sam"] == pytest.approx(np.mean(angles), rel=1e-5)
     assert found["rmse"] == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-5)
     assert found["rmse_pixel_mean"] == pytest.approx(np.mean(roots), rel=1e-5)
@@ -130,20 +137,21 @@ def test_ssim_of_the_whole_mask_ignores_where_pixels_lie_and_the_windowed_one_do
 
 
 @MASKS
-def test_identical_images_score_full_marks(mask: torch.Tensor | None) -> None:
-    target = pair()[1]
+@IN_PRECISIONS
+def test_identical_images_score_full_marks(mask: torch.Tensor | None, dtype: torch.dtype, device: str) -> None:
+    target, mask = on(device, pair()[1].to(dtype), mask)
     found = metrics.spectral_metrics(target, target, mask)
     assert found == pytest.approx(
         {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}, abs=1e-6
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
-def test_an_empty_mask_scores_like_identical_images(dtype: torch.dtype) -> None:
-    predicted, target = (image.to(dtype) for image in pair())
-    assert metrics.spectral_metrics(predicted, target, torch.zeros(H, W, dtype=torch.bool)) == pytest.approx(
-        {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
-    )
+@IN_PRECISIONS
+def test_an_empty_mask_scores_like_identical_images(dtype: torch.dtype, device: str) -> None:
+    predicted, target = (image.to(device, dtype) for image in pair())
+    assert metrics.spectral_metrics(
+        predicted, target, torch.zeros(H, W, dtype=torch.bool, device=device)
+    ) == pytest.approx({"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100})
 
 
 def test_variance_survives_a_large_offset_in_float32() -> None:
@@ -155,14 +163,13 @@ def test_variance_survives_a_large_offset_in_float32() -> None:
     assert contrast == pytest.approx((9e-4 - 2 * variance) / (9e-4 + 2 * variance), rel=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 3e38])
-def test_metrics_are_finite(scale: float, dtype: torch.dtype) -> None:
-    predicted, target = pair()
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-42, 1e-30, 3e38])
+def test_metrics_are_finite(scale: float, dtype: torch.dtype, device: str) -> None:
+    predicted, target, mask = on(device, *pair(), blob())
     predicted[..., 1] = 0
     target[..., 1] = 0
     predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype)
-    mask = blob()
     for against in (target.to(dtype), predicted, torch.zeros_like(predicted)):
         assert np.isfinite(list(metrics.spectral_metrics(predicted, against, mask).values())).all()
         assert metrics.spectral_rmse(predicted, against, mask).dtype == torch.float32
@@ -204,9 +211,9 @@ def test_flagged_values_may_be_anything(anything: float) -> None:
 
 
 @MASKS
-def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool)
+def test_nothing_valid_scores_like_identical_images(mask: torch.Tensor | None, device: str) -> None:
+    predicted, target, mask = on(device, *pair(), mask)
+    nothing = torch.zeros(H, W, BANDS, dtype=torch.bool, device=device)
     assert metrics.spectral_metrics(predicted, target, mask, nothing) == pytest.approx(
         {"sam": 0, "rmse": 0, "rmse_pixel_mean": 0, "ssim": 1, "ssim_windowed": 1, "psnr": 100}
     )

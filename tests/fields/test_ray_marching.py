@@ -2,6 +2,9 @@
 
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider
 
 from hsi_sc_nerf.fields.ray_marching import EXPLORED, cell_of, march_steps, sample_occupied, sample_with_tensors
 
@@ -31,13 +34,15 @@ def rays(count, seed=0):
     return origins, torch.nn.functional.normalize(directions, dim=-1), nears, torch.full((count,), 4.8)
 
 
-def sampled(function, opacity, samples=16, count=500):
-    return function(*rays(count), opacity, LOWER, CELL, samples)
+def sampled(function, opacity, samples=16, count=500, device="cpu"):
+    on_device = (tensor.to(device) for tensor in (*rays(count), opacity, LOWER))
+    return [found.cpu() for found in function(*on_device, CELL, samples)]
 
 
 @pytest.mark.parametrize("samples", [1, 5, 16])
-def test_compiled_loop_equals_tensor_operations(samples):
-    compiled, tensors = (sampled(function, shell(), samples) for function in (sample_occupied, sample_with_tensors))
+def test_compiled_loop_equals_tensor_operations(samples, device):
+    compiled = sampled(sample_occupied, shell(), samples)
+    tensors = sampled(sample_with_tensors, shell(), samples, device=device)
     for a, b in zip(compiled, tensors, strict=True):
         torch.testing.assert_close(a, b, rtol=0.0, atol=1e-4)
 
@@ -91,15 +96,40 @@ def test_rays_that_meet_nothing_have_samples_of_no_length(function):
     assert starts.isfinite().all()
 
 
+IN_BOX = [-1.0, -1.0, -0.8, 1.0, 1.0, 0.8]
+HARD_RAYS = {
+    "misses": ([-3.0, 2.0, 0.0], [1.0, 0.0, 0.0]),
+    "looks away": ([-3.0, 0.0, 0.0], [-1.0, 0.0, 0.0]),
+    "starts inside": ([0.0, 0.0, 0.0], [1.0, 2.0, -1.0]),
+    "starts on a face": ([-1.0, 0.3, 0.1], [1.0, 0.0, 0.0]),
+    "along a face": ([-3.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
+    "along an edge": ([-1.0, -1.0, -0.8], [0.0, 0.0, 1.0]),
+    "through a corner": ([-2.0, 0.0, -0.8], [1.0, 1.0, 0.0]),
+    "grazes a face": ([-3.0, 1.000001, 0.0], [1.0, -1e-7, 0.0]),
+    "almost along an axis": ([-3.0, 0.0, 0.0], [1.0, -1e-6, 1e-38]),
+}
+
+
 @pytest.mark.parametrize("function", [sample_occupied, sample_with_tensors])
-@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
-def test_rays_along_faces_and_from_inside_are_finite(function, direction):
-    origins = torch.tensor([[-1.0, -1.0, -0.8], [0.0, 0.0, 0.0], [-1.0, 0.3, 0.1]])
-    directions = torch.nn.functional.normalize(torch.tensor([direction] * 3), dim=-1)
-    zeros = torch.zeros(3)
-    starts, ends = function(origins, directions, zeros, zeros + 3.0, torch.zeros(SHAPE), LOWER, CELL, 8)
+@pytest.mark.parametrize("ray", HARD_RAYS)
+def test_hard_rays_have_finite_samples_in_order(function, ray, device):
+    origin, direction = (torch.tensor([values], device=device) for values in HARD_RAYS[ray])
+    direction = torch.nn.functional.normalize(direction, dim=-1)
+    bundle = RayBundle(origin, direction, torch.ones_like(origin[:, :1]))
+    box = SceneBox(torch.tensor(IN_BOX, device=device).reshape(2, 3))
+    bundle = AABBBoxCollider(box, near_plane=0.0)(bundle)
+    nears, fars = bundle.nears[:, 0], bundle.fars[:, 0]
+    grid = torch.zeros(SHAPE, device=device), LOWER.to(device)
+    starts, ends = function(origin, direction, nears, fars, *grid, CELL, 8)
     assert starts.isfinite().all()
+    assert ends.isfinite().all()
     assert (ends >= starts).all()
+    assert (starts[:, 1:] >= ends[:, :-1] - 1e-5).all()
+    lengths = (ends - starts).sum()
+    if ray in ("misses", "looks away"):
+        assert lengths == 0.0
+    if ray in ("starts inside", "starts on a face", "almost along an axis"):
+        assert lengths > 0.5
 
 
 def test_steps_cross_the_diagonal():

@@ -1,6 +1,5 @@
 import cv2
 import numpy as np
-import pytest
 import torch
 
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, pinhole_cameras
@@ -11,7 +10,6 @@ from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 LENS = PinholeIntrinsics(60, 40, 80.0, 85.0, 31.0, 18.5)
 STRAIGHT = (0.0, 0.0, 0.0, 0.0)
 CURVED = (-0.25, 0.1, 0.003, -0.002)
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SPECTRUM = torch.tensor([0.9, 0.8, 0.7])
 
 
@@ -36,7 +34,6 @@ def random_image(lines=LENS.h, samples=LENS.w):
     return 0.1 + 0.8 * torch.rand(lines, samples, 3, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_every_frame_sees_the_picture_itself(device):
     image = random_image()
     module = background(image).to(device)

@@ -32,13 +32,13 @@ def test_angular_loss_knows_shape_only() -> None:
     assert angular_loss(0.01 * predicted, target).item() == pytest.approx(angular_loss(predicted, target).item())
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-6, 1.0, 6e4, 3e38])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32], ids=str)
+@pytest.mark.parametrize("scale", [0.0, 1e-42, 1e-38, 1e-6, 1.0, 6e4, 3e38])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_losses_and_gradients_are_finite(loss, scale: float, dtype: torch.dtype) -> None:
-    predicted, target = pair()
+def test_losses_and_gradients_are_finite(loss, scale: float, dtype: torch.dtype, device: str) -> None:
+    predicted, target = (values.to(device) for values in pair())
     predicted = (scale * predicted.double()).clamp(max=torch.finfo(dtype).max).to(dtype).requires_grad_()
-    for valid in (None, some_valid()):
+    for valid in (None, some_valid().to(device)):
         for against in (target.to(dtype), torch.zeros_like(target, dtype=dtype), predicted.detach()):
             predicted.grad = None
             value = loss(predicted, against, valid)
@@ -74,7 +74,7 @@ def some_valid() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("flagged", [False, True])
-def test_losses_are_the_papers_formulas_over_valid_values(flagged) -> None:
+def test_losses_are_the_papers_formulas_over_valid_values(flagged, device: str) -> None:
     predicted, target = pair()
     valid = some_valid() if flagged else torch.ones(5, 6, 31, dtype=torch.bool)
     squares, angles = [], []
@@ -85,16 +85,16 @@ def test_losses_are_the_papers_formulas_over_valid_values(flagged) -> None:
         if bands.sum() >= 2:
             angles.append(1 - p @ t / (np.linalg.norm(p) * np.linalg.norm(t)))
     assert len(angles) == 30 - 2 * flagged
-    valid = valid if flagged else None
+    valid = valid.to(device) if flagged else None
+    predicted, target = predicted.to(device), target.to(device)
     assert hsi_loss(predicted, target, valid).item() == pytest.approx(np.mean(squares), rel=1e-6)
     assert angular_loss(predicted, target, valid).item() == pytest.approx(np.mean(angles), rel=1e-6)
 
 
 @pytest.mark.parametrize("anything", [0.0, 1e30, float("nan"), float("inf")])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: float) -> None:
-    predicted, target = pair()
-    valid = some_valid()
+def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: float, device: str) -> None:
+    predicted, target, valid = (values.to(device) for values in (*pair(), some_valid()))
     expected = loss(predicted, target, valid)
     target[~valid] = predicted[~valid] = anything
     predicted.requires_grad_()
@@ -107,10 +107,10 @@ def test_flagged_values_may_be_anything_and_send_no_gradient(loss, anything: flo
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_batch_without_measurements_costs_nothing(loss) -> None:
-    predicted, target = pair()
+def test_a_batch_without_measurements_costs_nothing(loss, device: str) -> None:
+    predicted, target = (values.to(device) for values in pair())
     predicted.requires_grad_()
-    value = loss(predicted, target * float("nan"), torch.zeros(5, 6, 31, dtype=torch.bool))
+    value = loss(predicted, target * float("nan"), torch.zeros(5, 6, 31, dtype=torch.bool, device=device))
     value.backward()
     assert value.item() == 0
     assert not predicted.grad.any()
@@ -127,9 +127,9 @@ def test_the_direction_floor_is_a_root_mean_square_of_the_valid_bands() -> None:
 
 @pytest.mark.parametrize("flagged", [False, True])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_gradients_match_finite_differences(loss, flagged) -> None:
-    predicted, target = (values.double() for values in pair((2, 3, 5)))
-    valid = some_valid()[1:3, :3, :5] if flagged else None
+def test_gradients_match_finite_differences(loss, flagged, device: str) -> None:
+    predicted, target = (values.double().to(device) for values in pair((2, 3, 5)))
+    valid = some_valid()[1:3, :3, :5].to(device) if flagged else None
     assert torch.autograd.gradcheck(lambda values: loss(values, target, valid), (predicted.requires_grad_(),))
 
 

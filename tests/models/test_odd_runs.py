@@ -10,7 +10,13 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from odd_runs import CASES, simulated, train
 
 STOPS = {"all masks empty": "the masks of all training frames are empty", "two dead bands": "free of flagged values"}
-ENDS = ["1 band", "two frames, 180 degrees apart", "loss weights 0 and 1", "learning rates times 100"]
+ENDS = [
+    "1 band",
+    "one training view",
+    "two training views, 180 degrees apart",
+    "loss weights 0 and 1",
+    "learning rates times 100",
+]
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from nerfstudio.configs.base_config import MachineConfig
 from small_trainer import trainer
 
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
@@ -67,6 +68,24 @@ def whole(tiny_dataset, tmp_path_factory):
     made = longer(tiny_dataset, tmp_path_factory.mktemp("whole"), evaluate_stages=True, **EVALUATIONS)
     made.train()
     return made
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_weights_and_another_does_not(tiny_dataset, tmp_path):
+    usual = torch.get_num_threads()
+    torch.set_num_threads(2)  # what is summed by several could depend on which is first
+    try:
+        weights = []
+        for number, seed in enumerate((3, 3, 4)):
+            machine = MachineConfig(seed=seed, device_type="cpu")
+            made = longer(tiny_dataset, tmp_path / str(number), machine=machine, steps_per_save=STEPS)
+            made.train()
+            weights.append(checkpoint(made.checkpoint_dir))
+            torch.rand(7)  # what was drawn before does not matter
+    finally:
+        torch.set_num_threads(usual)
+    assert differences(weights[0], weights[1]) == []
+    assert len(differences(weights[0], weights[2])) > 10
 
 
 @pytest.mark.slow

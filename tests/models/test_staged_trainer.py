@@ -14,11 +14,8 @@ from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", DEVICES)
 def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
     made = trainer(tiny_dataset, tmp_path, device)
     seen = []

@@ -1,6 +1,10 @@
 import json
 import logging
+import re
+import sys
+import weakref
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -26,9 +30,12 @@ from capture_factory import (
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.inspection import inspect
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import Container, open_packed
-from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.processing import process
+from hsi_sc_nerf.processing.frames import pack_frames
+from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
 from hsi_sc_nerf.processing.posed_frames import known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
@@ -57,6 +64,45 @@ def rewritten(output, before: dict[str, int]) -> list[str]:
 
 def no_markers(images, names, **_):
     raise InputError("no marker was found")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the process's maps from /proc")
+def test_pictures_of_the_inspection_and_maps_of_frames_are_not_kept(session, tmp_path, monkeypatch):
+    pictures, mapped = [], []
+
+    def inspected(*args, **kwargs):
+        found = inspect.inspect_session(*args, **kwargs)
+        pictures.extend(weakref.ref(look.picture) for look in found.looks)
+        return found
+
+    def masked(bins, *args, **kwargs):
+        assert len(pictures) == len(bins) == len(ANGLES_DEG)
+        assert [picture() for picture in pictures] == [None] * len(pictures)
+        found = foreground_masks(bins, *args, **kwargs)
+        mapped.extend(re.findall(r"\S+\.bins", Path("/proc/self/maps").read_text()))
+        return found
+
+    monkeypatch.setattr(process, "inspect_session", inspected)
+    monkeypatch.setattr(process, "foreground_masks", masked)
+    run(session, tmp_path / "data")
+    assert mapped == []
+
+
+@pytest.mark.slow
+def test_a_cube_that_vanishes_is_named_and_leaves_nothing_half_written(session, tmp_path, monkeypatch):
+    (cube,) = (path for path in session.rglob("*ball_3.raw") if "REF" not in path.name)
+
+    def packed(*args, **kwargs):
+        cube.unlink()
+        return pack_frames(*args, **kwargs)
+
+    monkeypatch.setattr(process, "pack_frames", packed)
+    # The entry makes one line of both kinds.
+    with pytest.raises((InputError, FileNotFoundError), match=re.escape(cube.name)):
+        run(session, tmp_path / "data")
+    assert not (tmp_path / "data" / "transforms.json").exists()
+    assert not list(tmp_path.rglob(".partial-*"))
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import visual_hull_region
 from hsi_sc_nerf.surface.surface_depth import MIN_COSINE
 
-pytestmark = pytest.mark.parametrize("device", ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
 LENS = PinholeIntrinsics(64, 48, 80.0, 79.0, 33.0, 25.0)
 POSES = np.stack([turntable_camera_to_world(look_at(np.array([4.0, 0, 0.5]), np.zeros(3)), a) for a in (0, 90, 180)])
 SECOND_BALL = np.array([1.6, 0.0, 0.0])

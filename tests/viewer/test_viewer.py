@@ -21,12 +21,10 @@ from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.panel import SpectralPanel, attach_spectral_panel, pick
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 LENS = PinholeIntrinsics(w=40, h=30, fl_x=50.0, fl_y=60.0, cx=19.0, cy=16.0)
 STRAIGHT = (0.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_colours_are_those_of_the_map_at_its_range(device):
     values = torch.tensor([[0.5, 0.9015, 1.3], [torch.nan, -9.0, 9.0]], device=device)
     table = matplotlib.colormaps["viridis"]
@@ -41,7 +39,6 @@ def rays_through(lens, lines, samples):
     return torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rays_meet_the_pixels_that_they_were_made_from(device):
     lines, samples = torch.meshgrid(torch.arange(-3, 33), torch.arange(-3, 43), indexing="ij")
     rotation = torch.from_numpy(SO3.exp(np.array([0.3, -1.1, 2.0])).as_matrix()).float()
@@ -53,7 +50,6 @@ def test_rays_meet_the_pixels_that_they_were_made_from(device):
     assert not frame_pixels(-directions.to(device), rotation.to(device), LENS, STRAIGHT)[1].any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_angle_to_measured_is_that_of_two_spectra_where_seen_and_valid(device):
     angles = torch.linspace(0.0, 1.0, 6).reshape(2, 3)
     rendered = torch.stack([angles.cos(), angles.sin(), torch.zeros(2, 3)], dim=-1)
