@@ -43,7 +43,7 @@ def moment_scores(
         moments = sums / np.maximum(pixels, 1)
         means += moments[:2]
     variance_p, variance_t, covariance, mse = moments[2:]
-    return pixels, mse, _similarity.py_func(*means, variance_p, variance_t, covariance)
+    return pixels, mse, _similarity.py_func(means[0], means[1], variance_p, variance_t, covariance)
 
 
 def windowed_scores(images: Images, masks: Bool[np.ndarray, "masks h w"]) -> BandScore:
