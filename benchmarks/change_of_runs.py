@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
 from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
-from hsi_sc_nerf.simulate.another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hsi_sc_nerf.simulate.another_day import STAND_M, CloudErrors, SetDown, cloud_of, fruit_of
+from another_day import STAND_M, CloudErrors, SetDown, cloud_of, fruit_of
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
