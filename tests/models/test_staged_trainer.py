@@ -220,6 +220,7 @@ def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_data
 
 def test_single_steps_run_without_the_loop_of_nerfstudio(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path)
+    made._show_progress = lambda step, psnr_db: None
     for step in range(STEPS):
         assert not made.stop_training
         made.train_iteration(step)
