@@ -291,6 +291,6 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("uncertainty of the distance", "{:.2f} %", uncertainty.get("distance_percent")),
         ("scale by", "{}", scale.get("source") or ("as given" if found.get("metric") else "none: not in metres")),
         ("uncertainty of the scale", "{:.3f} %", scale.get("uncertainty_percent")),
-        ("rejected sightings", "{}", len(found.get("outliers") or ())),
+        ("rejected observations", "{}", len(found.get("outliers") or ())),
     ]
     return [(name, pattern.format(value)) for name, pattern, value in candidates if value is not None]
