@@ -127,8 +127,8 @@ def changes(
         of_patches, *of_repeat = (patches.means(each - first, one.areas_m2) for each in (last, *again))
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
-        repeat = of_repeat[0] if of_repeat else None
-        test = significance(of_patches, patches.centres_m, noise, off, shared, repeat, rim)
+        errors = of_repeat[0] if of_repeat else None
+        test = significance(of_patches, patches.centres_m, noise, off, shared, errors, rim)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
