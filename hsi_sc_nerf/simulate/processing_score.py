@@ -140,5 +140,8 @@ def score_calibration(
 
 def lamp_output(truth: Truth, capture: str) -> Float[np.ndarray, "bands"]:
     """True illumination in the image centre, which differs between frames by the lamp drift only."""
-    factors = (factor[factor.shape[0] // 2, factor.shape[1] // 2] for factor in truth.light(capture).illumination)
-    return np.prod([np.ones(len(truth.wavelengths_nm)), *factors], axis=0)
+    product = np.ones(len(truth.wavelengths_nm))
+    for factor in truth.light(capture).illumination:
+        # A factor may be one number for all bands.
+        product = product * factor[factor.shape[0] // 2, factor.shape[1] // 2]
+    return product

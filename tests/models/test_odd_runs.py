@@ -29,7 +29,7 @@ def scene(tmp_path_factory):
 def test_odd_runs_end_finite_or_with_one_sentence(scene, tmp_path, name):
     (case,) = (case for case in CASES if case.name == name)
     ended = train(case, scene, tmp_path, steps=8)  # raises where a weight is not finite
-    assert STOPS.get(name, "") in ended.told
-    assert bool(ended.told) == (name in STOPS)
-    assert "\n" not in ended.told
+    assert STOPS.get(name, "") in ended.message
+    assert bool(ended.message) == (name in STOPS)
+    assert "\n" not in ended.message
     assert name in STOPS or np.isfinite([ended.before, ended.after]).all()

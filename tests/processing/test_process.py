@@ -73,7 +73,7 @@ def test_pictures_of_the_inspection_and_maps_of_frames_are_not_kept(session, tmp
 
     def inspected(*args, **kwargs):
         found = inspect.inspect_session(*args, **kwargs)
-        pictures.extend(weakref.ref(look.picture) for look in found.looks)
+        pictures.extend(weakref.ref(look.picture) for look in found.quicklooks)
         return found
 
     def masked(bins, *args, **kwargs):
