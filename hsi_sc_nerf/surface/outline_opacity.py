@@ -5,8 +5,9 @@ is: it lies between the chamber's spectrum beside the outline and the object's i
 render the same spectrum by more of a paler object, because nothing but the pixel's spectrum is taught there. So half
 a coverage is not half an opacity in general, and the surface is looked for at the opacity that is measured.
 
-Gloss makes the rim of an object resemble the chamber, which is mirrored there, and no coverage can be told. It shows
-in the rim's whole pixels as well, which are brighter than those further inside.
+Gloss makes the rim of an object resemble the chamber, which is mirrored there, and a lamp in front leaves the rim
+darker than what faces it. No coverage can be told then. Both show in the rim's whole pixels as well, which are
+brighter or darker than those further inside.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ RIM_PX = (1.5, 2.5)
 """Depths of the first pixels that are covered wholly."""
 PURE_PX, DEEP_PX = 2.5, 5.0
 """Spectra of the object and the chamber are taken this far from the outline; those that the rim is compared with."""
-GLOSSY_RIM = 1.025
-"""Median brightness of the rim, relative to deep pixels, above which it is taken for glossy
-(docs/validation/surface.md). Gloss just below it hides 0.04 of the coverage."""
+RIM_CHANGE = 0.025
+"""Largest change of the rim's median brightness, relative to deep pixels, with which the coverage can be told
+(docs/validation/surface.md)."""
 _SMOOTHING_PX = 1.0
 
 
@@ -82,7 +83,7 @@ def half_coverage_opacity(
 ) -> float:
     """Median opacity of the pixels that the object covers by `MEASURED_COVERAGE`.
 
-    `HALF` if there are too few such pixels, or if the rim is glossy.
+    `HALF` if there are too few such pixels, or if the rim is lit otherwise than the object's inside.
 
     Args:
         sampler: has the masks and reads the spectra.
@@ -96,7 +97,7 @@ def half_coverage_opacity(
     if len(half) < FEWEST_PIXELS:
         return HALF
     rim, deep, _ = _some(outline_pixels(sampler.masks, before_chamber, RIM_PX, DEEP_PX))
-    if len(rim) < FEWEST_PIXELS or rim_brightness(sampler, rim, deep) > GLOSSY_RIM:
+    if len(rim) < FEWEST_PIXELS or abs(rim_brightness(sampler, rim, deep) - 1.0) > RIM_CHANGE:
         return HALF
     return float(np.clip(np.median(opacity_of(half)), *PLAUSIBLE_OPACITY))
 
