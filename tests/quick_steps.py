@@ -1,6 +1,6 @@
 """The workflow of `batch` with commands that take no time: they leave empty results, and note that they ran.
 
-    python tests/quick_steps.py OBJECT STEP      (in the folder of the batch, as the workflow starts its steps)
+    python tests/quick_steps.py OBJECT STEP COPY      (in the folder of the batch, as the workflow starts its steps)
 
 A session with a file `broken` cannot be processed. Where a file `wait` lies beside the batch's list, a training does
 not come to its end.
@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from hsi_sc_nerf.batch.plan import read_plan
-from hsi_sc_nerf.batch.recorded_step import record_step
+from hsi_sc_nerf.batch.recorded_step import copy_record, record_step
 from hsi_sc_nerf.benchmark.steps import StepCost, end_with_parent
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -50,4 +50,5 @@ if __name__ == "__main__":
     planned = read_plan(Path.cwd())[sys.argv[1]]
     # As with the real commands, a training that goes on is told where from.
     record_step(planned, sys.argv[2], lambda *words: quick_run(planned, *words))
+    copy_record(planned, sys.argv[2], Path(sys.argv[3]))
     os._exit(0)

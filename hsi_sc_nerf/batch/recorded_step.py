@@ -1,12 +1,14 @@
 """One step of one object, as the workflow starts it: whatever happens to the session, its record says how it ended.
 
-    python -m hsi_sc_nerf.batch.recorded_step OBJECT STEP      (in the folder of the batch)
+    python -m hsi_sc_nerf.batch.recorded_step OBJECT STEP [COPY]      (in the folder of the batch)
 
-The workflow asks for records, not for results, so that a session that fails ends its own steps only.
+The workflow asks for records, not for results, so that a session that fails ends its own steps only. COPY is where
+it wants the record, unless that is its own place.
 """
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import time
@@ -65,6 +67,13 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
     _write(one, name, status, sentence, cost)
 
 
+def copy_record(one: PlannedObject, name: str, copy: Path) -> None:
+    """Copy a step's record to where Snakemake looks for it; its own place is left as it is."""
+    if copy.resolve() != one.record(name).resolve():
+        make_folder(copy.parent)
+        shutil.copyfile(one.record(name), copy)
+
+
 def _write(one: PlannedObject, name: str, status: str, sentence: str, cost: StepCost) -> None:
     # The page of all objects is handed on: it names files as they lie in the session and in the object's folder.
     for folder in (one.folder, one.session):
@@ -91,4 +100,7 @@ def _told(log: Path) -> str:
 if __name__ == "__main__":
     # Snakemake that is killed leaves its jobs; started again, it would have two of them write to one folder.
     end_with_parent()
-    record_step(read_plan(Path.cwd())[sys.argv[1]], sys.argv[2], partial(run_step, errors=subprocess.STDOUT))
+    planned = read_plan(Path.cwd())[sys.argv[1]]
+    record_step(planned, sys.argv[2], partial(run_step, errors=subprocess.STDOUT))
+    for path in sys.argv[3:]:
+        copy_record(planned, sys.argv[2], Path(path))
