@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
+from hsi_sc_nerf.calibration.dark_checks import check_dark
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -89,6 +90,7 @@ def inspect_session(
     findings = [
         *check_files(session, skip_damaged),
         *check_white(session, white_source),
+        check_dark(session, white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
         upright,

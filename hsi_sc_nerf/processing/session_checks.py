@@ -18,7 +18,7 @@ CHECKS_PATH = Path("report") / INSPECTION_NAME
 """File in the dataset with the inspection's content and the findings of all later steps."""
 MAY_BE_RED = (
     *("angles", "binning", "copies", "damaged", "dates", "exposure", "other-object", "scale", "turn"),
-    *("white", "white-clipped", "clipped", "drift", "noise"),
+    *("white", "white-clipped", "dark", "clipped", "drift", "noise"),
     *("poses-angles", "poses-camera", "poses-direction", "poses-scale", "poses-uncertain"),
     *("frames-hull", "masks-border", "masks-cut", "masks-empty", "masks-hull", "masks-static"),
 )
