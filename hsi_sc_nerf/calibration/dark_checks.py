@@ -139,7 +139,7 @@ def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
     if lowest <= LIT_AMBER * brightest:
         return Finding("dark", "green", "No capture has a dark reference, and the counts reach zero.", values)
     sentence = (
-        f"{session.path}: no capture has a dark reference, and hardly a count is below {lowest:.4g}, which may be the "
-        "detector's offset; take a dark reference with a covered lens."
+        f"{session.path}: no capture has a dark reference, and hardly a count is below {lowest:.4g}, which may be "
+        "the detector's offset; take a dark reference with a covered lens."
     )
     return Finding("dark", "amber", sentence, values)

@@ -256,7 +256,7 @@ def _other_object(session: Session, quicklooks: Sequence[Quicklook], detections:
     ratios = deviations([q.picture for q in quicklooks])
     seen = [set(found) for found in detections]
     strangers = [
-        q.name
+        look.name
         for index, look in enumerate(quicklooks)
         if len(seen[index]) > 1
         and not any(seen[index] & other for number, other in enumerate(seen) if number != index)

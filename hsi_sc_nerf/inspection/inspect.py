@@ -21,6 +21,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
+from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.feature_poses import known_angles_deg
@@ -93,6 +94,7 @@ def inspect_session(
         check_dark(session, white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
+        *check_paper(session, quicklooks, markers.detections),
         upright,
         check_scale(session, poses, scale_known),
         *check_angles(session, poses, markers),
