@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from hsi_sc_nerf.processing.appearance_checks import SLIPS_DEG, check_appearance, slip_between, without_standing_light
 from hsi_sc_nerf.processing.view_changes import PointViews
 
-FRAMES, POINTS, COLOURS = 24, 1500, 4
+FRAMES, POINTS, COLOURS = 24, 2500, 4
 NAMES = [f"ball_{number:02d}" for number in range(FRAMES)]
 CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # right, up, towards it
 
@@ -84,7 +84,7 @@ def test_a_lamp_that_fails_in_the_middle():
     assert "again" in findings["frames-light"].sentence
 
 
-@pytest.mark.parametrize("slip_deg", [9.0, -15.0])
+@pytest.mark.parametrize("slip_deg", [12.0, -15.0])
 @pytest.mark.parametrize("noise", [0.01, 0.06])
 def test_an_object_that_slipped(slip_deg, noise):
     slips = np.where(np.arange(FRAMES) < 10, 0.0, slip_deg)
