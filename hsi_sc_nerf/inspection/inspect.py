@@ -14,6 +14,7 @@ from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
 from hsi_sc_nerf.calibration.dark_checks import check_dark
+from hsi_sc_nerf.calibration.line_checks import check_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -92,6 +93,7 @@ def inspect_session(
         *check_files(session, skip_damaged),
         *check_white(session, white_source),
         check_dark(session, white_source),
+        *check_lines(session, white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
         *check_paper(session, quicklooks, markers.detections),

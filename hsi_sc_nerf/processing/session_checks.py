@@ -30,7 +30,7 @@ MAY_BE_RED = (
         "scale",
         "turn",
     ),
-    *("white", "white-clipped", "dark", "clipped", "drift", "noise"),
+    *("white", "white-clipped", "dark", "light-lines", "clipped", "drift", "noise"),
     *("poses-angles", "poses-aspect", "poses-camera", "poses-direction", "poses-scale", "poses-uncertain"),
     *(
         "frames-hull",

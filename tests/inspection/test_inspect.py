@@ -75,6 +75,30 @@ def test_a_frame_with_markers_that_no_other_shows(session):
     assert "--exclude fruit_05" in red.sentence
 
 
+@pytest.mark.parametrize("lost", ["pixels", "a band", "a frame"])
+def test_cubes_with_values_that_are_no_data(session, tmp_path, lost):
+    """Some pixels or a whole band cost nothing; a frame without any data is found."""
+    rng = np.random.default_rng(0)
+    for header in session.glob("fruit_*/capture/fruit_*.hdr"):
+        cube = open_cube(header)
+        counts = cube.read().astype(np.float32)
+        if lost == "pixels":
+            counts[rng.random(counts.shape) < 0.002] = np.nan
+        if lost == "a band":
+            counts[..., 2] = np.nan
+        if lost == "a frame" and header.stem == "fruit_04":
+            counts[:] = np.nan
+        write_cube(header, counts, wavelengths_nm=cube.wavelengths_nm)
+    inspection, findings = inspect(session)
+    draw_inspection(inspection, tmp_path / "inspection.png")
+    red = [name for name, finding in findings.items() if finding.level == "red"]
+    assert red == (["exposure", "other-object"] if lost == "a frame" else [])
+    if lost == "a frame":
+        assert "fruit_04" in findings["exposure"].sentence
+    else:
+        assert findings["turn"].level == "green"
+
+
 def test_damaged_captures_are_named(session):
     (session / "fruit_04" / "capture" / "fruit_04.raw").write_bytes(b"")
     inspection, findings = inspect(session)
