@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -42,6 +43,9 @@ MIN_MOVING_PX = 50
 ALIKE, BRIGHTER = 0.5, 0.2
 """A capture is one of the frames if at least this fraction of the moving pixels looks like the frames, and less than
 this fraction of its brightest region is brighter than the frames there."""
+SHADE_PX, SHADE_FRACTION, SHADE_BETWEEN, SHADE_LEVEL = 5, 0.1, 0.08, 0.85
+"""Pixels that are averaged, least fraction of the white in shade and in light, largest fraction in the middle third
+between the two levels (even gradients have 0.17), and the darker level over the brighter."""
 WHITE_FRACTION = 0.25
 """A capture that outshines the others in this fraction of the pixels looks like a white."""
 MAX_ERROR = 0.003
@@ -66,8 +70,8 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
         source: where the white is. A target inside the frames is not checked, because its place is a setting.
 
     Returns:
-        The findings ``white`` (red if the white is none) and ``white-clipped`` (values above the white's: amber from
-        1 %, red from 5 %).
+        The findings ``white`` (red if the white is none), ``white-shade`` (amber if a part of a tarp is darker) and
+        ``white-clipped`` (values above the white's: amber from 1 %, red from 5 %).
 
     Raises:
         InputError: the session does not have that source of white.
@@ -88,7 +92,14 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     text = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
     if level != "green":
         text = f"{session.path}: {text} and will be clipped; check that it is a white, in the frames' light"
-    return [of_white, Finding("white-clipped", level, f"{text}.", {"fraction": clipped})]
+    found_clipped = Finding("white-clipped", level, f"{text}.", {"fraction": clipped})
+    if fault is not None or not values.get("two_levels"):
+        return [of_white, found_clipped]
+    sentence = (
+        f"{session.path}: {white} has two levels of brightness with little between, so that a shadow fell on it or "
+        "something bright stands beside it; take it again, or give its place with --calibration.roi."
+    )
+    return [of_white, Finding("white-shade", "amber", sentence), found_clipped]
 
 
 def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]:
@@ -106,6 +117,7 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
     exposures = np.array([exposure_ratio(tarp, frame) for frame in frames])
     images, clipped, outshone = _compare_with_white(frames, [white[None] / ratio for ratio in exposures], live)
     differences = np.abs(np.diff(image, axis=1)) / np.maximum(image[:, 1:], 1e-9)
+    two_levels = is_partly_shaded(image, region)
     roughness = float(np.median(differences[region[:, 1:]])) if region[:, 1:].any() else np.inf
     brighter, alike, looks_white = 1.0, 0.0, None
     if images.shape[1:] == image.shape:
@@ -132,11 +144,29 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
             "looks_most_like_a_white": tarp.name if fault is None else looks_white,
             "area_fraction": float(region.mean()),
             "roughness": roughness,
+            "two_levels": two_levels,
             "brighter_than_frames_fraction": brighter,
             "like_the_frames_fraction": alike,
             "outshone_fraction": outshone,
         },
     )
+
+
+def is_partly_shaded(image: Float[np.ndarray, "lines samples"], region: Bool[np.ndarray, "lines samples"]) -> bool:
+    """Whether a white's brightness has two levels with little between: uneven light alone has all levels."""
+    smooth = cv2.blur(np.asarray(image, np.float32), (SHADE_PX, SHADE_PX))
+    values = np.sort(smooth[cv2.erode(region.astype(np.uint8), np.ones((SHADE_PX, SHADE_PX))) > 0]).astype(float)
+    if len(values) < MIN_MOVING_PX:
+        return False
+    # The two classes that are furthest apart (N. Otsu, 1979).
+    number, total = np.arange(1, len(values)), np.cumsum(values)
+    low, high = total[:-1] / number, (total[-1] - total[:-1]) / (len(values) - number)
+    best = int((number * (len(values) - number) * (high - low) ** 2).argmax())
+    fraction, low_level, high_level = number[best] / len(values), low[best], high[best]
+    third = (high_level - low_level) / 3.0
+    between = float(((values > low_level + third) & (values < high_level - third)).mean())
+    is_split = SHADE_FRACTION < fraction < 1.0 - SHADE_FRACTION and between < SHADE_BETWEEN
+    return bool(is_split and low_level < SHADE_LEVEL * high_level)
 
 
 def _compare_with_frames(

@@ -23,6 +23,15 @@ _POSITIVE = (
 )
 
 
+_LARGEST_M = {
+    "marker_side_m": 0.5,
+    "container_diameter_m": 3.0,
+    "container_height_m": 3.0,
+    "camera_distance_m": 30.0,
+}
+"""Lengths of a turntable session in metres; larger ones are centimetres or millimetres."""
+
+
 @dataclass(frozen=True)
 class SessionInfo:
     """The content of ``session.json``.
@@ -77,6 +86,8 @@ def read_session_info(path: Path) -> SessionInfo:
             expected = f"the name of a CSV file beside {path.name}"
         elif key in _POSITIVE and not value > 0.0:
             expected = "a positive number"
+        elif key in _LARGEST_M and value > _LARGEST_M[key]:
+            expected = f"a length in metres, at most {_LARGEST_M[key]:g}"
         elif key == "image_rotation_deg" and value not in (0, 90, 180, 270):
             expected = "0, 90, 180 or 270 degrees"
         elif key == "marker_dictionary" and not (value.startswith("DICT_") and hasattr(cv2.aruco, value)):

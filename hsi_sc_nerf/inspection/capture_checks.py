@@ -190,7 +190,8 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     side = (COMPARED_PX, COMPARED_PX)
     resized = [np.asarray(cv2.resize(picture, side, interpolation=cv2.INTER_AREA), float) for picture in pictures]
     small = np.clip(np.stack(resized), 0.0, 1.5)
-    small /= np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
+    brightness = np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
+    small /= np.maximum(brightness, 1e-3)
     away = np.abs(small - np.median(small, axis=0))
     spread = np.maximum(median_abs_deviation(small, scale="normal"), LEAST_SPREAD)
     deviation = np.minimum(away / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
@@ -256,7 +257,7 @@ def _other_object(session: Session, quicklooks: Sequence[Quicklook], detections:
     ratios = deviations([q.picture for q in quicklooks])
     seen = [set(found) for found in detections]
     strangers = [
-        q.name
+        look.name
         for index, look in enumerate(quicklooks)
         if len(seen[index]) > 1
         and not any(seen[index] & other for number, other in enumerate(seen) if number != index)

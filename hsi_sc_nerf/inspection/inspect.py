@@ -13,6 +13,8 @@ import numpy as np
 from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
+from hsi_sc_nerf.calibration.dark_checks import check_dark
+from hsi_sc_nerf.calibration.line_checks import check_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -20,6 +22,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
+from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.poses.feature_poses import known_angles_deg
@@ -89,8 +92,11 @@ def inspect_session(
     findings = [
         *check_files(session, skip_damaged),
         *check_white(session, white_source),
+        check_dark(session, white_source),
+        *check_lines(session, white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
+        *check_paper(session, quicklooks, markers.detections),
         upright,
         check_scale(session, poses, scale_known),
         *check_angles(session, poses, markers),

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.errors import InputError
@@ -28,6 +28,9 @@ LEAST_NOISE = 1e-4
 """Reflectance; no smaller noise is told."""
 FITTED_MARKERS = 5
 """Markers whose corners are fitted; they give their error."""
+MIRRORED_FRAMES, MORE_IN_MIRROR = 6, 2
+"""Frames in whose mirror images markers are looked for, where the images themselves tell no turn; and how many times
+as many markers they must show."""
 EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
 """Smallest side of a marker in px, and the largest error of poses in degrees and mm that simulated sessions with such
 markers have (docs/validation/poses.md). Smaller markers are refused."""
@@ -55,6 +58,7 @@ class Markers:
             markers do not tell.
         side_px: median side of a marker; nan without any.
         corner_error_px: standard deviation of a fitted corner; nan where none could be fitted.
+        mirrored: whether markers are seen in the images' mirror images only.
     """
 
     dictionary: str | None
@@ -63,6 +67,7 @@ class Markers:
     rotation_deg: int | None
     side_px: float
     corner_error_px: float
+    mirrored: bool = False
 
     @property
     def steps_deg(self) -> Float[np.ndarray, "steps"]:
@@ -101,18 +106,43 @@ def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
         fit = fit_marker(image, dictionary, marker, detections[index][marker])
         if fit is not None:
             errors.append(float(np.sqrt(np.diag(fit.covariance_px2).mean())))
-    return Markers(
+    markers = Markers(
         dictionary if sides else None,
         detections,
         *turn_and_rotation_deg(detections, grays[0].shape),
         float(np.median(sides)) if sides else float("nan"),
         float(np.median(errors)) if errors else float("nan"),
     )
+    if markers.usual_step_deg is None and _seen_in_mirror(grays, detections, session.info.marker_dictionary):
+        return replace(markers, mirrored=True)
+    return markers
+
+
+def _seen_in_mirror(
+    grays: Sequence[UInt8[np.ndarray, "h w"]], detections: Sequence[Detections], dictionary: str | None
+) -> bool:
+    """Whether frames show far more markers when they are mirrored; without, some cells are misread for markers."""
+    chosen = np.unique(np.linspace(0, len(grays) - 1, MIRRORED_FRAMES).astype(int)).tolist()
+    mirrored = [np.ascontiguousarray(grays[index][:, ::-1]) for index in chosen]
+    dictionary = dictionary or find_dictionary(mirrored)
+    if dictionary is None:
+        return False
+    seen = sum(len(detect_markers(gray, dictionary)) for gray in mirrored)
+    return seen > max(MORE_IN_MIRROR * sum(len(detections[index]) for index in chosen), len(chosen))
 
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:
-    """The findings ``markers``, ``turn`` and ``expected-accuracy``."""
-    return [_seen(session, markers), _turn(session, markers), _expected(session, markers)]
+    """The findings ``markers``, ``mirrored``, ``turn`` and ``expected-accuracy``."""
+    mirrored = [_mirrored(session)] if markers.mirrored else []
+    return [_seen(session, markers), *mirrored, _turn(session, markers), _expected(session, markers)]
+
+
+def _mirrored(session: Session) -> Finding:
+    sentence = (
+        f"{session.path}: the images are mirrored, for their markers can be read in a mirror only, and the object "
+        "would become its mirror image; export the cubes without flipping their lines or samples."
+    )
+    return Finding("mirrored", "red", sentence)
 
 
 def _seen(session: Session, markers: Markers) -> Finding:

@@ -15,7 +15,9 @@ from scipy.stats import median_abs_deviation
 from hsi_sc_nerf.calibration.detector import (
     SOME_LINES,
     dark_columns,
+    fill_no_data,
     light_of_some_lines,
+    no_data,
     saturation_counts,
     spread_rows,
 )
@@ -86,7 +88,8 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     bands = [slice(max(0, band - NEIGHBOURS // 2), max(0, band - NEIGHBOURS // 2) + NEIGHBOURS) for band in channels]
     picture = np.stack(
         [
-            (np.asarray(counts[..., near], np.float32).mean(axis=-1) - level[near].mean()) / white[near].mean()
+            (_mean_counts(counts[..., near], cube.ignore_value, level[near].mean()) - level[near].mean())
+            / white[near].mean()
             for near in bands
         ],
         axis=-1,
@@ -142,4 +145,17 @@ def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
 
 
 def _some_lines(cube: Cube) -> Num[np.ndarray, "some samples bands"]:
-    return np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])
+    return fill_no_data(np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)]), cube.ignore_value)
+
+
+def _mean_counts(
+    counts: Num[np.ndarray, "lines samples some"], ignore_value: float | None, dark: float
+) -> Float[np.ndarray, "lines samples"]:
+    """Mean of the bands with data; a pixel without any is dark."""
+    counts = np.asarray(counts, np.float32)
+    missing = no_data(counts, ignore_value)
+    if missing is None:
+        return counts.mean(axis=-1)
+    number = (~missing).sum(axis=-1)
+    total = np.where(missing, 0.0, counts).sum(axis=-1)
+    return np.where(number > 0, total / np.maximum(number, 1), dark).astype(np.float32)

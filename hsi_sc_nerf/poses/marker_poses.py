@@ -16,6 +16,7 @@ from hsi_sc_nerf.poses.marker_initialisation import initialise
 from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS, adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
+from hsi_sc_nerf.poses.pixel_aspect import check_pixel_aspect, pixel_aspect
 from hsi_sc_nerf.poses.posed_session import in_object_frame, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
@@ -93,6 +94,7 @@ def poses_from_markers(
     if not lie_on_disc(turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker corner."
         found.append(Finding("poses-origin", "amber", sentence))
+    found += check_pixel_aspect(*pixel_aspect(adjusted, kept))
     errors_px, overall_px = turntable.frame_errors_px(kept, len(names))
     return in_object_frame(
         with_hidden_errors(adjusted),

@@ -46,11 +46,24 @@ _LOG_P_NOISE = 0.43
 """Standard deviation of -log10 of a probability that is evenly distributed."""
 
 
-def measure_effects(
+def points_of_object(
     dataset: PackedDataset,
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     masks: Bool[np.ndarray, "frames h w"],
     hull: VotedHull,
+) -> PointViews | None:
+    """Points of the object as the frames see them; None where too few are seen."""
+    if len(hull.core) == 0:
+        return None
+    seen = point_views(bins, masks, dataset.camera_to_worlds, dataset.intrinsics, dataset.distortion, hull)
+    return seen if len(seen.point) >= FEWEST_POINT_VIEWS else None
+
+
+def measure_effects(
+    dataset: PackedDataset,
+    bins: Sequence[Float[np.ndarray, "bins h w"]],
+    masks: Bool[np.ndarray, "frames h w"],
+    seen: PointViews | None,
     drift: tuple[LampDriftEstimate | NotMeasurable, bool],
     poses: TurntablePoses,
 ) -> tuple[Effect, ...]:
@@ -60,14 +73,10 @@ def measure_effects(
         dataset: whose files are written, all but ``transforms.json``.
         bins: reflectance in bins of bands of each frame (`smoothed_bins`).
         masks: true on the object.
-        hull: of the masks.
+        seen: points of the object as the frames see them (`points_of_object`).
         drift: what is known of the lamps, and whether the frames are corrected.
         poses: of the frames.
     """
-    seen = None
-    if len(hull.core) > 0:
-        seen = point_views(bins, masks, dataset.camera_to_worlds, dataset.intrinsics, dataset.distortion, hull)
-        seen = seen if len(seen.point) >= FEWEST_POINT_VIEWS else None
     return (
         view_dependence(None if seen is None else change_with_direction(seen)),
         still_chamber(gain_of_background_image(*background_pixels(dataset, bins, masks))),

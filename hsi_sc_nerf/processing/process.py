@@ -33,8 +33,9 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
+from hsi_sc_nerf.processing.appearance_checks import check_appearance
 from hsi_sc_nerf.processing.chamber import background_spectrum
-from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, show_effects
+from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
 from hsi_sc_nerf.processing.frames import (
     MARKER_RANGE_NM,
     BinsOfFrames,
@@ -196,8 +197,11 @@ def process_session(
         fingerprint=fingerprint,
     )
     with console.status("looking for the effects that the session calls for"):
+        bins = BinsOfFrames(caches)
+        seen = points_of_object(dataset, bins, masks, hull)
+        checks.add([] if seen is None else check_appearance(seen, [frame.capture for frame in frames]))
         drift = calibration.drift, calibration.drift_corrected
-        effects = measure_effects(dataset, BinsOfFrames(caches), masks, hull, drift, poses)
+        effects = measure_effects(dataset, bins, masks, seen, drift, poses)
         draw_effects(output_dir / "report" / "effects.png", effects)
     show_effects(console, effects)
     write_transforms(replace(dataset, effects=effects))

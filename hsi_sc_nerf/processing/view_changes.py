@@ -59,16 +59,16 @@ def change_with_direction(views: PointViews) -> Change:
         0.083
     """
     count, colours = len(views.positions_m), views.reflectance.shape[1]
-    brightness = _mean_of(views.reflectance.mean(axis=1), views.point, count)
+    brightness = mean_by_index(views.reflectance.mean(axis=1), views.point, count)
     scale = np.maximum(brightness, 1e-3)[views.point]
-    kinds = [_indicators(_facing(views)), _indicators(views.frame)]
+    kinds = [_indicators(facing_cell(views)), _indicators(views.frame)]
     cells = kinds[0].shape[1]
     shared = np.concatenate(kinds, axis=1)
-    shared -= _mean_of(shared, views.point, count)[views.point]
+    shared -= mean_by_index(shared, views.point, count)[views.point]
     products = []
     for colour in range(colours):
         response = views.reflectance[:, colour] / scale
-        response -= _mean_of(response, views.point, count)[views.point]
+        response -= mean_by_index(response, views.point, count)[views.point]
         response = response.clip(-MOST_CHANGE, MOST_CHANGE)
         products.append([_products(shared[rows], response[rows]) for rows in _rows_of(views.sector[views.point])])
     return _predicted(products, cells)
@@ -81,7 +81,7 @@ def change_with_height(views: PointViews) -> Change:
     changes with height.
     """
     count = len(views.positions_m)
-    spectra = _mean_of(views.reflectance, views.point, count)
+    spectra = mean_by_index(views.reflectance, views.point, count)
     seen = np.unique(views.point)
     spectra = np.maximum(spectra[seen], 1e-4)
     brightness = np.log(spectra.mean(axis=1))
@@ -95,7 +95,7 @@ def change_with_height(views: PointViews) -> Change:
     return _predicted([[_products(causes[part], response[part]) for part in rows]], causes.shape[1])
 
 
-def _facing(views: PointViews) -> Int[np.ndarray, "n"]:
+def facing_cell(views: PointViews) -> Int[np.ndarray, "n"]:
     """Cell of the normal's direction in the camera's frame."""
     cell = ((views.normal[:, :2] + 1.0) / 2.0 * NORMAL_CELLS).astype(int).clip(0, NORMAL_CELLS - 1)
     return cell[:, 0] * NORMAL_CELLS + cell[:, 1]
@@ -108,7 +108,7 @@ def change_of(variances: Sequence[float], sizes: Sequence[int]) -> Change:
     return Change(rms, float(np.sqrt(error)) if rms**2 <= error else error / (2.0 * rms))
 
 
-def _mean_of(values: Float[np.ndarray, "n *k"], index: Int[np.ndarray, "n"], count: int) -> np.ndarray:
+def mean_by_index(values: Float[np.ndarray, "n *k"], index: Int[np.ndarray, "n"], count: int) -> np.ndarray:
     """Mean of the rows of each index; 0 without any."""
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, index, values)

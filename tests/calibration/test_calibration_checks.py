@@ -141,6 +141,15 @@ def test_a_tarp_beside_the_object_is_a_white(session):
     assert levels(session(white)[0]) == ("green", "green")
 
 
+@pytest.mark.parametrize(("shade", "is_told"), [(0.95, False), (0.65, True)])
+def test_a_white_partly_in_shade(session, shade, is_told):
+    white = np.ones((LINES, SAMPLES, BANDS)) * np.linspace(0.95, 1.0, SAMPLES)[:, None]
+    white[:, : SAMPLES // 2] *= shade
+    findings, _ = session(white, [frame(number, 0.3, 0.3) for number in range(FRAMES)])
+    assert findings["white"].level == "green"
+    assert ("white-shade" in findings) == is_told
+
+
 @pytest.mark.parametrize("count", [3, FRAMES])
 @pytest.mark.parametrize("wall", [0.1, 0.6])
 def test_a_frame_is_no_white(session, wall, count):

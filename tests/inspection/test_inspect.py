@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from inspection_session import INFO, LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_picture, write_one, write_turntable
 
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.inspection.capture_checks import check_frames
 from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session
 
 
@@ -61,6 +63,40 @@ def test_another_object_on_the_same_day(session):
     assert list(red) == ["other-object"]
     assert "fruit_07" in red["other-object"]
     assert "fruit_06" not in red["other-object"]
+
+
+def test_a_frame_with_markers_that_no_other_shows(session):
+    """Another turntable: its picture alone need not be unlike the others."""
+    quicklooks = inspect_session(open_session(session)).quicklooks
+    ours, others = {1: np.zeros((4, 2)), 2: np.zeros((4, 2))}, {7: np.zeros((4, 2)), 8: np.zeros((4, 2))}
+    findings = check_frames(open_session(session), quicklooks, [ours] * 5 + [others] + [ours] * 6)
+    (red,) = [finding for finding in findings if finding.level == "red"]
+    assert red.values["unknown_markers"] == ["fruit_05"]
+    assert "--exclude fruit_05" in red.sentence
+
+
+@pytest.mark.parametrize("lost", ["pixels", "a band", "a frame"])
+def test_cubes_with_values_that_are_no_data(session, tmp_path, lost):
+    """Some pixels or a whole band cost nothing; a frame without any data is found."""
+    rng = np.random.default_rng(0)
+    for header in session.glob("fruit_*/capture/fruit_*.hdr"):
+        cube = open_cube(header)
+        counts = cube.read().astype(np.float32)
+        if lost == "pixels":
+            counts[rng.random(counts.shape) < 0.002] = np.nan
+        if lost == "a band":
+            counts[..., 2] = np.nan
+        if lost == "a frame" and header.stem == "fruit_04":
+            counts[:] = np.nan
+        write_cube(header, counts, wavelengths_nm=cube.wavelengths_nm)
+    inspection, findings = inspect(session)
+    draw_inspection(inspection, tmp_path / "inspection.png")
+    red = [name for name, finding in findings.items() if finding.level == "red"]
+    assert red == (["exposure", "other-object"] if lost == "a frame" else [])
+    if lost == "a frame":
+        assert "fruit_04" in findings["exposure"].sentence
+    else:
+        assert findings["turn"].level == "green"
 
 
 def test_damaged_captures_are_named(session):
@@ -155,6 +191,24 @@ def test_session_json_that_the_markers_contradict(session, spoil, name):
     (session / "session.json").write_text(json.dumps({**INFO, **spoil}))
     _, findings = inspect(session)
     assert findings[name].level == ("red" if name == "turn" else "amber")
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_images(session, axis):
+    for header in session.glob("*/capture/*.hdr"):
+        cube = open_cube(header)
+        counts = np.flip(cube.read(), axis if not header.name.startswith("DARKREF") else 1)
+        write_cube(header, counts, wavelengths_nm=cube.wavelengths_nm)
+    assert list(found(session, "red")) == ["mirrored"]
+    (session / "session.json").unlink()
+    assert "mirrored" in found(session, "red")
+
+
+def test_a_session_without_markers_is_not_mirrored(session):
+    for number in range(12):
+        gray = np.full((SIZE_PX, SIZE_PX), 90.0)
+        write_one(session, f"fruit_{number:02d}", frame_picture(gray, spot_px=7.0, angle_deg=30.0 * number))
+    assert "mirrored" not in found(session, "red")
 
 
 def test_a_turn_with_a_gap_and_a_stop(session):

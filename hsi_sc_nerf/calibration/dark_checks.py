@@ -1,0 +1,145 @@
+"""Can the dark references be believed? As one finding.
+
+What a dark cube shows beyond its level is subtracted from the frames, band by band, so that reflectance is too low by
+as much. Light in it has the spectrum of the light on the white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hsi_sc_nerf.calibration.detector import SOME_LINES, fill_no_data, spread_rows
+from hsi_sc_nerf.calibration.white_source import WhiteSource, white_cubes, white_source
+from hsi_sc_nerf.capture.envi import Cube
+from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+
+LIT_AMBER, LIT_RED = 0.002, 0.01
+"""Light in a dark cube over that on the white, which is the reflectance that it takes away. Of a covered lens, dark
+patterns and noise leave less than 0.0001."""
+CERTAINTY = 3.0
+"""Standard deviations from which light counts: with few bands, a dark pattern may resemble a lamp."""
+OTHER_TIME = 1.01
+"""Factor between integration times from which they differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Exposure:
+    """Counts and the dark reference that is subtracted from them."""
+
+    name: str
+    counts: Cube
+    counts_ms: float | None
+    dark: Cube | None
+
+    @property
+    def other_time(self) -> bool:
+        """Whether the two were exposed for different times, as far as the headers tell."""
+        dark_ms = None if self.dark is None else self.dark.integration_time_ms
+        if dark_ms is None or self.counts_ms is None:
+            return False
+        return max(dark_ms, self.counts_ms) > OTHER_TIME * min(dark_ms, self.counts_ms)
+
+
+def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> Finding:
+    """The finding ``dark``: whether all counts have a dark reference, of their own exposure, without light.
+
+    Args:
+        session: its captures.
+        source: where the white is.
+
+    Raises:
+        InputError: the session does not have that source of white.
+
+    Example:
+        >>> refuse_red([check_dark(open_session(Path("captures")))])
+    """
+    found = white_source(session, "auto" if source == "target" else source, None)
+    if found == "product":
+        return Finding("dark", "green", "The instrument's finished reflectance needs no dark reference.")
+    exposures = _exposures(session, found)
+    without = [exposure.name for exposure in exposures if exposure.dark is None]
+    if len(without) == len(exposures):
+        return _without_any(session, exposures)
+    if without:
+        sentence = (
+            f"{session.path}: {names_in_short(without)} {'has' if len(without) == 1 else 'have'} no dark reference, "
+            "unlike the other captures, so that the detector's offset would count as light; copy it there"
+        )
+        frames = [frame.name for frame in session.frames if frame.name in without]
+        advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
+        return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
+    white = np.percentile(_some(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
+    lit = {e.name: light_over_white(_some(e.dark).mean(axis=(0, 1)), white) for e in exposures if e.dark is not None}
+    values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
+    shining = [name for name, value in lit.items() if value > LIT_AMBER]
+    if shining:
+        most = max(lit[name] for name in shining)
+        sentence = (
+            f"{session.path}: the dark references of {names_in_short(shining)} show light, {100.0 * most:.2g} % of "
+            "that on the white, so that reflectance would be too low by as much; cover the lens and take them again, "
+            "or copy that of another capture."
+        )
+        return Finding("dark", "red" if most > LIT_RED else "amber", sentence, values)
+    other = [exposure.name for exposure in exposures if exposure.other_time]
+    if other:
+        sentence = (
+            f"{session.path}: by their headers the dark references of {names_in_short(other)} have another "
+            "integration time than the captures; dark counts grow with it, so take them alike."
+        )
+        return Finding("dark", "amber", sentence, values | {"other_integration_time": other})
+    return Finding("dark", "green", "Dark references: every capture has one, without light.", values)
+
+
+def _exposures(session: Session, source: WhiteSource) -> list[_Exposure]:
+    """What a dark reference is subtracted from."""
+    captures = session.captures if source == "tarp" else session.frames
+    found = [_Exposure(c.name, c.cube, c.integration_time_ms, c.dark) for c in captures]
+    if source == "capture":
+        found += [
+            _Exposure(f"WHITEREF_{c.name}", c.white, c.white_integration_time_ms, c.white_dark)
+            for c in captures
+            if c.white is not None
+        ]
+    return found
+
+
+def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, "bands"]) -> float:
+    """Light in a dark cube over that on the white; 0 where it is not certain.
+
+    The dark spectrum is fitted by a level and the white's spectrum. Both are raw counts: the white's own dark, which
+    may be wrong as well, is part of the level.
+    """
+    centred = white - white.mean()
+    information = float(centred @ centred)
+    if not information > 0.0 or len(white) < 4:
+        return 0.0
+    slope = float(centred @ dark) / information
+    rest = dark - dark.mean() - slope * centred
+    error = float(np.sqrt(rest @ rest / (len(white) - 2) / information))
+    return slope if slope > CERTAINTY * error else 0.0
+
+
+def _some(cube: Cube) -> Float[np.ndarray, "rows samples bands"]:
+    rows = spread_rows(cube.shape[0], SOME_LINES)
+    return fill_no_data(np.asarray(cube.memmap()[rows], np.float32), cube.ignore_value)
+
+
+def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
+    """No capture has a dark: right for counts whose offset is gone, which then reach zero."""
+    some = [_some(exposure.counts) for exposure in exposures]
+    lowest = min(float(np.percentile(counts, 0.1)) for counts in some)
+    brightest = max(float(counts.max()) for counts in some)
+    values = {"lowest": lowest, "brightest": brightest}
+    if lowest <= LIT_AMBER * brightest:
+        return Finding("dark", "green", "No capture has a dark reference, and the counts reach zero.", values)
+    sentence = (
+        f"{session.path}: no capture has a dark reference, and hardly a count is below {lowest:.4g}, which may be "
+        "the detector's offset; take a dark reference with a covered lens."
+    )
+    return Finding("dark", "amber", sentence, values)

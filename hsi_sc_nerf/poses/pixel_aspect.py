@@ -1,0 +1,87 @@
+"""Are the pixels square? A line scanner whose speed does not fit its frame rate makes them longer or shorter.
+
+The images of square markers that turn tell the pixels' shape: with their lines moved closer or further apart, one
+spacing explains the corners best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from hsi_sc_nerf.findings import Finding, Level
+from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
+from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, LOSS_SIGMAS
+from hsi_sc_nerf.poses.residuals import MarkerResiduals
+from hsi_sc_nerf.poses.turntable import MarkerObservations
+
+ASPECT_AMBER, ASPECT_RED = 0.005, 0.015
+"""Departures from square pixels. One of 0.03 moves poses by a centimetre (docs/validation/sessions.md)."""
+_STEP, _ROUNDS = 0.02, 3
+"""Steps of the logarithm in which the best spacing is looked for."""
+_SMALLEST_P = 1e-99
+
+
+def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[float, float]:
+    """Height of a pixel over its width by the markers, and how strongly they call for it.
+
+    Args:
+        adjusted: the turntable of square pixels.
+        observations: the corners that it was adjusted to.
+
+    Returns:
+        The ratio, and -log10 of the probability that chance alone lowers the squares as much.
+
+    Example:
+        >>> adjusted, kept, _ = adjust_without_outliers(start, observations)
+        >>> pixel_aspect(adjusted, kept)
+        (1.0004, 0.31)
+    """
+    turntable, free = adjusted.turntable, adjusted.problem.free
+
+    def solved(log_aspect: float) -> Adjusted:
+        nonlocal turntable
+        seen = stretched(observations, float(np.exp(log_aspect)), turntable.centre_px[1])
+        problem = Problem(MarkerResiduals(turntable, seen, LOSS_SIGMAS), free=free)
+        turntable = problem.minimise(turntable)
+        return Adjusted(turntable, problem)
+
+    best, cost = 0.0, {0.0: solved(0.0).cost}
+    step = _STEP
+    for _ in range(_ROUNDS):
+        low, middle, high = (cost.setdefault(x, solved(x).cost) for x in (best - step, best, best + step))
+        curvature = low - 2.0 * middle + high
+        # Far from the minimum the cost need not be a parabola.
+        towards = np.sign(low - high) * 2.0 * step
+        move = 0.5 * step * (low - high) / curvature if curvature > 0.0 else towards
+        best += float(np.clip(move, -4.0 * step, 4.0 * step))
+    final = solved(best)
+    gain = max(cost[0.0] - final.cost, 0.0) / final.variance
+    p_value = max(float(f_distribution.sf(gain, 1, final.degrees_of_freedom)), _SMALLEST_P)
+    return float(np.exp(best)), float(-np.log10(p_value))
+
+
+def stretched(observations: MarkerObservations, factor: float, centre_px: float) -> MarkerObservations:
+    """The corners with the images' lines further apart by a factor, from the line of the principal point on."""
+    scale, centre = np.array([1.0, factor]), np.array([0.0, centre_px])
+    both = np.tile(scale, 4)
+    return replace(
+        observations,
+        corners_px=centre + (observations.corners_px - centre) * scale,
+        covariance_px2=observations.covariance_px2 * both[:, None] * both,
+    )
+
+
+def check_pixel_aspect(aspect: float, evidence: float) -> list[Finding]:
+    """The finding ``poses-aspect`` where pixels are not square (`pixel_aspect`)."""
+    away = abs(aspect - 1.0)
+    if evidence <= EVIDENCE_NEEDED or away <= ASPECT_AMBER:
+        return []
+    level: Level = "red" if away > ASPECT_RED else "amber"
+    sentence = (
+        f"The pixels are {100.0 * away:.1f} % {'higher' if aspect > 1.0 else 'lower'} than wide by the markers: "
+        "match the scanner's speed to its frame rate, or resample the cubes to square pixels."
+    )
+    return [Finding("poses-aspect", level, sentence, {"height_over_width": aspect, "evidence": evidence})]

@@ -1,0 +1,185 @@
+"""Does the object look the same in all frames? Shade that falls on one, and an object that slipped on the disc.
+
+Masks and markers do not tell either: a shadow leaves the outline, and what turns about its own axis may have one
+outline from all sides. The points of the masks' hull do, as the frames see them (`PointViews`), once the light that
+stands still with the camera is taken away: what changes with the direction that a point faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.stats import median_abs_deviation
+
+from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.poses.turntable import rotations_about_z
+from hsi_sc_nerf.processing.view_changes import PointViews, facing_cell, mean_by_index
+
+LEVEL_AMBER, LEVEL_RED = 0.04, 0.15
+"""Departures of a frame's brightness (logarithm) from the other frames'. Frames of good sessions stay below 0.01."""
+PATCH_AMBER, PATCH_RED, PATCH_TIMES = 0.06, 0.2, 3.0
+"""The same of its parts (root mean square over directions), which also have to exceed the typical frame's by a
+factor: noise and a rough hull leave up to 0.03."""
+LEAST_IN_PATCH = 15
+"""Fewest points of a part."""
+FEW = 0.1
+"""Fraction of the frames up to which those that are lit otherwise can be left out."""
+FEWEST_FRAMES, FEWEST_POINTS = 6, 200
+"""Fewest frames that tell of one, and fewest points that two frames share."""
+SLIPS_DEG = np.arange(-30.0, 30.1, 1.5)
+"""Turns of the object on the disc that are tried."""
+LEAST_SLIP_DEG, SLIP_FIT = 3.0, 0.65
+"""Two frames fit each other better with a slip if that leaves less than this fraction of their difference. Good
+sessions have 0.75 or more: of a plain object, another part may look alike by chance."""
+MOST_SLIPS, ONE_DIRECTION = 0.5, 0.8
+"""Where more of the pairs slip, nearly all in one direction, reflections stand still on a smooth object."""
+MATCHED_M = 0.003
+"""Largest distance of points that are compared."""
+LARGEST_SIGMAS = 3.0
+"""Differences count up to this many standard deviations: highlights move otherwise."""
+LEAST_SCATTER = 0.003
+"""Scatter of a channel (logarithm) that is stated at least."""
+_ROUNDS = 12
+
+
+def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
+    """The findings ``frames-light`` and ``frames-slip``, where something is wrong.
+
+    Args:
+        views: points of the object as the frames see them.
+        names: of all frames.
+
+    Example:
+        >>> refuse_red(check_appearance(point_views(bins, masks, poses, lens, distortion, hull), names))
+    """
+    if len(np.unique(views.frame)) < FEWEST_FRAMES:
+        return []
+    looks = without_standing_light(views)
+    light = _frames_light(views, looks, names)
+    # A frame in shade fits no other one, with any slip.
+    shaded = {name for finding in light if finding.level == "red" for name in finding.values}
+    return [*light, *_frames_slip(views, looks, names, shaded)]
+
+
+def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
+    """Logarithm of each view's brightness, and of its colours over it, less what goes with the direction it faces."""
+    log = np.log(np.maximum(views.reflectance, 1e-3))
+    brightness = log.mean(axis=1, keepdims=True)
+    channels = np.concatenate([brightness, log - brightness], axis=1)
+    cell, points = facing_cell(views), len(views.positions_m)
+    of_cell = np.zeros((cell.max() + 1, channels.shape[1]))
+    for _ in range(_ROUNDS):
+        of_point = mean_by_index(channels - of_cell[cell], views.point, points)
+        of_cell = mean_by_index(channels - of_point[views.point], cell, len(of_cell))
+    return channels - of_cell[cell]
+
+
+def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str]) -> list[Finding]:
+    """Frames in which the object is brighter or darker than in the others, as a whole or in parts."""
+    numbers, cell = np.unique(views.frame), facing_cell(views)
+    of_point = mean_by_index(looks[:, 0], views.point, len(views.positions_m))
+    rest = looks[:, 0] - of_point[views.point]
+    level, patches = np.zeros((2, len(numbers)))
+    for row, number in enumerate(numbers):
+        own, cells = rest[views.frame == number], cell[views.frame == number]
+        level[row] = np.median(own)
+        large = [c for c in np.unique(cells) if np.count_nonzero(cells == c) >= LEAST_IN_PATCH]
+        parts = [float(np.median(own[cells == c]) - level[row]) for c in large]
+        patches[row] = np.sqrt(np.mean(np.square(parts))) if parts else 0.0
+    level = np.abs(level - np.median(level))
+    unusual = PATCH_TIMES * float(np.median(patches))
+    odd = (level > LEVEL_AMBER) | (patches > max(PATCH_AMBER, unusual))
+    red = (level > LEVEL_RED) | (patches > max(PATCH_RED, unusual))
+    if not odd.any():
+        return []
+    named = np.flatnonzero(red if red.any() else odd)
+    changes = {names[numbers[row]]: round(float(max(level[row], patches[row])), 4) for row in named}
+    percent = 100.0 * -np.expm1(-max(changes.values()))
+    sentence = (
+        f"The object is lit otherwise in {names_in_short([*changes])} than in the other frames, by up to "
+        f"{percent:.0f} %: a shadow fell on it, or a lamp changed or moved"
+    )
+    few = len(named) < FEW * len(numbers)
+    advice = f"leave out with {leave_out([*changes])}" if few else "take the session again under steady lamps"
+    return [Finding("frames-light", "red" if red.any() else "amber", f"{sentence}; {advice}.", changes)]
+
+
+def _frames_slip(
+    views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str], shaded: set[str]
+) -> list[Finding]:
+    """Successive frames whose points match better where the object is turned on the disc between them."""
+    numbers = [number for number in np.unique(views.frame) if names[number] not in shaded]
+    pairs = list(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
+    by_frame = {number: np.flatnonzero(views.frame == number) for number in numbers}
+    scatter = _scatter(views, looks, [(by_frame[a], by_frame[b]) for a, b in pairs])
+    if scatter is None:
+        return []
+    slipped = {}
+    for first, second in pairs:
+        slip_deg, fit = slip_between(views, looks / scatter, by_frame[first], by_frame[second])
+        if fit < SLIP_FIT and abs(slip_deg) >= LEAST_SLIP_DEG:
+            slipped[f"{names[first]} to {names[second]}"] = slip_deg
+    directions = np.sign([*slipped.values()])
+    if len(slipped) > MOST_SLIPS * len(pairs) and abs(directions.mean()) > ONE_DIRECTION:
+        return []
+    if not slipped:
+        return []
+    told = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
+    sentence = (
+        f"The object turned on the disc from {told}: its texture moved otherwise than the markers; fix it and take "
+        "the session again, or leave out the frames before or after with --exclude."
+    )
+    return [Finding("frames-slip", "red", sentence, {"slip_deg": slipped})]
+
+
+def _scatter(
+    views: PointViews, looks: np.ndarray, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> Float[np.ndarray, "channels"] | None:
+    """Usual scatter of the channels between neighbouring points of successive frames; None with too few points."""
+    found = []
+    for first, second in pairs:
+        change = _change(views, looks, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
+        if change is not None:
+            found.append(median_abs_deviation(change, scale="normal"))
+    return np.maximum(np.median(found, axis=0), LEAST_SCATTER) if found else None
+
+
+def slip_between(
+    views: PointViews, looks: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray
+) -> tuple[float, float]:
+    """Turn of the object about the axis from one frame to another by which its points fit best.
+
+    Args:
+        views: all of them.
+        looks: of each, in units of their scatter.
+        first, second: rows of the two frames.
+
+    Returns:
+        Degrees, counter-clockwise from above; and the difference that is left, over that without a slip.
+    """
+    differences = []
+    for slip_deg in SLIPS_DEG:
+        change = _change(views, looks, first, second, float(slip_deg))
+        differences.append(np.inf if change is None else float(np.minimum(change**2, LARGEST_SIGMAS**2).mean()))
+    none, best = len(SLIPS_DEG) // 2, int(np.argmin(differences))
+    if not np.isfinite(differences[none]):
+        return 0.0, 1.0
+    return float(SLIPS_DEG[best]), differences[best] / max(differences[none], 1e-12)
+
+
+def _change(
+    views: PointViews, looks: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray, slip_deg: float
+) -> Float[np.ndarray, "k channels"] | None:
+    """Change of the object's points from frame to frame, their median left out; None with too few points."""
+    # What is now at a point was before at the point that the slip brings there.
+    before = rotations_about_z(np.deg2rad([-slip_deg]))[0]
+    points = views.positions_m[views.point[second]] @ before.T
+    away, nearest = cKDTree(views.positions_m[views.point[first]]).query(points, distance_upper_bound=MATCHED_M)
+    near = np.isfinite(away)
+    if near.sum() < FEWEST_POINTS:
+        return None
+    change = looks[second[near]] - looks[first[nearest[near]]]
+    return change - np.median(change, axis=0)

@@ -1,0 +1,63 @@
+"""A room's lamp whose lines stand in the frames or in the white only, and materials that have none."""
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.calibration.line_checks import check_lines, line_heights
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import open_session
+
+BANDS_NM = np.linspace(400.0, 1000.0, 205)
+LAMP = 2000.0 * np.exp(-(((BANDS_NM - 700.0) / 250.0) ** 2))
+LINES = 1.0 + sum(np.exp(-0.5 * ((BANDS_NM - nm) / 4.0) ** 2) for nm in (546.0, 611.0))
+LEAF = 0.06 + 0.5 / (1.0 + np.exp(-(BANDS_NM - 710.0) / 8.0)) - 0.1 * np.exp(-0.5 * ((BANDS_NM - 970.0) / 25.0) ** 2)
+BUD = 0.3 + 0.2 / (1.0 + np.exp(-(BANDS_NM - 600.0) / 15.0)) - 0.15 * np.exp(-0.5 * ((BANDS_NM - 676.0) / 12.0) ** 2)
+
+
+def write(folder, name, reflectance, light, seed=0):
+    rng = np.random.default_rng([seed, len(name)])
+    counts = 100.0 + reflectance * light * LAMP
+    counts = counts + rng.normal(0.0, 4.0, counts.shape) + rng.normal(0.0, 0.3, counts.shape) * np.sqrt(counts)
+    for prefix, cube in (("", counts), ("DARKREF_", rng.normal(100.0, 4.0, (8, 32, 205)))):
+        header = folder / name / "capture" / f"{prefix}{name}.hdr"
+        write_cube(header, np.clip(np.rint(cube), 0, 4095).astype(np.uint16), wavelengths_nm=BANDS_NM)
+
+
+def session(folder, on_white=1.0, on_frames=1.0):
+    """A wall, and a leaf or a bud before it."""
+    write(folder, "white_reference", np.ones((32, 32, 205)), on_white)
+    for number in range(3):
+        image = np.full((32, 32, 205), 0.7)
+        image[8:24, 8:28] = LEAF if number else BUD
+        write(folder, f"leaf_{number}", image, on_frames, number)
+    return open_session(folder)
+
+
+def test_materials_and_lamps_that_both_see_have_no_lines(tmp_path):
+    assert check_lines(session(tmp_path / "plain"))[0].level == "green"
+    both = 1.0 + 0.5 * (LINES - 1.0)
+    assert check_lines(session(tmp_path / "both", both, both))[0].level == "green"
+    # A leaf alone, with its steep edge, before no wall.
+    assert np.abs(line_heights(LEAF[None], 15)).max() < 0.025
+
+
+@pytest.mark.parametrize(("strength", "level"), [(0.06, "amber"), (0.4, "red")])
+def test_a_lamp_that_shone_on_the_frames_only(tmp_path, strength, level):
+    (finding,) = check_lines(session(tmp_path, on_frames=1.0 + strength * (LINES - 1.0)))
+    assert finding.level == level
+    assert "the frames only" in finding.sentence
+    assert finding.values["value"] == pytest.approx(strength, rel=0.3)
+
+
+def test_a_lamp_that_shone_on_the_white_only(tmp_path):
+    (finding,) = check_lines(session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0)))
+    assert finding.level == "red"
+    assert "the white only" in finding.sentence
+
+
+def test_few_broad_bands_tell_nothing(tmp_path):
+    opened = session(tmp_path)
+    for capture in opened.captures:
+        for cube in capture.cubes:
+            write_cube(cube.header_path, cube.read()[..., ::8], wavelengths_nm=BANDS_NM[::8])
+    assert check_lines(open_session(tmp_path)) == []

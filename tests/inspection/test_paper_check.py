@@ -1,0 +1,59 @@
+"""The markers' paper tells of a white that is none, or of an exposure that was not as long as its header says."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from inspection_session import INFO, SIZE_PX, WAVELENGTHS_NM, write_one
+
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.inspection.inspect import inspect_session
+
+PAPER = 0.76
+"""Of the scene, relative to its white."""
+
+
+def paper(folder):
+    (found,) = [f for f in inspect_session(open_session(folder)).findings if f.name == "paper"]
+    return found
+
+
+def write_white(folder, reflectance, **fields):
+    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), reflectance), **fields)
+
+
+def test_white_paper_is_green(session):
+    found = paper(session)
+    assert found.level == "green"
+    assert found.values["reflectance"] == pytest.approx(PAPER, rel=0.1)
+
+
+@pytest.mark.parametrize(("white", "level"), [(0.9, "green"), (0.45, "amber"), (0.2, "red")])
+def test_a_grey_white(session, white, level):
+    write_white(session, white)
+    found = paper(session)
+    assert found.level == level
+    assert found.values["reflectance"] == pytest.approx(PAPER / white, rel=0.15)
+    assert ("too high" in found.sentence) == (level != "green")
+
+
+def test_a_panel_whose_reflectance_is_known(session):
+    write_white(session, 0.5)
+    (session / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.5\n1000,0.5\n")
+    (session / "session.json").write_text(json.dumps({**INFO, "panel_reflectance": "panel.csv"}))
+    assert paper(session).level == "green"
+
+
+@pytest.mark.parametrize(("stated_ms", "level"), [(10, "green"), (40, "amber"), (10_000, "red")])
+def test_an_integration_time_that_is_not_as_stated(session, stated_ms, level):
+    for header in session.glob("fruit_*/capture/*.hdr"):
+        header.write_text(re.sub(r"tint = \d+", f"tint = {stated_ms}", header.read_text()))
+    found = paper(session)
+    assert found.level == level
+    assert ("too low" in found.sentence) == (level != "green")
+
+
+def test_without_a_tarp_or_markers_nothing_is_said(session):
+    (session / "session.json").write_text(json.dumps({**INFO, "marker_dictionary": "DICT_7X7_50"}))
+    assert [f for f in inspect_session(open_session(session)).findings if f.name == "paper"] == []
