@@ -118,7 +118,6 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """The object in a JSON file.
 
     Args:
-        path: the file.
         remedy: what to do if it cannot be read, the end of the error's sentence.
 
     Raises:

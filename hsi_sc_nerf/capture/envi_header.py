@@ -80,7 +80,6 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
     """Read and check a header; the data file is not read.
 
     Args:
-        path: the header.
         library: whether it has to describe a spectral library, whose lines are spectra and whose samples are bands.
 
     Raises:

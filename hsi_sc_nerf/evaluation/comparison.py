@@ -125,8 +125,6 @@ def compare(
         cloud_path: PLY cloud, or PLY, OBJ or STL mesh, in metres.
         reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.true_surface.true_reference` of a
             simulated session.
-        config: settings.
-        track: shows progress.
 
     Raises:
         InputError: a file or a setting cannot be used, the sizes do not fit together, or the shape is symmetric, so

@@ -58,11 +58,7 @@ def measure_effects(
 
     Args:
         dataset: whose files are written, all but ``transforms.json``.
-        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
-        masks: true on the object.
-        hull: of the masks.
         drift: what is known of the lamps, and whether the frames are corrected.
-        poses: of the frames.
     """
     seen = None
     if len(hull.core) > 0:

@@ -68,8 +68,6 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
     """The session's camera while the object makes one even counter-clockwise turn before the fixed background.
 
     Args:
-        run: the trained run.
-        count: views in the turn.
         size: factor on the size of the camera's images.
     """
     cameras = cameras_at(run, np.arange(count) * 360.0 / count, size)
