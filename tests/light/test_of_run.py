@@ -85,6 +85,7 @@ def upper_cloud(found, lit):
     return cloud.select((cosines.max(axis=1) > 0.5) & (normals[:, 2] > 0.2))
 
 
+@pytest.mark.slow
 def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert lit.evidence.shaded
     cloud = upper_cloud(lit, lit=True)
@@ -139,6 +140,7 @@ def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
     assert any(line.startswith("Warning") for line in sentences(told)) == warned
 
 
+@pytest.mark.slow
 def test_even_light_is_left_alone(even):
     assert not even.evidence.shaded
     cloud = upper_cloud(even, lit=False)
