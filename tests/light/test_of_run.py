@@ -102,6 +102,7 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file_format", ["ply", "netcdf"])
 def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, file_format):
     cloud = upper_cloud(lit, lit=True)
@@ -124,6 +125,7 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
     np.testing.assert_allclose(columns["irradiance_std"], std, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
     same = with_material(upper_cloud(lit, lit=True), lit, factory.WAVELENGTHS_NM, corrected=False)
     assert np.isnan(same.extra["irradiance_std"]).all()
