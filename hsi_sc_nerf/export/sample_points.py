@@ -233,7 +233,7 @@ def read_points(path: Path) -> PlyPoints:
         InputError: the file is missing, is no PLY, has no points, or its points hold lists or are not finite.
     """
     if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: is no PLY file; export the cloud or mesh as PLY.")
+        raise InputError(f"{path}: is not a PLY file; export the cloud or mesh as PLY.")
     positions, triangles = read_surface(path)
     return PlyPoints(read_ply(path), positions, triangles)
 

@@ -90,7 +90,7 @@ def views_of_path(path: Path) -> Views:
     Their background is the chamber's median spectrum, since none of them stands where the camera stood.
 
     Raises:
-        InputError: the file is missing or is no camera path.
+        InputError: the file is missing or is not a camera path.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; export a camera path from ns-viewer.")
@@ -103,7 +103,7 @@ def views_of_path(path: Path) -> Views:
         if not cameras.camera_to_worlds.isfinite().all():
             raise ValueError("a camera is at no finite place")
     except (AttributeError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: is no camera path ({error!r}); export one from ns-viewer.") from error
+        raise InputError(f"{path}: is not a camera path ({error!r}); export one from ns-viewer.") from error
     return Views("path", cameras, [f"path_{i:03d}" for i in range(len(cameras))])
 
 
