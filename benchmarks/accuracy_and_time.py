@@ -31,6 +31,7 @@ from jaxtyping import Float
 from paper_tables import PaperTable
 from results_table import read_results, write_results
 from traits_accuracy import spots_on
+from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
@@ -49,7 +50,7 @@ from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.simulate.scene import load_scene
-from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms, true_reference
+from hsi_sc_nerf.simulate.true_surface import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 Part = Literal["budgets", "settings", "presets", "views", "pictures"]
@@ -236,10 +237,10 @@ def surface_figures(config: Path, session: Path) -> dict[str, float]:
     )
     f_scores = [score_at(*distances_m, threshold_m).f_score for threshold_m in (0.002, 0.0005)]
     figures = dict(zip(("f_2_mm", "f_half_mm"), f_scores, strict=True))
-    return figures | trait_errors(cloud, TrueSurface.of(truth), truth.camera_to_world[:, :3, 3])
+    return figures | trait_errors(cloud, TrueObject.of(truth), truth.camera_to_world[:, :3, 3])
 
 
-def trait_errors(cloud: SpectralCloud, true: TrueSurface, eyes_m: Float[np.ndarray, "frames 3"]) -> dict[str, float]:
+def trait_errors(cloud: SpectralCloud, true: TrueObject, eyes_m: Float[np.ndarray, "frames 3"]) -> dict[str, float]:
     """Errors of what a laboratory reports, percent: area and volume, spectra of spots, area of a bruise.
 
     Spots are 10 mm wide; the figure is the median over them of the relative root mean square error. The bruise is

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from true_object import TrueObject
 
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.camera import Similarity
@@ -15,7 +16,6 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material, PlantTissue, endmembers, smooth_noise
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights, pear
 from hsi_sc_nerf.simulate.scene import Fruit
-from hsi_sc_nerf.simulate.true_surface import TrueSurface
 
 STAND_M = 0.07
 """Height of the container."""
@@ -73,14 +73,14 @@ class CloudErrors:
 
 def fruit_of(
     day: SetDown, wavelengths_nm: Float[np.ndarray, "bands"], kind: Literal["apple", "pear"] = "apple", seed: int = 3
-) -> TrueSurface:
+) -> TrueObject:
     """The true surface of an apple or a pear on that day, as it grew, not turned."""
     rng = np.random.default_rng(seed)
     fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
     shape = (apple if kind == "apple" else pear)(fruit.height_m, rng)
     weights = fruit_weights(shape, fruit, rng)
     spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
-    return TrueSurface(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
+    return TrueObject(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
 
 
 def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:
@@ -92,7 +92,7 @@ def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, M
     }
 
 
-def cloud_of(true: TrueSurface, day: SetDown, errors: CloudErrors, points: int, seed: int) -> SpectralCloud:
+def cloud_of(true: TrueObject, day: SetDown, errors: CloudErrors, points: int, seed: int) -> SpectralCloud:
     """What a run would export of the fruit as it was set down: visible points, with errors that ``seed`` draws.
 
     The columns ``views`` and ``spectral_std`` state the white errors only, as those of a run do.

@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 import tyro
+from calibration_score import CalibrationScore, lamp_output, score_calibration
 from jaxtyping import Float, UInt16
 from results_table import RESULTS, write_results
 from rich.progress import track
@@ -32,7 +33,6 @@ from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calib
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import Capture, open_session
 from hsi_sc_nerf.processing.frames import pack_frames
-from hsi_sc_nerf.simulate.processing_score import CalibrationScore, lamp_output, score_calibration
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import load_truth

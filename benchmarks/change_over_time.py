@@ -19,6 +19,7 @@ from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
+from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.change import Comparison, compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
@@ -36,7 +37,6 @@ from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.paper import CLASSIFICATION_ANGLE_RAD
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
-from hsi_sc_nerf.simulate.true_surface import TrueSurface
 
 NM = np.linspace(400.0, 1000.0, 25)
 MESH = MeshConfig(octree_depth=7)
@@ -118,7 +118,7 @@ class ChangeOverTime:
 
     def _ball(self) -> list[str]:
         mesh = sphere(0.07)
-        skin = TrueSurface(
+        skin = TrueObject(
             ("apple_skin",), mesh, np.ones((len(mesh.vertices), 1)), endmembers(("apple_skin",), NM), NM
         )
         clouds = [cloud_of(skin, SetDown(), CloudErrors(), self.points, seed) for seed in (0, 1)]
@@ -139,7 +139,7 @@ def _draw(path: Path, points: int) -> None:
     draw_change(path, first, found, found.quantities[BRIGHTNESS], SideViews(first.surface.mesh))
 
 
-def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparison) -> float:
+def _false_cm2(first: TrueObject, now: TrueObject, day: SetDown, one: Comparison) -> float:
     """Area that any quantity calls changed, away from what did: bruise, and the place of a lost stem."""
     bruise, stem = first.materials.index("bruise"), first.materials.index("stem")
     differs = np.abs(now.weights[:, bruise] - first.weights[:, bruise]) > 0.02
@@ -153,7 +153,7 @@ def _false_cm2(first: TrueSurface, now: TrueSurface, day: SetDown, one: Comparis
     return float(1e4 * surface.areas_m2[changed].sum())
 
 
-def _row(kind: str, name: str, day: SetDown, first: TrueSurface, now: TrueSurface, one: Comparison) -> list[str]:
+def _row(kind: str, name: str, day: SetDown, first: TrueObject, now: TrueObject, one: Comparison) -> list[str]:
     attitude, brightness = one.after.attitude, one.quantities[BRIGHTNESS]
     assert attitude is not None
     grew, by_brightness, by_class = [""] * 3
@@ -177,12 +177,12 @@ def beside(found: float, true: float) -> str:
     return f"{found:.2f} ({100 * (found / true - 1):+.0f} %)"
 
 
-def bruise_cm2(fruit: TrueSurface) -> float:
+def bruise_cm2(fruit: TrueObject) -> float:
     """True area of the bruise."""
     return float(1e4 * _areas_m2(fruit)[fruit.weights[:, fruit.materials.index("bruise")] > BRUISED].sum())
 
 
-def _water_change(first: TrueSurface, now: TrueSurface) -> float:
+def _water_change(first: TrueObject, now: TrueObject) -> float:
     """Median over the surface."""
     areas_m2 = _areas_m2(first)
     drawn = np.random.default_rng(0).choice(len(areas_m2), 20_000, p=areas_m2 / areas_m2.sum())
@@ -192,7 +192,7 @@ def _water_change(first: TrueSurface, now: TrueSurface) -> float:
     return float(np.median(after - before))
 
 
-def _areas_m2(fruit: TrueSurface) -> np.ndarray:
+def _areas_m2(fruit: TrueObject) -> np.ndarray:
     thirds = np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3)
     return np.bincount(fruit.mesh.triangles.ravel(), thirds, minlength=len(fruit.weights))
 

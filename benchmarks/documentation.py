@@ -27,7 +27,7 @@ from mkdocs.structure.pages import Page
 from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
 from hsi_sc_nerf.cli.commands import COMMANDS, command_line, named_commands
-from hsi_sc_nerf.indices.catalogue import catalogue_table
+from hsi_sc_nerf.indices.catalogue import CATALOGUE
 from hsi_sc_nerf.terminal import markdown_table
 
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
@@ -96,7 +96,12 @@ def indices_page() -> str:
         "R800 is the reflectance at 800 nm. All are numbers without a unit. The range is that of the colours in the "
         "viewer, in videos and in the report. [Map indices](../how-to/indices.md) says how to use them."
     )
-    return "\n\n".join(["# Indices", intro, catalogue_table()]) + "\n"
+    rows = [
+        [one.name, f"`{one.expression}`", "{:g} to {:g}".format(*one.drawn_range), one.tells, one.reference]
+        for one in CATALOGUE.values()
+    ]
+    table = markdown_table(["index", "formula", "range drawn", "follows", "source"], rows)
+    return "\n\n".join(["# Indices", intro, table]) + "\n"
 
 
 def commands_page() -> str:

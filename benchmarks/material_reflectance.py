@@ -29,6 +29,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 from results_table import RESULTS, write_results
+from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -40,7 +41,6 @@ from hsi_sc_nerf.light.views import Views
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.processing.voted_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
-from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 
 COLUMNS = (
@@ -203,7 +203,7 @@ def judge_run(truth: Truth, config: Path, cloud_path: Path) -> Judged:
     run, cloud = open_run(config), read_spectral_ply(cloud_path)
     started = time.process_time()
     found = light_of_run(run, facing_of(truth))
-    seconds, surface = time.process_time() - started, TrueSurface.of(truth)
+    seconds, surface = time.process_time() - started, TrueObject.of(truth)
     frontal = np.flatnonzero(cloud.extra[INCIDENCE] < LARGEST_INCIDENCE_DEG)
     chosen = np.random.default_rng(0).choice(frontal, min(2 * POINTS, len(frontal)), replace=False)
     points = cloud.points[chosen].astype(float)

@@ -19,6 +19,7 @@ from another_day import CloudErrors, SetDown, cloud_of, set_down
 from matplotlib import rc_context
 from results_table import RESULTS, write_results
 from rich.progress import track
+from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.drawn_regions import points_of_page, propose_regions
 from hsi_sc_nerf.analysis.organs import BODY, CALYX, HUSK, KERNELS, STEM
@@ -29,7 +30,6 @@ from hsi_sc_nerf.simulate.assemble import object_part
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import load_scene
-from hsi_sc_nerf.simulate.true_surface import TrueSurface
 from hsi_sc_nerf.simulate.truth import load_truth
 
 NM = np.linspace(400.0, 1000.0, 25)
@@ -82,20 +82,20 @@ class OrganProposals:
             self._write(name, errors, [self._simulated(name, ERRORS[errors], seed) for seed in SEEDS])
         for folder in self.trained:
             truth = load_truth(folder / "session")
-            case = read_spectral_ply(folder / "point_cloud.ply"), TrueSurface.of(truth)
+            case = read_spectral_ply(folder / "point_cloud.ply"), TrueObject.of(truth)
             self._write(truth.object, f"trained on {truth.intrinsics.w} px", [case])
 
-    def _write(self, name: str, errors: str, cases: list[tuple[SpectralCloud, TrueSurface]]) -> None:
+    def _write(self, name: str, errors: str, cases: list[tuple[SpectralCloud, TrueObject]]) -> None:
         """As soon as an object is measured; what stops later loses nothing."""
         rows = _rows(name, errors, cases)
         write_results("organ_proposals", COLUMNS, rows, keys=3, seed="11 to 13", folder=self.results)
 
-    def _simulated(self, name: str, errors: CloudErrors, seed: int) -> tuple[SpectralCloud, TrueSurface]:
+    def _simulated(self, name: str, errors: CloudErrors, seed: int) -> tuple[SpectralCloud, TrueObject]:
         part = object_part(replace(load_scene(name.split()[0]), seed=seed))
         if name == UPSIDE_DOWN:
             part = _upside_down(part)
         spectra = endmembers([STEM if one == CALYX else one for one in part.materials], NM)
-        true = TrueSurface(part.materials, part.mesh, part.weights, spectra, NM)
+        true = TrueObject(part.materials, part.mesh, part.weights, spectra, NM)
         cloud = cloud_of(true, SetDown(keeps_stem=name != UPSIDE_DOWN), errors, self.points, seed)
         placed = set_down(SetDown(), true.mesh.vertices)(true.mesh.vertices)
         return cloud, replace(true, mesh=Mesh(placed, true.mesh.triangles))
@@ -113,7 +113,7 @@ def _upside_down(apple: Part) -> Part:
     )
 
 
-def _rows(name: str, errors: str, cases: list[tuple[SpectralCloud, TrueSurface]]) -> list[list[str]]:
+def _rows(name: str, errors: str, cases: list[tuple[SpectralCloud, TrueObject]]) -> list[list[str]]:
     """A row for each organ. Overlap: points that are the organ's in both, over those in either."""
     overlaps: dict[str, list[float]] = {material: [] for material in ORGANS[name].values()}
     false = 0

@@ -17,6 +17,7 @@ import tyro
 from paper_tables import short_training
 from results_table import RESULTS, write_results
 from traits_accuracy import EVERY_KTH_CAMERA, SPOTS, spots_on
+from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
 from hsi_sc_nerf.analysis.size import combined, pixel_on_object_m, shared_errors, size_of, size_uncertainty
@@ -26,7 +27,6 @@ from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, read_spectral_ply
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.simulate.true_surface import TrueSurface
 from hsi_sc_nerf.simulate.truth import load_truth
 
 TRAITS = {"area_m2": "area", "volume_l": "volume", "height_m": "height", "largest_diameter_m": "largest diameter"}
@@ -100,7 +100,7 @@ class TraitUncertainty:
 def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
     """Trait, relative error and relative stated standard deviation of a session's sizes and spots."""
     truth, dataset = load_truth(folder / "session"), open_packed(folder / "data")
-    true, cloud = TrueSurface.of(truth), read_spectral_ply(folder / "export" / "point_cloud.ply")
+    true, cloud = TrueObject.of(truth), read_spectral_ply(folder / "export" / "point_cloud.ply")
     config = replace(MeshConfig(), base_height_m=float(true.mesh.vertices[:, 2].min()))
     mesh = closed_mesh(cloud.points, cloud.normals, config)
     shared = shared_errors(dataset, base_known=True)

@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 from results_table import RESULTS, write_results
 from rich.console import Console
+from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
@@ -24,7 +25,6 @@ from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, classified, region_spectrum
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
-from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.terminal import screen_table
 
@@ -74,7 +74,7 @@ class TraitsAccuracy:
     def main(self) -> None:
         """Measure, print all figures, write the table's row."""
         truth = load_truth(self.session)
-        true = TrueSurface.of(truth)
+        true = TrueObject.of(truth)
         eyes_m = truth.camera_to_world[::EVERY_KTH_CAMERA, :3, 3]
         cloud = read_spectral_ply(self.cloud) if self.cloud else true.cloud(self.points, eyes_m, self.noise_m)
         stands_at_m = float(true.mesh.vertices[:, 2].min())
@@ -137,7 +137,7 @@ def _spot_errors(surface: SpectralMesh, ideal: SpectralMesh) -> tuple[str, str, 
     return f"{median:.2g} %", f"{worst:.2g} %", f"at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
 
 
-def _class_rows(surface: SpectralMesh, true: TrueSurface, ideal: SpectralMesh) -> list[list[str]]:
+def _class_rows(surface: SpectralMesh, true: TrueObject, ideal: SpectralMesh) -> list[list[str]]:
     """Areas of classes, against the true surface: classified in the same way, and where the class has most of it.
 
     The first difference is the cloud's, the second that of telling tissues by spectral angle as well, the third that

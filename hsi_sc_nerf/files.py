@@ -96,7 +96,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be made a folder ({error.strerror or error}); choose another one."
+            f"{path}: cannot be created as a folder ({error.strerror or error}); choose another one."
         ) from error
 
 
@@ -118,11 +118,10 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """The object in a JSON file.
 
     Args:
-        path: the file.
         remedy: what to do if it cannot be read, the end of the error's sentence.
 
     Raises:
-        InputError: the file cannot be read or holds no JSON object.
+        InputError: the file cannot be read or is not a JSON object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -131,9 +130,9 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}.") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON object ({error}); {remedy}.") from error
+        raise InputError(f"{path}: is not a JSON object ({error}); {remedy}.") from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: is no JSON object; {remedy}.")
+        raise InputError(f"{path}: is not a JSON object; {remedy}.")
     return content
 
 

@@ -44,7 +44,6 @@ def refuse_red(findings: Iterable[Finding], accepted: Collection[str] = ()) -> N
     """Stop at findings that would spoil the results.
 
     Args:
-        findings: results of checks.
         accepted: names of checks whose red findings the user accepts.
 
     Raises:
@@ -75,8 +74,6 @@ def judged(name: str, value: float, limits: tuple[float, float], sentence: str, 
     """The finding on a value: green up to the first limit, amber up to the second, red above.
 
     Args:
-        name: of the check.
-        value: measured.
         limits: of green and of amber, in the value's unit.
         sentence: what is so, without a full stop.
         advice: what to do, given unless it is green.

@@ -158,8 +158,6 @@ def one_minus_cosine(
     """One minus the cosine of the spectral angle, in [0, 2], without cancellation: ``|u - v|² / 2``.
 
     Args:
-        a: Spectra.
-        b: Spectra of the same shape.
         norm_floor: Lower bound of the norms in the denominator, which bounds the gradient. The cosine of a spectrum
             below it shrinks to 0 with the norm; spectra above it are not affected.
     """

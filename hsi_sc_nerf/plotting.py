@@ -77,9 +77,7 @@ def show_image(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
     """Show an image without ticks; its pixel coordinates start at its upper left corner.
 
     Args:
-        axes: to draw in.
         image: (h, w), or (h, w, 3) as 8 bit or as floats, which are clipped to [0, 1].
-        **options: of ``Axes.imshow``.
     """
     height, width = image.shape[:2]
     axes.set(xticks=[], yticks=[])
@@ -105,7 +103,6 @@ def coloured(
     Args:
         values: clipped to ``drawn_range``; NaN becomes ``BLANK``.
         drawn_range: values at the two ends of the colour map.
-        colours: name of a matplotlib colour map.
 
     Example:
         >>> ndvi = torch.tensor([[0.2, 0.8], [0.5, torch.nan]])

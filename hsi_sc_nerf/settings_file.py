@@ -32,10 +32,6 @@ def read_yaml(text: str, source: str) -> Any:
 
     References can make a short text stand for more values than fit into memory.
 
-    Args:
-        text: YAML.
-        source: name of the text in error messages.
-
     Raises:
         InputError: it is no such text.
     """
@@ -57,7 +53,6 @@ def read_dataclass(cls: Any, values: Any, source: str, prefix: str) -> Any:
         cls: the dataclass; fields may be numbers, texts, paths, literals, tuples, optional values, dataclasses, or
             unions of dataclasses whose first field is a literal that tells them apart.
         values: content of the file or of one of its keys.
-        source: name of the file in error messages.
         prefix: path of keys down to ``values``, with a dot at its end; empty for the whole file.
 
     Raises:

@@ -10,6 +10,13 @@ from hsi_sc_nerf.config import hsi_sc_nerf
 STEPS = 6
 
 
+def shrink(model) -> None:
+    """Settings of a model that is built and evaluated in tenths of a second."""
+    model.match_resolution = False
+    model.num_levels, model.log2_hashmap_size, model.max_res = 4, 10, 32
+    model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
+
+
 def trainer(
     tiny_dataset,
     folder,
@@ -22,9 +29,7 @@ def trainer(
     config.pipeline.datamanager.data = tiny_dataset[0]
     config.pipeline.datamanager.train_num_rays_per_batch = 64
     model = config.pipeline.model
-    model.match_resolution = False
-    model.num_levels, model.log2_hashmap_size, model.max_res = 4, 10, 32
-    model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
+    shrink(model)
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.machine.device_type = device
     config.max_num_iterations, config.evaluate_stages = STEPS, False

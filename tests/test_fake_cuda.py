@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.model_components.ray_generators import RayGenerator
+from small_trainer import shrink
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -71,9 +72,7 @@ def move_module(module, mode):
 def small(method, data, **changes):
     config = copy.deepcopy(method.config.pipeline)
     config.datamanager.data = data
-    config.model.match_resolution = False
-    config.model.num_levels, config.model.log2_hashmap_size, config.model.max_res = 4, 10, 32
-    config.model.num_proposal_samples_per_ray, config.model.num_nerf_samples_per_ray = (16, 8), 8
+    shrink(config.model)
     for name, value in changes.items():
         setattr(config.model, name, value)
     return config.setup(device="cpu")

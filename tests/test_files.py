@@ -67,7 +67,7 @@ def test_pictures_come_back_and_damaged_ones_are_none(tmp_path, channels, shape)
 def test_what_is_no_json_object_is_refused_in_a_sentence(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"a\.json: is no JSON object.*; mend it\."):
+    with pytest.raises(InputError, match=r"a\.json: is not a JSON object.*; mend it\."):
         read_json(path, "mend it")
 
 

@@ -64,7 +64,7 @@ def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path):
     config = copy.deepcopy(hsi_sc_nerf.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path / "file", "x", "run"
     config.output_dir.write_text("months of work")
-    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cannot be made a folder[^\n]*\.$"):
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cannot be created as a folder[^\n]*\.$"):
         config.save_config()
     assert config.output_dir.read_text() == "months of work"
 

@@ -75,6 +75,7 @@ def test_losses_of_any_numbers_are_finite_and_flagged_ones_pull_at_nothing(devic
     target = leaf(values[::-1], dtype, device).detach().reshape(2, 4)
     valid = torch.tensor(flags, device=device).reshape(2, 4)
     found = loss(predicted, torch.where(valid, target, torch.nan), valid)
+    assert found.dtype == torch.float32
     assert found.isfinite()
     found.backward()
     assert predicted.grad.isfinite().all()

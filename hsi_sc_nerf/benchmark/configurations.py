@@ -91,8 +91,8 @@ def own_configuration(text: str) -> Configuration:
     name, equals, rest = text.partition("=")
     if not equals or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
         raise InputError(
-            f"'{text}' is no configuration; write NAME=WORDS, the name of letters, digits, dots and dashes, such as "
-            "fine=--pipeline.model.max-res 1024."
+            f"'{text}' is not a configuration; write NAME=WORDS, a name of letters, digits, dots and dashes, such "
+            "as fine=--pipeline.model.max-res 1024."
         )
     words = split_words(rest)
     based = bool(words) and not words[0].startswith("-")

@@ -174,8 +174,6 @@ def pooled_darks(
     frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
 
     Args:
-        darks: `dark_columns` of each frame.
-        readings: lines of each dark cube.
         read_noise: standard deviation of one reading.
     """
     if len(darks) < 2 or len({dark.shape for dark in darks}) > 1 or len(darks[0]) < 2:

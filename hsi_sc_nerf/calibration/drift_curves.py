@@ -45,7 +45,6 @@ def common_courses(
     variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
-        coefficients: of each frame, in its order in time.
         covariance: of one frame's coefficients; terms with a roughness have an error of their own.
         basis: terms over the bands.
         roughness: of each term, 0 for those that are not penalised; all 0 if not given.

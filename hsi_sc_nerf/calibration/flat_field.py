@@ -35,12 +35,6 @@ def flat_field(
     Its mean is 1 over the region of the white spectrum, except for dirt and folds there, which lower the spectrum but
     not the illumination. Camera and lamps must not have moved between the tarp and the frames.
 
-    Args:
-        tarp: the capture of the white tarp.
-        white: the tarp's white reference.
-        frame_shape: lines and samples of the frames.
-        defects: of the detector, if they are known.
-
     Raises:
         InputError: the tarp's image has another size than the frames, or the tarp is too small in it.
     """

@@ -93,7 +93,6 @@ def reflectance_uncertainty(
 
     Args:
         noise: of one reading.
-        white: counts of the white above dark, W - D.
         white_pixels: pixels of the white that were averaged.
         smoothing_bands: width of the moving average around each band; odd.
         frame_dark_readings: dark readings averaged for each element of a frame; 0 if no dark was subtracted.

@@ -151,8 +151,6 @@ def pack_counts(
 
     Args:
         counts: the raw counts; the lines of a BIL file are fastest.
-        calibration: of the frame.
-        pictures: bands of the pictures.
         buffer: memory of at least lines x samples x kept values for the packed numbers, so that several frames can
             share it; allocating takes a considerable part of the time.
 

@@ -84,9 +84,7 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
     """Steps 1 to 5 on an image that shows the white; the spectrum has one column.
 
     Args:
-        capture: the capture of the white tarp, or a frame with a white target.
         roi: region of the white; None finds it by its brightness (step 1). Nothing outside of it is read.
-        defects: of the detector, if they are known.
 
     Raises:
         InputError: the region is not inside the image, no part of it is evenly bright, or the white is not lit in
@@ -139,10 +137,7 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     """Steps 4 and 5 on a white cube (WHITEREF: lines of nothing but white), for each sample of the detector.
 
     Args:
-        white: counts of the white.
-        dark: counts without light that belong to it.
         samples: of the frames. A white of another width cannot be matched by sample and gives one column.
-        defects: of the detector, if they are known.
 
     Raises:
         InputError: the white is not lit in half of the bands.

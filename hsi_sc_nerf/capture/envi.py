@@ -105,12 +105,8 @@ def write_cube(
     viewers such as SPy's ``get_rgb`` take.
 
     Args:
-        header_path: the header, ending in ``.hdr``.
-        cube: the numbers; their data type is kept.
         wavelengths_nm: band centres; None for bands that are no wavelengths (a map).
-        interleave: "bil", "bip" or "bsq".
         data_suffix: ending of the data file, which is written beside the header.
-        extra_header: further fields of the header.
 
     Raises:
         InputError: the operating system refused to write (full disk, no permission).

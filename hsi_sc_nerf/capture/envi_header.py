@@ -80,7 +80,6 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
     """Read and check a header; the data file is not read.
 
     Args:
-        path: the header.
         library: whether it has to describe a spectral library, whose lines are spectra and whose samples are bands.
 
     Raises:
@@ -100,7 +99,7 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
     if is_library and not library:
         raise InputError(f"{path}: describes a spectral library, not an image; give the cube's header.")
     if library and not is_library:
-        raise InputError(f"{path}: its file type is no spectral library; give a library's header or correct it.")
+        raise InputError(f"{path}: its file type is not a spectral library; give a library's header or correct it.")
     bands = shape[1] if library else shape[2]
     scale = _number(path, fields, "reflectance scale factor")
     if scale is not None and not scale > 0.0:
@@ -144,7 +143,7 @@ def _mended_fields(path: Path) -> dict[str, Any]:
     lines = text.lstrip().splitlines()[1:]
     text = "\n".join(line.rstrip() for line in lines if not line.lstrip().startswith(";"))
     if not is_envi or "{" in _FIELD.sub("", text):
-        raise InputError(f"{path}: is no readable ENVI header; export the file again.")
+        raise InputError(f"{path}: is not a readable ENVI header; export the file again.")
     fields: dict[str, Any] = {"byte order": "0"}
     for name, value in _FIELD.findall(text):
         key, value = name.strip().lower(), value.strip()
@@ -165,16 +164,16 @@ def _check_layout(
 ) -> None:
     """Refuse headers whose pixels would be read wrongly."""
     if fields["interleave"] not in INTERLEAVES:
-        raise InputError(f"{path}: interleave {fields['interleave']} is none of bil, bip, bsq; correct it.")
+        raise InputError(f"{path}: interleave {fields['interleave']} is not bil, bip or bsq; correct it.")
     if min(shape) < 1 or offset < 0:
         raise InputError(
-            f"{path}: {shape[0]} lines, {shape[1]} samples, {shape[2]} bands after {offset} bytes are no spectral "
+            f"{path}: {shape[0]} lines, {shape[1]} samples, {shape[2]} bands after {offset} bytes are not a spectral "
             "image; correct the header."
         )
     if max(shape[1:] if library else shape[2:]) > _MOST_BANDS:
         raise InputError(f"{path}: describes more than {_MOST_BANDS} bands; correct the header.")
     if dtype.kind == "c":
-        raise InputError(f"{path}: holds complex numbers, which are no spectral image; export real numbers.")
+        raise InputError(f"{path}: holds complex numbers, which are not a spectral image; export real numbers.")
     if str(fields["byte order"]) not in ("0", "1"):
         raise InputError(f"{path}: byte order {fields['byte order']} is neither 0 (little) nor 1 (big); correct it.")
     for key in ("major frame offsets", "minor frame offsets", "file compression"):
@@ -219,7 +218,7 @@ def _wavelengths(path: Path, fields: dict[str, Any], bands: int) -> tuple[float,
     wavelengths_nm = listed * nm_per_unit
     if wavelengths_nm.min() < _SENSIBLE_NM[0] or wavelengths_nm.max() > _SENSIBLE_NM[1]:
         raise InputError(
-            f"{path}: wavelengths from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm are none of an "
+            f"{path}: wavelengths from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm are not those of an "
             "imaging spectrometer; correct the list or its unit."
         )
     return nm_per_unit, wavelengths_nm

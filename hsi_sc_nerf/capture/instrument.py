@@ -197,7 +197,7 @@ def read_metadata(path: Path) -> SpecimMetadata:
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: is no readable XML ({error}); copy the capture's metadata again.") from error
+        raise InputError(f"{path}: is not readable XML ({error}); copy the capture's metadata again.") from error
     values: dict[str, str] = {}
     for element in root.iter():
         text = (element.text or "").strip()

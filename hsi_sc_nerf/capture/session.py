@@ -166,8 +166,6 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     """Find the captures of a session, open their cubes and check that they belong together.
 
     Args:
-        path: the session's folder.
-        exclude: names of captures to leave out.
         skip_damaged: whether captures that cannot be used are left out (`Session.damaged`) instead of refused.
 
     Raises:

@@ -72,8 +72,8 @@ def read_session_info(path: Path) -> SessionInfo:
     """Read ``session.json``; if there is none, every value is unknown.
 
     Raises:
-        InputError: no readable file, no JSON object, an unknown key, a value of the wrong kind, or a named file that
-            is missing.
+        InputError: the file cannot be read or is not a JSON object; a key is unknown; a value is of the wrong kind; a
+            named file is missing.
     """
     if not os.path.lexists(path):
         return SessionInfo()
@@ -115,8 +115,8 @@ def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
         centres_nm = np.array([float(line.split(",")[0]) for line in lines if line.strip()])
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: is no list of band centres ({error}); write a line of names and one wavelength in nm a line."
+            f"{path}: is not a list of band centres ({error}); write a line of names and one wavelength in nm a line."
         ) from error
     if len(centres_nm) == 0 or not (np.isfinite(centres_nm).all() and centres_nm.min() >= 100.0):
-        raise InputError(f"{path}: its band centres are no wavelengths in nm; write one number a line, 100 at least.")
+        raise InputError(f"{path}: its band centres are not wavelengths in nm; write one number a line, from 100.")
     return centres_nm

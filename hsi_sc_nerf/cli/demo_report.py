@@ -188,11 +188,8 @@ def draw_spectra(
     """Measured and reconstructed spectra of marked points, their differences, and the picture that shows the points.
 
     Args:
-        path: the PNG file.
-        wavelengths_nm: band centres.
         measured: reflectance of each point (solid); NaN, where it was not measured, is a gap.
         reconstructed: of each point (dashed).
-        labels: a name for each point.
         image: pseudo-RGB, float in [0, 1] or 8 bit.
         pixels: (x, y) of each point in the image, from its upper left corner.
     """
@@ -235,9 +232,7 @@ def draw_cloud(path: Path, points_m: Float[np.ndarray, "n 3"], colours: UInt8[np
     """The cloud, in parallel projection and to one scale, from the camera's side, from the left and from above.
 
     Args:
-        path: the PNG file.
         points_m: positions in the object frame, metres. Above 200 000 points every k-th is drawn.
-        colours: pseudo-RGB.
     """
     stride = max(1, math.ceil(len(points_m) / _CLOUD_POINTS))
     points, colours = points_m[::stride] * 1000.0, colours[::stride] / 255.0

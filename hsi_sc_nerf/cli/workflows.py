@@ -61,9 +61,6 @@ class RunCommand(SessionSettings):
     def main(self, run_step: StepRunner = run_step) -> None:
         """Run the steps that are not up to date and print what was found.
 
-        Args:
-            run_step: runs a step's command.
-
         Raises:
             InputError: a step failed, there is no session, or the output folder holds something else.
         """

@@ -47,10 +47,6 @@ def estimate_static_background(
     Pixels count outside of the object's mask and of the turntable's silhouette, and of their values those that are
     measurements. Bands that are measured nowhere take ``dataset.background_reflectance``.
 
-    Args:
-        dataset: its camera, boxes and container.
-        frames: the frames that may be read (training frames).
-
     Returns:
         Reflectance of the cells, and their side in pixels of the camera's image, from its upper left corner.
 
@@ -130,11 +126,6 @@ def wiener_filter(
 
     J.-S. Lee, "Digital image enhancement and noise filtering by use of local statistics", IEEE TPAMI 2, 1980. Values
     that are not measured (nan) are left out and stay nan.
-
-    Args:
-        image: with noise.
-        variance: of the noise of each value.
-        window: side of the neighbourhood, odd.
     """
     measured = np.isfinite(image)
     number = _window_sum(measured.astype(np.float32), window)

@@ -120,7 +120,6 @@ def pinhole_cameras(
 
     Args:
         poses: camera-to-world, OpenGL axes.
-        intrinsics: of all cameras.
         distortion: k1, k2, p1, p2 (OpenCV).
         frames: indices of the session's frames that were taken at these poses, which the model refines; None for
             poses that belong to no frame and are not refined.

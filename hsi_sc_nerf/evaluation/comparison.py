@@ -125,8 +125,6 @@ def compare(
         cloud_path: PLY cloud, or PLY, OBJ or STL mesh, in metres.
         reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.true_surface.true_reference` of a
             simulated session.
-        config: settings.
-        track: shows progress.
 
     Raises:
         InputError: a file or a setting cannot be used, the sizes do not fit together, or the shape is symmetric, so
@@ -196,7 +194,7 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give a point cloud (PLY) or a mesh (PLY, OBJ, STL).")
     if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path}: is no file that can be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
+        raise InputError(f"{path}: cannot be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
     try:
         vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
     except InputError:
@@ -206,9 +204,9 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     if not len(vertices):
         raise InputError(f"{path}: holds no surface and no points; export it again, clouds as PLY.")
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
-        raise InputError(f"{path}: its triangles name vertices that it has not; export it again.")
+        raise InputError(f"{path}: its triangles refer to vertices that do not exist; export it again.")
     if not np.isfinite(vertices).all():
-        raise InputError(f"{path}: some points are not at finite places; remove them or export it again.")
+        raise InputError(f"{path}: some points have coordinates that are not finite; remove them or export it again.")
     return vertices, triangles
 
 

@@ -222,8 +222,6 @@ def _draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float],
     """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
 
     Args:
-        path: the PNG file.
-        curves: over the threshold.
         knee: threshold (metres) and F-score (percent) of the curve's knee.
         chosen: likewise of ``--threshold-m``, which may lie beyond the curves.
     """
@@ -253,9 +251,7 @@ def _draw_distances(
     """Points coloured by distance, each surface from two sides, in parallel projection and to one scale.
 
     Args:
-        path: the PNG file.
         surfaces: title, points and their distances, in metres.
-        limit_m: upper end of the colour scale.
     """
     low, high = np.percentile(np.concatenate([points for _, points, _ in surfaces]), (0.1, 99.9), axis=0)
     margin_m = 0.05 * float((high - low).max())

@@ -70,11 +70,7 @@ def refine(
     deviations, so that neither outliers nor parts missing in the reference bias the result.
 
     Args:
-        cloud_m: moves.
-        reference_m: stays.
         start: default: the identity.
-        with_scale: also estimate a scale.
-        seed: of the random subsets of the points.
 
     Example:
         >>> shifted_m = reference_m + [0.002, 0.0, 0.0]
@@ -103,11 +99,7 @@ def align_by_features(
     squared distance, is reported as a rival: the shape does not determine the attitude.
 
     Args:
-        cloud_m: moves.
-        reference_m: stays.
         with_scale: also estimate a scale; it starts at the ratio of the clouds' robust radii.
-        seed: of everything random.
-        track: wraps the starts while they are refined, for a progress bar.
     """
     import open3d
 

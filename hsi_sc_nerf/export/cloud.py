@@ -120,7 +120,6 @@ def statistical_inliers(points: Float[np.ndarray, "n 3"], std_ratio: float) -> I
     All points of a cloud with no more than ``OUTLIER_NEIGHBOURS`` points are inliers.
 
     Args:
-        points: positions, any unit.
         std_ratio: standard deviations above the cloud's mean from which a point is an outlier, above 0.
     """
     if len(points) <= OUTLIER_NEIGHBOURS:
@@ -192,8 +191,6 @@ def write_spectral_ply(
     A stream is written chunk by chunk; plyfile would need all points at once.
 
     Args:
-        path: the PLY file; an existing one is replaced.
-        cloud: the points.
         triangles: indices of three points each, counter-clockwise seen from outside.
 
     Raises:
@@ -243,7 +240,6 @@ def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"], kind: str = 
     """``scalar_397.32nm`` a band: two decimals, or as many as it takes to distinguish all bands.
 
     Args:
-        wavelengths_nm: band centres.
         kind: ``scalar`` for reflectance as measured, ``material`` for that of the material.
 
     Raises:

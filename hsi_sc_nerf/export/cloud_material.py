@@ -78,9 +78,7 @@ def with_material(
     """The cloud with the columns of material and irradiance.
 
     Args:
-        cloud: of the run.
         found: the light in the run.
-        run_nm: bands of the run.
         corrected: whether the light is taken out; else the material is what was measured.
 
     Raises:
@@ -104,11 +102,6 @@ def require_bands_of_run(
 ) -> Int[np.ndarray, "selected"]:
     """Index of each band of a cloud in its run.
 
-    Args:
-        cloud: of the run.
-        run_nm: bands of the run.
-        what: the cloud, in the message.
-
     Raises:
         InputError: the run has no such band.
     """
@@ -120,10 +113,6 @@ def require_bands_of_run(
 
 def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> CloudMaterial:
     """The material in a PLY file by `hsi-sc-nerf material`.
-
-    Args:
-        path: of the file.
-        wavelengths_nm: bands that it must have.
 
     Raises:
         InputError: the file cannot be read, has no material's columns, or other bands.

@@ -78,7 +78,7 @@ def format_of(path: Path) -> CloudFormat:
     for file_format, suffix in _SUFFIXES.items():
         if path.suffix.lower() == suffix:
             return file_format
-    raise InputError(f"{path}: is no name of a cloud; let it end in {', '.join(_SUFFIXES.values())}.")
+    raise InputError(f"{path}: is not a file name of a cloud; let it end in {', '.join(_SUFFIXES.values())}.")
 
 
 def require_format(path_without_suffix: Path, file_format: CloudFormat, num_bands: int, num_extra: int) -> Path:
@@ -104,7 +104,7 @@ def require_format(path_without_suffix: Path, file_format: CloudFormat, num_band
             "export as PLY."
         )
     if file_format == "zarr" and path.exists() and not (path / "zarr.json").is_file():
-        raise InputError(f"{path}: is no Zarr folder and will not be replaced by one; choose another output folder.")
+        raise InputError(f"{path}: is not a Zarr folder and is not replaced by one; choose another output folder.")
     return path
 
 

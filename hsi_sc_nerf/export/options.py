@@ -92,7 +92,6 @@ def select_bands(wavelengths_nm: Float[np.ndarray, "bands"], words: Sequence[str
     """Indices, ascending, of the bands that ``--bands`` names; all bands without a word.
 
     Args:
-        wavelengths_nm: band centres.
         words: wavelengths in nm (``"670"``: the nearest band) and ranges (``"600-700"``: every band in it).
 
     Raises:

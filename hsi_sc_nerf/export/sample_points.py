@@ -72,7 +72,6 @@ def sample_points(
     """Spectra of points. Lens distortion is neglected when selecting the images that hold a point.
 
     Args:
-        run: the trained run.
         points_m: object frame, metres.
         normals: unit vectors, to either side of the surface; 0 for a point that gets no spectrum.
         max_distance_m: largest distance of a point from the model's surface, along its normal.
@@ -125,8 +124,6 @@ def frontal_views(
     """The ``count`` most frontal cameras of each point, or all if there are fewer, and which of them see it.
 
     Args:
-        cosines: of the angle between the point's normal and the direction to the camera.
-        in_frame: whether the camera's image holds the point.
         count: cameras a point, at most.
     """
     ranked = np.where(in_frame, cosines, -1.0)
@@ -236,7 +233,7 @@ def read_points(path: Path) -> PlyPoints:
         InputError: the file is missing, is no PLY, has no points, or its points hold lists or are not finite.
     """
     if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: is no PLY file; export the cloud or mesh as PLY.")
+        raise InputError(f"{path}: is not a PLY file; export the cloud or mesh as PLY.")
     positions, triangles = read_surface(path)
     return PlyPoints(read_ply(path), positions, triangles)
 

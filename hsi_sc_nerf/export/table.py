@@ -38,10 +38,6 @@ _ANCILLARY = {"reflectance": ("spectral_std", "sampled_std"), "irradiance": ("ir
 def to_xarray(cloud: SpectralCloud, run: str = "") -> xarray.Dataset:
     """A cloud as an xarray dataset, as it is opened from the NetCDF file of the cloud.
 
-    Args:
-        cloud: the points.
-        run: name of the run that made the cloud.
-
     Raises:
         InputError: xarray is not installed.
 

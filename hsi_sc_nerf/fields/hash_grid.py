@@ -215,10 +215,6 @@ def grid_for_resolution(box_side_m: float, pixel_footprint_m: float) -> GridSize
     The finest level has `CELLS_PER_PIXEL` cells a pixel; the number of levels follows from `LEVEL_GROWTH`. A table
     has a row for every second cell that a plane through the box cuts, since density lies on surfaces.
 
-    Args:
-        box_side_m: longest side of the box.
-        pixel_footprint_m: what one pixel covers at the object.
-
     Raises:
         ValueError: a length is not above 0.
 

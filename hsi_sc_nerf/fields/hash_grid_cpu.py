@@ -143,8 +143,6 @@ def run_in_parts(alone: Callable[..., None], at_once: Callable[..., None], point
     Args:
         alone: takes the arguments, the number of a part and how many parts there are.
         at_once: takes the arguments and the number of parts, and does them side by side.
-        points: how many there are to work on.
-        *arguments: of the kernel.
     """
     threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     if threads == 1 or points < _SHARED_FROM:

@@ -126,13 +126,6 @@ def bounds_from_masks(
     The former are the visual hull with a margin, and all that is lower than the object. The latter are the hull, the
     container, and the disc under it. A fifth of the frames may contradict the former hull, few the latter. If the
     masks leave none, all cells may hold matter, and none is solid.
-
-    Args:
-        dataset: camera, container, and the object's box.
-        frames: whose masks are used.
-        shape: cells along each axis.
-        lower_m: corner of the grid, object frame.
-        cell_m: side of a cell.
     """
     centres_m = lower_m + (np.indices(shape).reshape(3, -1).T + 0.5) * cell_m
     low_m, high_m = dataset.object_box_m

@@ -38,14 +38,7 @@ def sample_occupied(
     matter has samples of length 0. Gradients are not carried.
 
     Args:
-        origins: of the rays.
-        directions: unit vectors.
-        nears: distances at which the rays enter the grid.
-        fars: distances at which they leave it.
         opacity: of the cells along a side, in [0, 1]; below 0 where there is no matter.
-        lower: corner of the grid.
-        cell: side of a cell.
-        num_samples: samples a ray.
     """
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it

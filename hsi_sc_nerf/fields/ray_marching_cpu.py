@@ -19,15 +19,7 @@ def sample_occupied(
     explored: float,
     max_opacity: float,
 ) -> tuple[Float32[np.ndarray, "rays samples"], Float32[np.ndarray, "rays samples"]]:
-    """Starts and ends of the samples, as `ray_marching.sample_occupied` describes them.
-
-    Args:
-        rays: origins, directions, nears and fars.
-        grid: opacity, lower corner and cell.
-        num_samples: samples a ray.
-        explored: `ray_marching.EXPLORED`.
-        max_opacity: `ray_marching.MAX_OPACITY`.
-    """
+    """Starts and ends of the samples, as `ray_marching.sample_occupied` describes them."""
     count = len(rays[0])
     results = np.empty((count, num_samples), np.float32), np.empty((count, num_samples), np.float32)
     opacity, lower, cell = grid

@@ -107,5 +107,5 @@ def ply_triangles(content: PlyData) -> Int[np.ndarray, "t 3"]:
     ]
     triangles = np.concatenate(fans).astype(np.int64) if fans else np.zeros((0, 3), np.int64)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < content["vertex"].count:
-        raise ValueError("its faces name vertices that it has not")
+        raise ValueError("its faces refer to vertices that do not exist")
     return triangles

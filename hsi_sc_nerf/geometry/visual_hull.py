@@ -37,7 +37,6 @@ def visual_hull(
         points: in the object frame, metres.
         masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera.
         max_missed_fraction: fraction of all frames that may have a point of the hull outside of their mask.
 
     Example:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.indices.formula import SpectralIndex
 from hsi_sc_nerf.spectra import covered, require_bands
-from hsi_sc_nerf.terminal import markdown_table
 
 # Name, formula, ends of the colour map for plant tissue, what it follows, source.
 _TABLE = (
@@ -125,12 +124,3 @@ def find_index(word: str) -> SpectralIndex:
 def available_indices(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[SpectralIndex]:
     """The indices of the catalogue that these band centres can give."""
     return [one for one in CATALOGUE.values() if covered(wavelengths_nm, one.wavelengths_nm).all()]
-
-
-def catalogue_table() -> str:
-    """The catalogue in Markdown."""
-    rows = [
-        [one.name, f"`{one.expression}`", "{:g} to {:g}".format(*one.drawn_range), one.tells, one.reference]
-        for one in CATALOGUE.values()
-    ]
-    return markdown_table(["index", "formula", "range drawn", "follows", "source"], rows)

@@ -127,8 +127,6 @@ def _value(
     """Value of a tree.
 
     Args:
-        node: the tree.
-        reflectance: at a wavelength.
         constant: turns a number of the formula into one of the values' type, whose division by zero raises nothing.
         library: numpy or torch, for the functions.
 

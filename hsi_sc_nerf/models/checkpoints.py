@@ -113,9 +113,9 @@ def require_whole(path: Path) -> None:
         *(OSError, EOFError, NotImplementedError, OverflowError, RuntimeError, ValueError),
         *(struct.error, zipfile.BadZipFile, zlib.error),
     ) as error:
-        raise InputError(f"{path}: is no readable checkpoint ({error}); {_EARLIER}.") from error
+        raise InputError(f"{path}: is not a readable checkpoint ({error}); {_EARLIER}.") from error
     if damaged is not None:
-        raise InputError(f"{path}: is no readable checkpoint (its part {damaged} is damaged); {_EARLIER}.")
+        raise InputError(f"{path}: is not a readable checkpoint (its part {damaged} is damaged); {_EARLIER}.")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu")
     except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
-        raise InputError(f"{path}: is no readable checkpoint ({error}); {_EARLIER}.") from error
+        raise InputError(f"{path}: is not a readable checkpoint ({error}); {_EARLIER}.") from error
     if not isinstance(state, dict) or not state.keys() >= CHECKPOINT_KEYS:
-        raise InputError(f"{path}: is no checkpoint that hsi-sc-nerf can go on from; train anew.")
+        raise InputError(f"{path}: is not a checkpoint that hsi-sc-nerf can continue from; train anew.")
     return state

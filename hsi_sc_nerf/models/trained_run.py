@@ -79,7 +79,7 @@ def open_run(load_config: Path) -> TrainedRun:
     """
     config = read_config(load_config)
     if not isinstance(config.pipeline.model, SpectralModelConfig):
-        raise InputError(f"{load_config}: is no run of hsi-sc-nerf; give the config.yml of one.")
+        raise InputError(f"{load_config}: is not a run of hsi-sc-nerf; give the config.yml of one.")
     from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
 
     require_whole(find_checkpoint(_relocated(config, load_config).get_checkpoint_dir()))

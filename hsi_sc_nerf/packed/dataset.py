@@ -71,7 +71,7 @@ class PackedFrame:
         """
         counts = open_cube(self.cube_path).memmap()
         if not (isinstance(counts, np.memmap) and counts.flags.c_contiguous and counts.dtype.str[1:] == "u2"):
-            raise InputError(f"{self.cube_path}: is no BIP cube of 16-bit numbers; process the session again.")
+            raise InputError(f"{self.cube_path}: is not a BIP cube of 16-bit numbers; process the session again.")
         return counts
 
     def mask(self) -> Bool[np.ndarray, "lines samples"]:
@@ -90,7 +90,7 @@ class PackedFrame:
 def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
     image = read_picture(path, channels)
     if image is None:
-        raise InputError(f"{path}: is no readable picture; {_AGAIN}.")
+        raise InputError(f"{path}: is not a readable picture; {_AGAIN}.")
     return image
 
 

@@ -60,11 +60,6 @@ def container_outline(
 
     A container off the axis moves both edges to one side; the mean of both tells its radius.
 
-    Args:
-        images: gray, one per frame of the session.
-        turntable: adjusted, with points of the object that stands on the container.
-        height_over_diameter: of the container.
-
     Returns:
         None where two edges and a foot do not stand out in most frames, or do not agree.
     """

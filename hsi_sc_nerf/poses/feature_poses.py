@@ -102,7 +102,6 @@ def poses_from_known_camera(
     """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
 
     Args:
-        names: of the frames.
         size_px: width and height of the images.
         info: the angles and the direction.
         camera: of the earlier session; its direction counts where ``info`` has none.
@@ -152,8 +151,6 @@ def poses_from_features(
     Markers that are seen, known angles and a known camera enter the adjustment.
 
     Args:
-        images: one gray image per frame.
-        names: the frames' names.
         info: what gives the scale, the markers' dictionary, and the angles.
         camera: of an earlier session, whose focal length and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.

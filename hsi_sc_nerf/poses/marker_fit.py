@@ -63,9 +63,7 @@ def fit_marker(
     marker) eliminated; pixels that do not fit are weighted down (Huber).
 
     Args:
-        image: the frame as floats.
         dictionary: OpenCV's name of the marker's dictionary.
-        marker: its id.
         corners_px: where to start, within about one cell of the truth.
         blur_px: standard deviation of the camera's blur beside the pixel's own area.
         largest_shift_px: the fit fails where a corner moves farther than this.

@@ -144,10 +144,6 @@ def observe_expected(
 
     Args:
         images: of all frames; of ``SessionPictures`` the best ones.
-        dictionary: of the markers.
-        turntable: adjusted to the seen markers.
-        seen: markers so far.
-        blur_px: of each frame's image.
     """
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
     missing = [pair for pair in _facing(turntable) if pair not in have]

@@ -33,10 +33,7 @@ def marker_sheets(marker_side_m: float, dictionary: str, ids: Sequence[int], pap
     """Sheets with the markers, each with its number and size below it, and a ruler on each sheet.
 
     Args:
-        marker_side_m: side of a marker's black square.
         dictionary: OpenCV's name, such as ``DICT_5X5_50``.
-        ids: numbers of the markers.
-        paper: size of the sheets.
 
     Raises:
         InputError: the dictionary has no such markers, or one does not fit on a sheet.

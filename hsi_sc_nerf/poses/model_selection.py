@@ -198,10 +198,6 @@ def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted
 
     The lens is decided first, on a table that does not wobble. If then the table should move, a few displaced frames
     are tried as the explanation. If it wobbles, the lens is decided again beside it.
-
-    Args:
-        start: a turntable that has the frames and markers of the observations.
-        observations: marker corners.
     """
     solve = partial(_solve, observations)
     steady, wobbling = _steady(start, solve)
@@ -227,7 +223,6 @@ def frame_motions(
 
     Args:
         turntable: without wobble; observations of markers that it lacks are ignored.
-        observations: marker corners.
 
     Returns:
         Of each frame the probability that chance alone lowers its squares as much as a motion of its own does

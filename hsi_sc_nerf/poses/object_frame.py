@@ -35,7 +35,6 @@ def to_object_frame(turntable: Turntable, disc: float) -> Float[np.ndarray, "4 4
     """From the object's axes at the angle 0 to the object frame: a turn about z and a shift along it.
 
     Args:
-        turntable: adjusted.
         disc: height of the disc in the turntable frame, in the turntable's unit of length.
     """
     camera = turntable.camera_positions()[0]
@@ -98,7 +97,6 @@ def container_diameter(turntable: Turntable, container_height: float | None) -> 
     around the axis. None where no upright marker faces outwards, or their planes touch no common circle.
 
     Args:
-        turntable: with markers.
         container_height: markers whose centre is above this height over the disc are not on the container.
     """
     normals, centres = turntable.marker_poses[:, :3, 2], turntable.marker_poses[:, :3, 3]

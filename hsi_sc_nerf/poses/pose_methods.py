@@ -38,7 +38,6 @@ def find_poses(
 
     Args:
         images: one gray image per frame, all of one size, or ``SessionPictures``.
-        names: the frames' names.
         info: what is known of the session: markers, container, nominal step or angles, direction, distance.
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses

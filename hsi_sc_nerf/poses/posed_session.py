@@ -49,10 +49,6 @@ def in_object_frame(
 
     Args:
         adjusted: in any unit of length.
-        markers: that it was adjusted to.
-        names: of the session's frames.
-        size_px: width and height of the images.
-        info: what is known of the session.
         outline: of the container in the same unit, which gives the disc's height.
         specific: what the method itself knows for ``TurntablePoses``.
     """
@@ -116,7 +112,6 @@ def pose_uncertainty(
     """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
 
     Args:
-        adjusted: the turntable.
         covariance: of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
         outline: of the container, where its radius gives the scale and its foot the disc's height.

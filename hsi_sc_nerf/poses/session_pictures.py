@@ -124,8 +124,6 @@ def frame_pictures(
     Args:
         cube_path: header of the packed cube; it must exist while pictures are accessed.
         flags_path: its pixels' flags (docs/reference/files.md).
-        gray: the mean over ``gray_nm``, made when the frame was packed.
-        gray_nm: its range.
     """
     cube = open_cube(cube_path)
     wavelengths_nm = cube.wavelengths_nm

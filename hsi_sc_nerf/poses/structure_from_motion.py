@@ -82,7 +82,6 @@ def structure_from_motion(
 
     Args:
         images: one gray image per frame in the order of the turn, all of one size.
-        names: the frames' names, for messages.
         focal_px: of the camera, where it is known; mapping holds it.
 
     Raises:

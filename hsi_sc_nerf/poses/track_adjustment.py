@@ -77,8 +77,6 @@ def adjust_tracks(start: Turntable, tracks: Tracks, *, free_angles: bool = True)
 
     Args:
         start: where to start. Tracks of frames or points that it lacks count as outliers.
-        tracks: points seen in frames.
-        free_angles: whether the angles are adjusted.
 
     Raises:
         InputError: too few tracks fit to determine an axis.

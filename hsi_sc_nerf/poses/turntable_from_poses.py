@@ -43,8 +43,6 @@ def turntable_from_poses(
     Args:
         world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
         points_3d: points of the poses' world.
-        focal_px: of the camera.
-        centre_px: its principal point.
 
     Returns:
         The turntable with the points, numbered by row, in distances of the camera from the axis; its first frame has

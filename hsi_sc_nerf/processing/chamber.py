@@ -42,13 +42,7 @@ def background_pixels(
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     masks: Bool[np.ndarray, "frames h w"],
 ) -> tuple[Float[np.ndarray, "chosen pixels colours"], Bool[np.ndarray, "chosen pixels"]]:
-    """Reflectance of the same pixels in some frames, and which of them show the chamber.
-
-    Args:
-        dataset: its camera and what turns.
-        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
-        masks: true on the object.
-    """
+    """Reflectance of the same pixels in some frames, and which of them show the chamber."""
     step = -(-max(masks.shape[1:]) // MAX_SIDE)
     spectra, free = [], []
     count = min(len(masks), MAX_FRAMES)

@@ -71,11 +71,8 @@ def measure_effects(
 
     Args:
         dataset: whose files are written, all but ``transforms.json``.
-        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
-        masks: true on the object.
         seen: points of the object as the frames see them (`points_of_object`).
         drift: what is known of the lamps, and whether the frames are corrected.
-        poses: of the frames.
     """
     return (
         view_dependence(None if seen is None else change_with_direction(seen)),

@@ -37,7 +37,6 @@ def foreground_score(
     """Root mean square over bins of what is left of each spectrum outside of the background's subspace.
 
     Args:
-        bins: of one frame (`smoothed_bins`).
         background: orthonormal columns (`background_subspace`).
 
     Example:

@@ -112,13 +112,9 @@ def pack_frames(
     """Calibrate and pack all frames of a session; frames that an earlier run finished in the same way are kept.
 
     Args:
-        session: raw captures.
-        calibration: of the session.
-        output_dir: folder of the packed dataset.
         pseudo_rgb_nm: wavelengths shown as red, green and blue.
         marker_range_nm: bands that are averaged into the gray image.
         workers: frames that are calibrated at the same time.
-        progress: whether to show a progress bar.
 
     Returns:
         The frames' caches, in the session's order.
@@ -181,8 +177,6 @@ def process_frame(
 
     Args:
         cube: raw counts, or finished reflectance.
-        calibration: of this frame.
-        paths: files to write.
         fingerprint: of what the frame is made from, kept in its cache.
         pseudo_rgb_nm, marker_range_nm: as in `pack_frames`.
         buffer: memory to pack in (`pack_counts`), which several frames may use in turn.

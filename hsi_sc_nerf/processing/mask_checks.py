@@ -44,10 +44,7 @@ def check_masks(
     """What speaks against the masks; nothing for good ones.
 
     Args:
-        masks: true on the object.
-        names: of the frames.
         silhouettes: of the masks' visual hull (`VotedHull`).
-        brightness: mean reflectance.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
         lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
 

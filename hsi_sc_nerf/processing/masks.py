@@ -74,8 +74,6 @@ def foreground_masks(
     """Masks of the object in all frames, with one threshold.
 
     Args:
-        bins: of each frame (`smoothed_bins`).
-        config: settings.
         regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
 
     Raises:
@@ -138,8 +136,6 @@ def foreground_mask(
     """The largest connected component above the threshold, with gaps closed, holes filled and thin parts added.
 
     Args:
-        score: of one frame.
-        threshold: of the score.
         region: pixels that may be the object's; all if not given.
         weak_fraction: thin parts that stick out of the component (a woody stem) are added from this fraction of the
             threshold on; 1 for none. The component's edge, where pixels are mixed, does not grow.
@@ -164,7 +160,6 @@ def above_lid(
     """Pixels whose rays pass through the space above the container's lid before they meet the container.
 
     Args:
-        intrinsics: of the camera.
         distortion: k1, k2, p1, p2 (OpenCV).
         camera_to_world: pose in the object frame, OpenGL axes, metres.
         container: upright cylinder about the z axis, from z = 0 up.
@@ -251,9 +246,6 @@ def shaded_parts(
     object times the object's ratio. In front of a dark one even a small fraction of object has the object's ratio.
 
     Args:
-        body: the object's mask so far.
-        score: of one frame.
-        brightness: of one frame.
         region: pixels that may be the object's; all if not given.
         fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
 
@@ -280,8 +272,6 @@ def at_half_coverage(
     """The mask with its edge where pixels are half object, judged by the score of the object beside them.
 
     Args:
-        mask: of one frame.
-        score: of one frame.
         brightness: of one frame. A pixel in shade is kept: its score is low because it is dark.
         may_grow: pixels that may be added.
 

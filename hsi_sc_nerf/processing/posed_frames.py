@@ -48,11 +48,6 @@ def pose_frames(
     Args:
         session: its frames are packed under ``output_dir``.
         images: the mean over ``marker_range_nm`` of each frame.
-        info: what is known of the session, settings included.
-        camera: of an earlier session, if it is known.
-        method, find_poses: how poses are found.
-        output_dir: the dataset.
-        console: prints.
         marker_range_nm: range in which the markers' ink is visible.
         check: called with the findings on the poses; raises where one is red.
 

@@ -98,10 +98,7 @@ def process_session(
     complete.
 
     Args:
-        session_dir: folder of the captures (`open_session`).
         output_dir: folder of the dataset; made if it does not exist.
-        config: settings.
-        progress: whether to print what is found.
         estimate_poses: called like `find_poses`.
 
     Returns:

@@ -63,7 +63,6 @@ def training_subspace(
 
     Args:
         dataset: its uncertainty is the noise; where it has none, the noise is estimated from the spectra.
-        frames: training frames.
         rank: size of the basis; None for as many directions as stand out of the noise.
 
     Raises:
@@ -91,7 +90,6 @@ def find_subspace(
     exceeds the largest one of simulated noise with the same standard deviations (parallel analysis, Horn 1965).
 
     Args:
-        spectra: reflectance.
         noise: standard deviation of each value or of each band, above 0; None to estimate it (`estimate_noise`).
         valid: which values are measurements; spectra with any other are left out. All if not given.
         rank: number of directions, from the strongest on; None for those that count, at most `MAX_RANK`.

@@ -191,12 +191,8 @@ def point_views(
     """Look the hull's points up in the frames.
 
     Args:
-        bins: reflectance in bins of bands of each frame (`smoothed_bins`).
-        masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera.
         distortion: k1, k2, p1, p2 (OpenCV).
-        hull: of the masks.
     """
     distance_m = float(np.linalg.norm(camera_to_worlds[:, :3, 3] - hull.core.mean(axis=0), axis=1).mean())
     # The hull is that of masks which were dilated by this.

@@ -65,7 +65,6 @@ def voted_hull(
     dilated by half a voxel's diagonal, so that parts thinner than a voxel are kept.
 
     Args:
-        masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
         intrinsics: of the one camera; lens distortion is neglected.
         min_z_m: height of the container's lid, below which the hull does not reach; None if unknown.
@@ -109,7 +108,6 @@ def object_box(hull: VotedHull, min_z_m: float | None = None) -> Float[np.ndarra
     """Minimum and maximum of the core of the masks' visual hull, object frame, metres.
 
     Args:
-        hull: of the masks.
         min_z_m: height of the container's lid, below which the box does not reach; None if unknown.
 
     Raises:
@@ -147,8 +145,6 @@ def scene_box(
     - with neither, the object box's reach. It holds all that differs from the background.
 
     Args:
-        object_box_m: minimum and maximum of the object's box.
-        marker_corners_m: corners of the markers by their id; may be empty.
         container: where its size is known and it stands on z = 0.
         container_diameter_m: of a container whose height over the disc is not known, where lengths are metres.
     """

@@ -54,11 +54,7 @@ def compare(
     """Metrics of a rendered frame on the object; ``NAME.png`` shows it beside the measured frame.
 
     Args:
-        folder: folder of the picture.
-        name: of the frame.
-        view: the rendering.
         item: the frame as `SpectralDataset` gives it.
-        rgb_bands: bands shown as red, green, blue.
 
     Raises:
         InputError: the picture cannot be written.
@@ -71,9 +67,7 @@ def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping
     """Write a table of the views as ``PATH.md`` and ``PATH.json``.
 
     Args:
-        path: path without a suffix.
         rows: name, fraction of valid pixels and, if the view was measured, metrics of each view.
-        legends: what the colours of each video mean.
 
     Raises:
         InputError: the files cannot be written.

@@ -68,8 +68,6 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
     """The session's camera while the object makes one even counter-clockwise turn before the fixed background.
 
     Args:
-        run: the trained run.
-        count: views in the turn.
         size: factor on the size of the camera's images.
     """
     cameras = cameras_at(run, np.arange(count) * 360.0 / count, size)
@@ -92,7 +90,7 @@ def views_of_path(path: Path) -> Views:
     Their background is the chamber's median spectrum, since none of them stands where the camera stood.
 
     Raises:
-        InputError: the file is missing or is no camera path.
+        InputError: the file is missing or is not a camera path.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; export a camera path from ns-viewer.")
@@ -105,7 +103,7 @@ def views_of_path(path: Path) -> Views:
         if not cameras.camera_to_worlds.isfinite().all():
             raise ValueError("a camera is at no finite place")
     except (AttributeError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: is no camera path ({error!r}); export one from ns-viewer.") from error
+        raise InputError(f"{path}: is not a camera path ({error!r}); export one from ns-viewer.") from error
     return Views("path", cameras, [f"path_{i:03d}" for i in range(len(cameras))])
 
 

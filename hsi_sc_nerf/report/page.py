@@ -115,7 +115,7 @@ def read_known(path: Path) -> dict[str, Any] | None:
     """Content of a JSON file; None if it does not exist.
 
     Raises:
-        InputError: it is no JSON object.
+        InputError: it is not a JSON object.
     """
     return read_json(path, _AGAIN) if path.is_file() else None
 
@@ -164,13 +164,13 @@ def embedded_file(path: Path, alt: str) -> Markup:
     """An ``img`` of a picture file, downscaled if it is large.
 
     Raises:
-        InputError: the file is no readable picture.
+        InputError: the file is not a readable picture.
     """
     try:
         with Image.open(path) as opened:
             image = opened.convert("RGB")
     except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: is no readable picture ({error}); delete it, or make it again.") from error
+        raise InputError(f"{path}: is not a readable picture ({error}); delete it, or make it again.") from error
     if image.width > WIDEST_PX:
         image = image.resize((WIDEST_PX, round(image.height * WIDEST_PX / image.width)), Image.Resampling.LANCZOS)
     return _img(image, alt, lossless=False, css_class="picture")

@@ -137,8 +137,6 @@ def build_renderer(
     """The renderer of the whole scene.
 
     Args:
-        scene: the scene.
-        scanned: its object, from `object_part`.
         extra_materials: materials of patterns on the chamber, which get columns of their own.
         spacing_m: approximate largest distance between vertices, metres, for light that is computed at vertices.
     """

@@ -60,11 +60,7 @@ def render(
     """An image of a camera; a pixel is the mean over ``supersampling``² evenly spaced rays (a box filter).
 
     Args:
-        renderer: the parts.
-        intrinsics: of the camera.
         camera_to_world: pose of the camera, OpenGL axes, metres.
-        supersampling: rays per pixel along each side.
-        lens: bends the rays of the pinhole camera.
         lighting: light on the parts of ``renderer``; even light by default.
     """
     size = intrinsics.h, intrinsics.w

@@ -24,7 +24,6 @@ def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:
     Args:
         profile: (radius, height) points from the lower to the upper pole; the first and last radius are 0, the others
             positive.
-        segments: number of vertices around the axis.
 
     Returns:
         A mesh whose first vertex is the lower pole and whose last vertex is the upper pole; vertex
@@ -76,7 +75,6 @@ def cylinder(diameter_m: float, height_m: float, segments: int = 128, spacing_m:
     Args:
         diameter_m: of the circle through its vertices, metres.
         height_m: metres.
-        segments: vertices around the axis.
         spacing_m: largest distance between rings of vertices, metres; None gives rings at the two rims only.
     """
     r = diameter_m / 2.0

@@ -86,7 +86,7 @@ def _read_mesh_file(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | No
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = np.concatenate([np.asarray(part.faces) + offset for part, offset in zip(parts, first, strict=False)])
     if not 0 <= triangles.min() <= triangles.max() < len(vertices):
-        raise InputError(f"{path}: its triangles name vertices that it has not; export it again.")
+        raise InputError(f"{path}: its triangles refer to vertices that do not exist; export it again.")
     colours = [of_part for part in parts if (of_part := _colours(part)) is not None]
     return vertices, triangles, np.concatenate(colours) if len(colours) == len(parts) else None
 

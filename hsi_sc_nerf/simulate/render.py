@@ -115,8 +115,6 @@ class Hits:
 
         Args:
             triangles: the renderer's triangles as indices of points.
-            columns: number of points.
-            factor: weight of each hit.
         """
         return scipy.sparse.csr_array(
             (

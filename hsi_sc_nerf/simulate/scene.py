@@ -200,9 +200,6 @@ def parse_scene(text: str, *, source: str, name: str, folder: Path = Path()) -> 
     """Parse the YAML text of a scene.
 
     Args:
-        text: YAML.
-        source: name of the text in error messages.
-        name: name of the scene if the text has none.
         folder: folder to which paths in the text are relative.
 
     Raises:
@@ -261,11 +258,6 @@ def override(
     """Replace values of a scene; ``None`` keeps a value.
 
     Args:
-        scene: the scene.
-        frames: number of frames in a full turn.
-        size_px: side of the images in pixels.
-        bands: number of spectral bands.
-        seed: seed of all random numbers.
         effects: effects as YAML texts: ``photon_noise`` or ``{read_noise: {electrons: 40}}``.
 
     Raises:
@@ -288,7 +280,6 @@ def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
 
     Args:
         values: names, or names with settings such as ``{"read_noise": {"electrons": 40}}``.
-        source: name of the file or option in error messages.
 
     Raises:
         InputError: an unknown or repeated effect; an unknown, missing, mistyped or out-of-range setting.

@@ -41,9 +41,7 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
     The session is written to a hidden sibling folder and moved into place at the end.
 
     Args:
-        scene: the scene.
         session_dir: folder to write; an earlier simulated session there is replaced.
-        progress: whether to show a progress bar.
 
     Returns:
         ``session_dir``.

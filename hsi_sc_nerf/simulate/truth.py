@@ -99,7 +99,7 @@ class Truth:
         path = pixels_path(self.session_dir, capture)
         image = _one_of(path, _read_arrays(path, (key,)), key)
         if image.shape[2:] != each or image.ndim < 2:
-            raise InputError(f"{path}: its {key} is no image of the session; simulate the session again.")
+            raise InputError(f"{path}: its {key} is not an image of the session; simulate the session again.")
         return image
 
 
@@ -223,7 +223,7 @@ def _read_arrays(path: Path, only: Collection[str] = ()) -> dict[str, np.ndarray
         for name, array in found.items():
             # Of a member that is no array, NumPy gives the bytes.
             if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-                raise ValueError(f"{name} is no array of numbers")
+                raise ValueError(f"{name} is not an array of numbers")
         return found
     except Exception as error:  # what readers of damaged archives raise has no common class
         raise InputError(f"{path}: cannot be read ({error}); simulate the session again.") from error

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
+from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.change_features import surface_gradients, surface_samples
 from hsi_sc_nerf.analysis.change_registration import find_attitude
@@ -10,7 +11,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
-from hsi_sc_nerf.simulate.true_surface import TrueSurface
 
 NM = np.linspace(400.0, 1000.0, 13)
 POINTS = 20_000
@@ -31,7 +31,7 @@ def first_day():
 def ball():
     mesh = sphere(0.07)
     skin = endmembers(("apple_skin",), NM)
-    return TrueSurface(("apple_skin",), mesh, np.ones((len(mesh.vertices), 1)), skin, NM)
+    return TrueObject(("apple_skin",), mesh, np.ones((len(mesh.vertices), 1)), skin, NM)
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ def outcome(change, centres_m, **other):
     return significance(change, centres_m, **(plain | {"session_sd": np.zeros(change.shape[1])} | other))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [1, 3])
 @pytest.mark.parametrize("smooth_over_m", [0.01, 0.02, 0.04])
 def test_smooth_errors_are_seldom_taken_for_a_change(smooth_over_m, dimensions):
@@ -57,6 +58,7 @@ def errors_of_a_capture(centres_m, seed, at_base=1.0):
     return smooth_noise(centres_m, 0.01, np.random.default_rng(seed))[:, None] * np.where(low, at_base, 1.0)[:, None]
 
 
+@pytest.mark.slow
 def test_errors_that_are_larger_at_the_base_are_no_change_where_a_second_capture_shows_them():
     centres_m, alone, told = ball_patches(), 0, 0
     spot = np.linalg.norm(centres_m - centres_m[300], axis=1) < 0.012

@@ -14,6 +14,7 @@ GREEN, BROWN, RED = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31), 0.5 + 
 ENDMEMBERS = np.stack([GREEN, BROWN, RED])
 
 
+@pytest.mark.slow
 def test_fractions_of_mixtures_are_found_at_any_brightness():
     rng = np.random.default_rng(0)
     fractions = rng.dirichlet([0.5, 0.5, 0.5], 200)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.library import SpectralLibrary, read_library
@@ -19,7 +20,6 @@ from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import cylinder
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights
 from hsi_sc_nerf.simulate.scene import Fruit
-from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 25)
 STAND_M = 0.07
@@ -39,7 +39,7 @@ def true_apple():
     shape = apple(fruit.height_m, rng)
     mesh = shape.mesh.moved(np.array([0.0, 0.0, STAND_M]))
     materials = FRUIT_MATERIALS["apple"]
-    return TrueSurface(materials, mesh, fruit_weights(shape, fruit, rng), endmembers(materials, NM), NM)
+    return TrueObject(materials, mesh, fruit_weights(shape, fruit, rng), endmembers(materials, NM), NM)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def small_cloud(path):
     """A green and brown cylinder as the command's input."""
     mesh: Mesh = cylinder(0.04, 0.05, segments=96, spacing_m=0.001).moved(np.array([0.0, 0.0, STAND_M]))
     weights = np.eye(2)[(mesh.vertices[:, 1] > 0.0).astype(int)]
-    true = TrueSurface(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
+    true = TrueObject(("skin", "bruise"), mesh, weights, endmembers(("apple_skin", "bruise"), NM), NM)
     cloud = true.cloud(6000, eyes_around(), 0.0)
     write_spectral_ply(path, replace(cloud, extra={}))
     return true

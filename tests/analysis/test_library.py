@@ -94,7 +94,7 @@ def test_a_spectrum_is_refused_only_where_what_it_lacks_is_needed(tmp_path):
         ("Micrometers", "Index", "lists no wavelengths"),
         ("data type = 4", "data type = 99", "a field of this header cannot be read"),
         ("data type = 4", "data type = 6", "complex numbers"),
-        ("ENVI Spectral Library", "ENVI Standard", "its file type is no spectral library"),
+        ("ENVI Spectral Library", "ENVI Standard", "its file type is not a spectral library"),
         ("{ green , brown }", "{ green }", "holds 2 spectra and names 1"),
         ("lines = 2", "lines = 3", r"library\.sli: is smaller than its header"),
         ("lines = 2", "lines = 5000000000", r"library\.sli: is smaller than its header"),
@@ -111,7 +111,7 @@ def test_envi_libraries_that_cannot_be_used_are_refused(tmp_path, old, new, says
     [
         ("a.sli", {}, "no such file"),
         ("a.sli", {"a.sli": ""}, r"a\.hdr is missing"),
-        ("a.sli", {"a.sli": "", "a.hdr": "no header"}, "no readable ENVI header"),
+        ("a.sli", {"a.sli": "", "a.hdr": "no header"}, "not a readable ENVI header"),
         ("a.hdr", {"a.hdr": "no header"}, r"a\.sli is missing"),
         ("a.csv", {"a.csv": ""}, r"a\.csv"),
         ("a.csv", {"a.csv": "wavelength_nm\n400\n"}, r"a\.csv"),

@@ -23,6 +23,7 @@ def test_a_ball_with_a_cap_and_a_rod_has_body_stem_and_calyx(cap_at):
     assert (np.sum(list(found.values()), axis=0) == 1).all()
 
 
+@pytest.mark.slow
 def test_a_stem_in_a_hollow_that_no_camera_sees_is_found_across_the_gap():
     points_m, spectra, true = fruit(cap=SKIN)
     hollow = ~true["stem"] & (points_m[:, 2] > 0.0) & (np.hypot(points_m[:, 0], points_m[:, 1]) < 0.022)
@@ -31,6 +32,7 @@ def test_a_stem_in_a_hollow_that_no_camera_sees_is_found_across_the_gap():
     assert overlap(found["stem"], true["stem"][~hollow]) > 0.93
 
 
+@pytest.mark.slow
 def test_neither_a_spot_beside_a_stem_nor_a_long_stripe_from_a_calyx_belongs_to_it():
     points_m, spectra, true = fruit()
     spot = (np.linalg.norm(points_m - [0.011, 0.0, 0.0279], axis=1) < 0.004) & ~true["stem"]
@@ -42,6 +44,7 @@ def test_neither_a_spot_beside_a_stem_nor_a_long_stripe_from_a_calyx_belongs_to_
     assert overlap(found["calyx"], true["calyx"]) > 0.85
 
 
+@pytest.mark.slow
 def test_a_stem_of_the_colour_of_the_body_is_told_by_its_shape():
     points_m, spectra, true = fruit(stem=SKIN, cap=SKIN)
     found = propose_organs(points_m, spectra)
@@ -49,6 +52,7 @@ def test_a_stem_of_the_colour_of_the_body_is_told_by_its_shape():
     assert overlap(found["stem"], true["stem"]) > 0.85
 
 
+@pytest.mark.slow
 def test_the_answer_does_not_depend_on_size_turn_or_light():
     points_m, spectra, _ = fruit()
     found = propose_organs(points_m, spectra)
@@ -58,6 +62,7 @@ def test_the_answer_does_not_depend_on_size_turn_or_light():
     assert all(overlap(found[name], again[name]) > 0.99 for name in found)
 
 
+@pytest.mark.slow
 def test_a_fruit_that_hangs_upside_down_has_the_same_organs():
     points_m, spectra, true = fruit()
     found = propose_organs(points_m * [1.0, -1.0, -1.0], spectra)
@@ -65,6 +70,7 @@ def test_a_fruit_that_hangs_upside_down_has_the_same_organs():
     assert all(overlap(found[name], true[name]) > 0.93 for name in true)
 
 
+@pytest.mark.slow
 def test_an_ear_has_kernels_and_a_husk():
     rng = np.random.default_rng(0)
     points_m = rod(0.16, 0.02, 20_000, rng)
@@ -75,6 +81,7 @@ def test_an_ear_has_kernels_and_a_husk():
     assert overlap(found["husk"], husk) > 0.95
 
 
+@pytest.mark.slow
 def test_a_large_part_has_no_name_of_its_own():
     rng = np.random.default_rng(0)
     points_m = ball(10_000, rng)
@@ -98,6 +105,7 @@ def leaf(count, rng):
     return np.stack([RADIUS_M + 0.012 + radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1)
 
 
+@pytest.mark.slow
 def test_a_leaf_a_twig_and_a_spot_at_the_side_are_told_by_their_spectra_and_named_by_their_shape():
     rng = np.random.default_rng(3)
     twig = rod(0.02, 0.002, 200, rng)[:, [2, 1, 0]] + np.array([RADIUS_M - 0.0005, 0.0, 0.0])
@@ -114,6 +122,7 @@ def test_a_leaf_a_twig_and_a_spot_at_the_side_are_told_by_their_spectra_and_name
     assert overlap(found["part 1"], spot) > 0.75  # of 142 points, many are beside other ones
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("falls", [True, False])
 def test_a_part_at_the_lower_edge_is_an_organ_if_it_does_not_fade_towards_its_own_edge(falls):
     """Mixed pixels hold less of what the object stands on the higher they lie."""
@@ -128,6 +137,7 @@ def test_a_part_at_the_lower_edge_is_an_organ_if_it_does_not_fade_towards_its_ow
         assert overlap(next(where for name, where in found.items() if name != "body"), height < 1.0) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["ball", "rod"])
 @pytest.mark.parametrize("coloured", ["evenly", "without noise", "fading", "one side", "rim", "in shadow"])
 def test_no_organ_is_invented(shape, coloured):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.analysis import report
 from hsi_sc_nerf.analysis.classes import (
@@ -36,7 +37,6 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
-from hsi_sc_nerf.simulate.true_surface import TrueSurface, relative_rms
 
 NM = np.linspace(400.0, 1000.0, 31)
 GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
@@ -287,7 +287,7 @@ def test_regions_off_the_surface_or_of_one_name_are_refused():
 def test_ideal_cloud_holds_what_cameras_see():
     surface = two_halves()
     weights = (surface.mesh.vertices[:, 1:2] > 0.0) * [1.0, -1.0] + [0.0, 1.0]
-    true = TrueSurface(("green", "brown"), surface.mesh, weights, LIBRARY.spectra, NM)
+    true = TrueObject(("green", "brown"), surface.mesh, weights, LIBRARY.spectra, NM)
     cloud = true.cloud(5000, np.array([[0.5, 0.0, 0.2]]), noise_m=0.0)
     # Of the base, nothing but its rim.
     assert ((cloud.points[:, 2] > 1e-4) | (np.hypot(*cloud.points[:, :2].T) > 0.0195)).all()

@@ -207,6 +207,7 @@ def test_a_timed_run_ends_by_its_clock(tiny_dataset, tmp_path, in_this_process, 
     assert all(read >= due for read, due in zip(seconds, (0.75, 1.5), strict=True))
 
 
+@pytest.mark.slow
 def test_finished_runs_are_not_repeated(tiny_dataset, tmp_path, made_up):
     asked = command(tiny_dataset, tmp_path)
     asked.main()

@@ -124,12 +124,6 @@ def test_saturation_is_where_the_digitiser_stops(bit_depth, noise):
         assert find_defects(shifted[0], shifted[1:]).saturation_counts == 1023 << 6
 
 
-def test_hot_elements_alone_do_not_saturate_anything():
-    simulation = session(size_px=40, bands=24, bad_pixels={"hot_fraction": 0.02}, **NOISE)
-    assert (simulation.white().counts == 4095).any()
-    assert find_defects(*readings(simulation)).saturation_counts is None
-
-
 @pytest.mark.slow
 def test_readings_that_pile_up_at_an_unusual_count():
     white, frames = readings(session(size_px=40, bands=40, saturation={}, **NOISE))

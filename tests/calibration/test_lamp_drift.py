@@ -89,15 +89,6 @@ def test_session_without_drift_stays_as_it_is(effects):
 
 
 @pytest.mark.slow
-def test_inter_reflection_makes_no_drift():
-    drift, _, _ = simulated(
-        {"inter_reflection": {"directions": 24}}, {"chamber_shading": {"directions": 24}}, bands=20, frames=4
-    )
-    assert np.abs(drift.factor - 1.0).max() < 2e-4
-    assert not drift.significant
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("effects", "name"), [((), "pear"), ((*NOISE, DRIFT), "maize"), ((*NOISE, "lamp"), "apple")])
 def test_not_measurable_where_the_object_fills_the_frame(effects, name):
     drift, _, _ = simulated(*effects, name=name, bands=20, frames=5, field_of_view_deg=4.0, aim_height_m=0.11)

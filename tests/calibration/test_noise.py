@@ -1,6 +1,5 @@
 """The noise of a reading and of a reflectance, against exposures whose noise is known."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,7 @@ from hsi_sc_nerf.calibration.noise import (
     reflectance_uncertainty,
 )
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.simulate import frames
 from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, ReadoutContext
-from hsi_sc_nerf.simulate.frames import Simulation
-from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
 LINES, SAMPLES, BANDS = 72, 60, 40
 COUNTS_PER_ELECTRON, READ_NOISE = 0.15, 4.0
@@ -36,23 +32,6 @@ def exposures(light=1.0, **noise):
     rng = np.random.default_rng(5)
     white = digitised(np.broadcast_to(light * SIGNAL, (LINES, SAMPLES, BANDS)), rng, **noise)
     return white, digitised(np.zeros((64, SAMPLES, BANDS)), rng, **noise)
-
-
-@pytest.mark.slow
-def test_simulated_session_within_three_percent():
-    scene = override(load_scene("sphere"), size_px=128, bands=204, frames=1)
-    effects = read_effects(["illumination_falloff", "photon_noise", "dark_pattern", "read_noise"], "test")
-    simulation = Simulation(dataclasses.replace(scene, effects=effects))
-    white = simulation.white()
-    edge = round(frames.TARP_MARGIN * 128)
-    region = np.pad(np.ones((128 - 2 * edge, 128 - 2 * edge), bool), edge)
-    noise = measure_noise(white.counts, region, white.dark, saturation_counts=4095)
-    counts_per_electron = 4095 / scene.sensor.full_well_electrons
-    assert noise.photon_noise_measured
-    assert noise.read_noise_measured
-    assert noise.counts_per_electron == pytest.approx(counts_per_electron, rel=0.03)
-    expected = np.sqrt((40.0 * counts_per_electron) ** 2 + QUANTISATION_VARIANCE)
-    np.testing.assert_allclose(noise.read_noise, expected, rtol=0.03)
 
 
 def weave():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_score import CalibrationScore, score_calibration
 from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
 
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
@@ -13,7 +14,6 @@ from hsi_sc_nerf.capture.session import Capture, Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.processing.frames import FramePaths, pack_frames
-from hsi_sc_nerf.simulate.processing_score import CalibrationScore, score_calibration
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 from hsi_sc_nerf.simulate.truth import Truth, load_truth

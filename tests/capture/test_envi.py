@@ -117,12 +117,12 @@ def test_data_of_another_length(header, change, word):
         ("wavelength = { 450.25 ,", "wavelength = {", "wavelength lists 3 numbers for 4 bands"),
         ("450.25", "blue", "what is not a number"),
         ("450.25", "-450.25", "negative"),
-        ("interleave = bil", "interleave = bix", "none of bil, bip, bsq"),
+        ("interleave = bil", "interleave = bix", "not bil, bip or bsq"),
         ("lines = 3\n", "", "does not give lines"),
         ("bands = 4", "bands = 3", "lists 4 numbers for 3 bands"),
         ("lines = 3", "lines = three", "cannot be read"),
-        ("lines = 3", "lines = 0", "no spectral image"),
-        ("header offset = 0", "header offset = -8", "no spectral image"),
+        ("lines = 3", "lines = 0", "not a spectral image"),
+        ("header offset = 0", "header offset = -8", "not a spectral image"),
         ("header offset = 0", "header offset = 0\nmajor frame offsets = {0, 4}", "major frame offsets"),
         ("header offset = 0", "header offset = 0\nminor frame offsets = 2", "minor frame offsets"),
         ("header offset = 0", "header offset = 0\nfile compression = 1", "file compression"),
@@ -137,16 +137,16 @@ def test_data_of_another_length(header, change, word):
         ("header offset = 0", "header offset = 0\nbbl = {1, 1, 0}", "bbl lists 3 numbers for 4 bands"),
         ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, 2, 2}", "fwhm lists 5 numbers for 4 bands"),
         ("header offset = 0", "header offset = 0\nfwhm = {1, 1, 2, nan}", "fwhm .* not finite"),
-        ("}", "", "no readable ENVI header"),
+        ("}", "", "not a readable ENVI header"),
         ("byte order = 0", "byte order = 2", "byte order 2"),
         ("file type = ENVI Standard", "file type = ENVI Spectral Library", "spectral library"),
         ("units = nm", "units = Wavenumber", "wavenumber, not as wavelengths"),
-        ("units = nm", "units = Micrometers", "none of an imaging spectrometer"),
-        ("450.25", "0.45", "none of an imaging spectrometer"),
+        ("units = nm", "units = Micrometers", "not those of an imaging spectrometer"),
+        ("450.25", "0.45", "not those of an imaging spectrometer"),
         ("data type = 12", "data type = 77", "cannot be read"),
         ("data type = 12", "data type = 6", "complex numbers"),
         ("data type = 12\n", "data type =\n", "does not give data type"),
-        ("ENVI\n", "ENVY\n", "no readable ENVI header"),
+        ("ENVI\n", "ENVY\n", "not a readable ENVI header"),
     ],
 )
 def test_headers_that_cannot_be_used(header, old, new, message):
@@ -158,7 +158,7 @@ def test_headers_that_cannot_be_used(header, old, new, message):
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"\x00\x01\xff" * 50, b"ENVI\x00\x00", bytes(range(256)) * 9])
 def test_a_header_that_is_none(header, content):
     header.write_bytes(content)
-    with pytest.raises(InputError, match=r"cube\.hdr: is no readable ENVI header"):
+    with pytest.raises(InputError, match=r"cube\.hdr: is not a readable ENVI header"):
         open_cube(header)
 
 

@@ -170,9 +170,9 @@ def test_spellings_of_the_integration_time(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no readable XML"),
-        ('<p><key field="integration_time">', "no readable XML"),
-        ('<?xml version="1.0" encoding="klingon"?><p/>', "no readable XML"),
+        ("", "not readable XML"),
+        ('<p><key field="integration_time">', "not readable XML"),
+        ('<?xml version="1.0" encoding="klingon"?><p/>', "not readable XML"),
         ('<p><key field="integration_time">long</key></p>', "'long' is not a positive number of ms"),
         ('<p><key field="integration_time">0</key></p>', "'0' is not a positive"),
         ('<p><key field="integration_time">1.2.3</key></p>', "'1.2.3' is not a positive"),
@@ -187,7 +187,7 @@ def test_broken_metadata(tmp_path, text, message):
 def test_broken_metadata_matter_only_where_something_in_them_is_needed(tmp_path):
     assert len(open_session(two(tmp_path, white=False, white_dark=False, xml="<broken")).frames) == 2
     write_capture(tmp_path, "446", xml="<broken")
-    with pytest.raises(InputError, match=r"446 \(is no readable XML"):
+    with pytest.raises(InputError, match=r"446 \(is not readable XML"):
         open_session(tmp_path)
 
 

@@ -204,9 +204,9 @@ def test_wavelengths_of_a_list_beside_session_json(tmp_path):
     ("content", "message"),
     [
         ("wavelength_nm\n400\n500\n", "2 band centres do not fit"),
-        ("wavelength_nm\nred\n", r"bands\.csv: is no list of band centres"),
-        ("wavelength_nm\n", r"bands\.csv: its band centres are no wavelengths in nm"),
-        ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are no wavelengths in nm"),
+        ("wavelength_nm\nred\n", r"bands\.csv: is not a list of band centres"),
+        ("wavelength_nm\n", r"bands\.csv: its band centres are not wavelengths in nm"),
+        ("wavelength_nm\n0.4\n0.5\n", r"bands\.csv: its band centres are not wavelengths in nm"),
         (None, r"\.hdr: gives no wavelengths; .*'band_centres' in session\.json"),
     ],
 )
@@ -230,8 +230,8 @@ def test_something_else_in_the_place_of_session_info_is_not_taken_for_none(tmp_p
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "no JSON object [^][]*nominal_step_deg, direction"),
-        ("[]", "no JSON object"),
+        ("{", "not a JSON object [^][]*nominal_step_deg, direction"),
+        ("[]", "not a JSON object"),
         ('{"marker_size": 1}', "marker_size is not a known key; .*marker_side_m"),
         ('{"marker_side_m": "2 cm"}', "marker_side_m is '2 cm'"),
         ('{"marker_side_m": 0}', "positive number"),
@@ -251,12 +251,12 @@ def test_something_else_in_the_place_of_session_info_is_not_taken_for_none(tmp_p
         ('{"panel_reflectance": 0.98}', "panel_reflectance is 0.98, but must be a text"),
         ('{"container_height_m": 0.07}', "one dimension of the container"),
         (f'{{"marker_side_m": 1{"0" * 400}}}', "must be a number"),
-        (f'{{"marker_side_m": {"9" * 5000}}}', "no JSON object"),
+        (f'{{"marker_side_m": {"9" * 5000}}}', "not a JSON object"),
         (f'{{"frame_angles_deg": [0, 1{"0" * 400}]}}', r"frame_angles_deg\[1\] is .* must be a number"),
         (f'{{"band_centres": "{"a" * 5000}"}}', "the name of a CSV file beside"),
         (f'{{"object": {"[" * 900}{"]" * 900}}}', "must be a text"),
-        ('{"object": "\\ud800"}', "no JSON object"),
-        ("[" * 100_000, "no JSON object"),
+        ('{"object": "\\ud800"}', "not a JSON object"),
+        ("[" * 100_000, "not a JSON object"),
     ],
 )
 def test_bad_session_info(tmp_path, text, message):

@@ -135,6 +135,7 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
     assert change._file_of(config) == change._file_of(config.parent) == config.parent / "point_cloud.ply"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["brightness", "Surface", "spectrum", "r670", "mine"])
 def test_an_index_with_the_name_of_another_quantity_is_one_sentence(clouds, tmp_path, name):
     """One of the two would silently take the place of the other."""

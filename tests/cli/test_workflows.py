@@ -242,7 +242,7 @@ def test_the_demo_leaves_somebody_elses_runs_alone(tmp_path):
 
 def test_a_file_is_no_folder_for_the_demo(tmp_path):
     (tmp_path / "out").write_text("")
-    with pytest.raises(InputError, match="out: cannot be made a folder"):
+    with pytest.raises(InputError, match="out: cannot be created as a folder"):
         DemoCommand(output_dir=tmp_path / "out").main()
 
 

@@ -15,8 +15,8 @@ from hsi_sc_nerf.data.background_image import (
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack, unpack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import Container, PackedDataset, open_packed
+from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, pack, write_packed_cube
+from hsi_sc_nerf.packed.dataset import Container, PackedDataset
 from hsi_sc_nerf.processing.chamber import turntable_cylinders, turntable_silhouette
 
 LENS = PinholeIntrinsics(48, 40, 70.0, 70.0, 24.0, 20.0)
@@ -199,13 +199,6 @@ def test_median_over_frames_agrees_with_numpy():
     assert np.isnan(median).any()
 
 
-def test_variance_of_the_median_is_what_noise_gives_it():
-    rng = np.random.default_rng(2)
-    counts = pack(0.5 + 0.02 * rng.standard_normal((12, 20_000, 1)))
-    median, variance = median_over_frames(counts, np.ones((12, 20_000), bool), min_frames=1)
-    assert variance.mean() == pytest.approx(median.var(), rel=0.15)
-
-
 def test_wiener_filter_averages_noise_and_keeps_edges():
     rng = np.random.default_rng(3)
     clean = np.full((60, 60, 2), 0.4)
@@ -246,19 +239,3 @@ def test_inpainting_keeps_a_ramp_and_every_inpainted_cell_is_its_neighbours_mean
     for i, j in np.argwhere(hidden):
         near = [(i + a, j + b) for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0)) if 0 <= i + a < 12 and 0 <= j + b < 10]
         assert filled[i, j] == pytest.approx(np.mean([filled[cell] for cell in near]), abs=1e-5)
-
-
-def test_inpainting_without_anything_measured():
-    filled = inpaint(np.full((4, 5, 2), np.nan, np.float32), np.array([0.1, 0.9]))
-    np.testing.assert_allclose(filled, np.broadcast_to([0.1, 0.9], (4, 5, 2)))
-
-
-@pytest.mark.slow
-def test_held_out_frames_see_the_same_chamber(tiny_dataset):
-    dataset = open_packed(tiny_dataset[0])
-    held_out = dataset.frames[4]
-    found, _ = estimate_static_background(dataset, [frame for frame in dataset.frames if frame is not held_out])
-    reflectance, _ = unpack(np.array(held_out.cube()))
-    static = ~dilate(held_out.mask() | turntable_silhouette(dataset, held_out.camera_to_world), 3)
-    assert 0.3 < static.mean() < 0.9
-    assert np.sqrt(np.mean((found - reflectance)[static] ** 2)) < 1e-3

@@ -13,7 +13,6 @@ from hsi_sc_nerf.evaluation.spatial import (
     best_threshold_m,
     distance_statistics,
     distance_to_surface,
-    f_score,
     precision_recall_f_score,
     sample_surface,
     score_at,
@@ -108,19 +107,6 @@ def distances(cloud: Surface, reference: Surface) -> tuple[np.ndarray, np.ndarra
     return reference.distances_m(cloud.points_m), cloud.distances_m(reference.points_m)
 
 
-def test_curves_are_the_papers_formulas_at_each_threshold() -> None:
-    rng = np.random.default_rng(2)
-    cloud, reference = Surface(rng.random((300, 3))), Surface(rng.random((200, 3)))
-    thresholds = np.array([0.0, 0.02, 0.1, 0.3])
-    curves = threshold_curves(*distances(cloud, reference), thresholds)
-    for i, threshold in enumerate(thresholds):
-        score = precision_recall_f_score(cloud.points_m, reference.points_m, threshold)
-        assert (curves.precision[i], curves.recall[i]) == pytest.approx((score.precision, score.recall))
-        assert curves.f_score[i] == pytest.approx(score.f_score)
-        at = score_at(*distances(cloud, reference), threshold)
-        assert (at.precision, at.recall, at.f_score) == pytest.approx((score.precision, score.recall, score.f_score))
-
-
 @pytest.mark.parametrize("threshold_m", [0.0005, 0.001, 0.002])
 def test_noise_along_the_normal_is_within_a_threshold_as_the_normal_distribution_says(threshold_m: float) -> None:
     sigma_m = 0.001
@@ -134,13 +120,6 @@ def test_noise_along_the_normal_is_within_a_threshold_as_the_normal_distribution
     assert statistics["mean_m"] == pytest.approx(sigma_m * np.sqrt(2 / np.pi), rel=0.01)
     assert statistics["median_m"] == pytest.approx(norm.ppf(0.75) * sigma_m, rel=0.02)
     assert statistics["percentile_95_m"] == pytest.approx(norm.ppf(0.975) * sigma_m, rel=0.02)
-
-
-def test_points_overstate_the_distance_to_a_surface() -> None:
-    above = np.array([[0.05, 0.05, 0.003]])
-    sampled = np.array([[0.05, 0.054, 0.0]])
-    assert Surface(sampled, SQUARE, TRIANGLES).distances_m(above) == pytest.approx(0.003)
-    assert Surface(sampled).distances_m(above) == pytest.approx(0.005)
 
 
 def exponential_knee(scale: float) -> float:
@@ -171,7 +150,3 @@ def test_the_threshold_that_reaches_a_score_does_and_the_next_smaller_one_does_n
         assert score_at(forth, back, threshold).f_score >= percent - 1e-9
         assert score_at(forth, back, threshold * (1 - 1e-9)).f_score < percent
     assert threshold_for_m(forth, back, 100) == max(forth.max(), back.max())
-
-
-def test_f_score_of_nothing_is_nothing() -> None:
-    np.testing.assert_array_equal(f_score([0, 0, 50, 100], [0, 100, 100, 100]), [0, 0, 100 * 2 / 3, 100])

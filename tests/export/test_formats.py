@@ -101,7 +101,7 @@ def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     (tmp_path / "cloud.zarr").mkdir()
     (tmp_path / "cloud.zarr" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"cloud\.zarr: is no Zarr folder"):
+    with pytest.raises(InputError, match=r"cloud\.zarr: is not a Zarr folder"):
         write_cloud(tmp_path / "cloud", stream(random_cloud()), "zarr")
     assert (tmp_path / "cloud.zarr" / "notes.txt").read_text() == "mine"
 

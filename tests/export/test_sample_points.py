@@ -217,8 +217,8 @@ def test_bad_points_are_refused_in_a_sentence(tmp_path, text, told):
     [
         (("list uchar int corners", "3 0 1 2"), "its faces have no vertex_indices"),
         (("int vertex_index", "2"), "its faces have no vertex_indices"),
-        (("list uchar int vertex_indices", "3 0 1 3"), "its faces name vertices that it has not"),
-        (("list uchar int vertex_indices", "3 0 1 -1"), "its faces name vertices that it has not"),
+        (("list uchar int vertex_indices", "3 0 1 3"), "its faces refer to vertices that do not exist"),
+        (("list uchar int vertex_indices", "3 0 1 -1"), "its faces refer to vertices that do not exist"),
     ],
 )
 def test_odd_faces_are_refused_in_a_sentence(tmp_path, faces, told):

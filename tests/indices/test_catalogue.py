@@ -5,7 +5,7 @@ import pytest
 import spyndex
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.indices.catalogue import CATALOGUE, USUAL, available_indices, catalogue_table, find_indices
+from hsi_sc_nerf.indices.catalogue import CATALOGUE, USUAL, available_indices, find_indices
 from hsi_sc_nerf.indices.formula import index_values
 
 NM = np.linspace(397.32, 1003.58, 204)
@@ -95,7 +95,3 @@ def test_without_a_name_the_usual_ones_that_the_bands_give():
 def test_what_cannot_be_computed_is_refused_in_a_sentence(words, sentence):
     with pytest.raises(InputError, match=re.escape(sentence)):
         find_indices(words, NM)
-
-
-def test_the_reference_page_lists_all():
-    assert all(f"| {name} | `{one.expression}` |" in catalogue_table() for name, one in CATALOGUE.items())

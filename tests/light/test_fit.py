@@ -58,6 +58,7 @@ def test_a_lamp_has_its_own_colour(ball):
     assert np.quantile(np.abs(ratio[:, 0] / ratio[:, 1] - 1.0), 0.9) < 0.03
 
 
+@pytest.mark.slow
 def test_a_near_lamp_is_found_to_be_near():
     places_m = np.random.default_rng(3).uniform(-0.06, 0.06, (300, 3))
     parts = turning_ball(places_m=places_m)

@@ -85,6 +85,7 @@ def upper_cloud(found, lit):
     return cloud.select((cosines.max(axis=1) > 0.5) & (normals[:, 2] > 0.2))
 
 
+@pytest.mark.slow
 def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert lit.evidence.shaded
     cloud = upper_cloud(lit, lit=True)
@@ -101,6 +102,7 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file_format", ["ply", "netcdf"])
 def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, file_format):
     cloud = upper_cloud(lit, lit=True)
@@ -123,6 +125,7 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
     np.testing.assert_allclose(columns["irradiance_std"], std, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
     same = with_material(upper_cloud(lit, lit=True), lit, factory.WAVELENGTHS_NM, corrected=False)
     assert np.isnan(same.extra["irradiance_std"]).all()
@@ -139,6 +142,7 @@ def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
     assert any(line.startswith("Warning") for line in sentences(told)) == warned
 
 
+@pytest.mark.slow
 def test_even_light_is_left_alone(even):
     assert not even.evidence.shaded
     cloud = upper_cloud(even, lit=False)

@@ -72,6 +72,7 @@ def test_the_published_preset_keeps_what_it_has():
     assert model.camera_optimizer.mode == "free-discarded"
 
 
+@pytest.mark.slow
 def test_what_is_off_is_not_built(tiny_dataset, tmp_path):
     _, bare = made(tiny_dataset, tmp_path / "none", "none")
     _, full = made(tiny_dataset, tmp_path / "all", ",".join(MODEL_EFFECTS))
@@ -84,6 +85,7 @@ def test_what_is_off_is_not_built(tiny_dataset, tmp_path):
     assert "camera_opt" not in bare.get_param_groups()
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_effects_when_the_dataset_changes(tiny_dataset, tmp_path):
     data = copied(tiny_dataset, tmp_path / "data", "view_dependence")
     first, model = made(data, tmp_path / "run")

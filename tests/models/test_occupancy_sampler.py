@@ -64,6 +64,7 @@ def test_every_ray_is_sampled_where_that_is_wanted():
     assert samples.deltas.sum(dim=1).flatten().tolist() == pytest.approx([0.0, 1.2 * 8 / 9], abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_field_begins_solid_inside_the_hull():
     torch.manual_seed(0)
     grid = ball_grid()

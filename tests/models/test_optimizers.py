@@ -55,6 +55,7 @@ def test_a_step_of_muon_has_the_gradients_directions_and_no_sizes(shape):
     assert (in_its_directions - torch.diag(sizes)).abs().max() < 0.1
 
 
+@pytest.mark.slow
 def test_muon_moves_the_networks_weights_alone(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path)
     groups = made.pipeline.get_param_groups()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from small_trainer import shrink
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.files import write_png
@@ -32,9 +33,7 @@ def pipeline_config(data):
     config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
     config.datamanager.data = data
     config.datamanager.train_num_rays_per_batch = 256
-    config.model.match_resolution = False
-    config.model.num_levels, config.model.log2_hashmap_size, config.model.max_res = 4, 10, 32
-    config.model.num_proposal_samples_per_ray, config.model.num_nerf_samples_per_ray = (16, 8), 8
+    shrink(config.model)
     return config
 
 

@@ -184,15 +184,15 @@ def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, 
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
     damaged = tmp_path / "step-000000003.ckpt"
     damaged.write_bytes(max(whole.checkpoint_dir.glob("*.ckpt")).read_bytes()[:1000])
-    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is no readable checkpoint"):
+    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is not a readable checkpoint"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
     content = bytearray(max(whole.checkpoint_dir.glob("*.ckpt")).read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is no readable checkpoint"):
+    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is not a readable checkpoint"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
     torch.save({"step": 3}, damaged)
-    with pytest.raises(SystemExit, match="is no checkpoint that hsi-sc-nerf can go on from"):
+    with pytest.raises(SystemExit, match="is not a checkpoint that hsi-sc-nerf can continue from"):
         longer(tiny_dataset, tmp_path, load_dir=tmp_path)
     other = checkpoint(whole.checkpoint_dir)
     other["pipeline"]["_model.background.correction"] = torch.zeros(2, 2, 12)

@@ -218,6 +218,7 @@ def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_data
         trainer(tiny_dataset, tmp_path / "other", load_dir=made.checkpoint_dir)
 
 
+@pytest.mark.slow
 def test_single_steps_run_without_the_loop_of_nerfstudio(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path)
     made._show_progress = lambda step, psnr_db: None

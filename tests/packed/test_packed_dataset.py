@@ -103,7 +103,7 @@ def test_a_frames_files(dataset):
     write_png(frame.image_path, image)
     np.testing.assert_array_equal(frame.pseudo_rgb(), image)
     frame.flags_path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"flags.a\.png: is no readable picture"):
+    with pytest.raises(InputError, match=r"flags.a\.png: is not a readable picture"):
         frame.flags()
 
 
@@ -122,7 +122,7 @@ def test_another_cube_is_not_taken_for_a_packed_one(dataset, interleave, dtype):
     frame = dataset.frames[0]
     cube = np.ones((4, 5, 3), dtype)
     write_cube(frame.cube_path, cube, wavelengths_nm=WAVELENGTHS_NM, interleave=interleave, data_suffix=".bip")
-    with pytest.raises(InputError, match=r"a\.hdr: is no BIP cube of 16-bit numbers"):
+    with pytest.raises(InputError, match=r"a\.hdr: is not a BIP cube of 16-bit numbers"):
         frame.cube()
 
 

@@ -120,7 +120,7 @@ def test_a_camera_path_is_nerfstudios(tmp_path):
     np.testing.assert_allclose(camera.camera_to_worlds[0], pose[:3], atol=1e-6)
     assert (camera.height.item(), camera.width.item()) == (20, 30)
     for bad in (camera_path(tmp_path, pose, camera_path=[{}]), camera_path(tmp_path, pose, camera_path=[])):
-        with pytest.raises(InputError, match="is no camera path"):
+        with pytest.raises(InputError, match="is not a camera path"):
             views_of_path(bad)
     with pytest.raises(InputError, match="there is no such file"):
         views_of_path(tmp_path / "none.json")

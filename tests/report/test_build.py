@@ -190,7 +190,7 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         traits_section({"settings": {}}, run / "traits.json")
     (tmp_path / "broken.json").write_text("{")
     for sources, sentence in (
-        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is no JSON object"),
+        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is not a JSON object"),
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
         (ReportSources(indices=("own = R1240",)), "1240 nm"),

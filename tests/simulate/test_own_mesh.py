@@ -1,7 +1,6 @@
 """A user's own mesh: each format and way of laying materials on gives what was put in; bad files get one sentence."""
 
 import numpy as np
-import pepper_mesh
 import pytest
 import trimesh
 from plyfile import PlyData, PlyElement
@@ -10,7 +9,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate import own_mesh
 from hsi_sc_nerf.simulate.mesh import cylinder, snapped, subdivided, welded
-from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene
+from hsi_sc_nerf.simulate.scene import OwnMesh
 
 RADIUS_M = 0.03
 TWO, THREE = ("a", "b"), ("a", "b", "c")
@@ -149,25 +148,6 @@ def test_welding_averages_columns_and_drops_empty_triangles():
 def test_snapping_moves_near_vertices_to_one_place():
     vertices = np.array([[0.1, 0.2, 0.3], [0.1 + 1e-9, 0.2, 0.3], [0.5, 0.2, 0.3]])
     np.testing.assert_array_equal(snapped(vertices, 1e-6), vertices[[0, 0, 2]])
-
-
-def test_the_shipped_pepper_is_what_its_script_makes(tmp_path):
-    pepper_mesh.write(tmp_path / "pepper.ply")
-    thing = load_scene("pepper").object
-    assert isinstance(thing, OwnMesh)
-    assert thing.mesh_file.stat().st_size < 300_000
-    assert thing.materials == pepper_mesh.MATERIALS
-    made, shipped = (PlyData.read(path) for path in (tmp_path / "pepper.ply", thing.mesh_file))
-    for name in ("x", "y", "z"):
-        np.testing.assert_allclose(shipped["vertex"][name], made["vertex"][name], atol=1e-7)
-    for name in pepper_mesh.MATERIALS:
-        np.testing.assert_allclose(
-            shipped["vertex"][f"weight_{name}"] - 0.0, made["vertex"][f"weight_{name}"], atol=1
-        )
-    mesh, weights = own_mesh.load(thing)
-    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(0.105)
-    assert 250e-6 < mesh.volume_m3() < 450e-6
-    assert (weights.mean(axis=0) > 0.05).all()
 
 
 def refused(tmp_path, sentence, file="ball.ply", materials=TWO, **keys):
