@@ -100,7 +100,7 @@ class OrganProposals:
         trained: dict[tuple[str, str], list[Path]] = {}
         for folder in self.trained:
             truth = load_truth(folder / "session")
-            cloud = f"trained on {len(truth.frames)} views of {truth.intrinsics.w} px"
+            cloud = f"trained on {len(truth.captures)} views of {truth.intrinsics.w} px"
             trained.setdefault((truth.object, cloud), []).append(folder)
         for (name, cloud), folders in track(trained.items(), "Proposing on trained clouds"):
             self._write(name, cloud, [_trained(folder) for folder in folders], " ".join(one.name for one in folders))
