@@ -58,5 +58,5 @@ def test_classes_have_colours_and_areas_on_the_object_and_in_regions(browser, tm
         page.select_option("select[name=shown]", "classes 1")
         np.testing.assert_allclose(colour_at(page, 0.5, 0.25)[:3], [128, 128, 128], atol=2)
         assert re.search(r"outside 0\.00 cm².*outside of what the classifier knows [1-9]", page.inner_text(".legend"))
-        rows = [row.split("\t") for row in page.locator("table tbody tr").all_inner_texts()]
+        rows = [row.split("\n") for row in page.locator("table tbody tr").all_inner_texts()]
         assert [row[:2] for row in rows[3:5]] == [["dark half", "south"], ["dark half", "outside"]]
