@@ -1,11 +1,13 @@
 """How well `hsi-sc-nerf traits --propose-regions` finds the organs of simulated objects, as a table.
 
     uv run python benchmarks/organ_proposals.py
-    uv run python benchmarks/organ_proposals.py --trained OUT  # and of an object that `hsi-sc-nerf demo` trained
+    uv run python benchmarks/organ_proposals.py --objects --trained RUNS/apple-12 RUNS/apple-13  # of trained clouds
     uv run python benchmarks/organ_proposals.py --picture docs/images/organs.png  # that alone
 
 The clouds are those that runs would give: the true surface as cameras see it, with the errors of a run
-(`another_day.CloudErrors`). A point is an organ's if its material is more than half of it.
+(`another_day.CloudErrors`). Trained clouds are those of `benchmarks/trait_uncertainty.py RUNS`, of
+`benchmarks/change_of_runs.py RUNS`, or of any folder with a simulated ``session`` and the cloud that a run exported.
+A point is an organ's if its material is more than half of it.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.drawn_regions import points_of_page, propose_regions
 from hsi_sc_nerf.analysis.organs import BODY, CALYX, HUSK, KERNELS, STEM
+from hsi_sc_nerf.analysis.spectral_edges import LEAST_POINTS
 from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
@@ -47,6 +50,10 @@ ORGANS: dict[str, dict[str, str]] = {
 }
 """What each object has beside its body, by the name of the proposal, and its material; the scar of the tomato lies
 where no camera sees it."""
+TRAINED = {STEM: STEM, HUSK: HUSK, "part 1": "bruise"}
+"""What is looked for on a trained cloud, where enough of its points have the material."""
+STEMS = {"pepper": "pepper_stem"}
+"""Materials of stems that have another name."""
 CALYX_RADIUS_M = 0.008
 ERRORS = {
     "usual errors": CloudErrors(),
@@ -54,6 +61,15 @@ ERRORS = {
     "errors smooth over 5 mm": CloudErrors(smooth_over_m=0.005),
 }
 COLUMNS = ("object", "cloud", "material", "clouds", "found in", "overlap, mean", "overlap, worst", "false organs")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A cloud, the surface that it is of, and the materials of the parts that should be proposed."""
+
+    cloud: SpectralCloud
+    true: TrueSurface
+    organs: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -67,7 +83,8 @@ class OrganProposals:
     errors: tuple[str, ...] = tuple(ERRORS)
     """Which errors their clouds have."""
     trained: tuple[Path, ...] = ()
-    """Folders that `hsi-sc-nerf demo` wrote, whose rows are added."""
+    """Folders of simulated sessions and the clouds that runs exported of them, whose rows are added: a row for all of
+    one object and size."""
     results: Path = RESULTS
     """Folder of the CSV file."""
     picture: Path | None = None
@@ -76,21 +93,24 @@ class OrganProposals:
     def main(self) -> None:
         """Measure, print, write."""
         if self.picture is not None:
-            _draw(self.picture, [self._simulated(name, CloudErrors(), 1)[0] for name in ORGANS if ORGANS[name]])
+            _draw(self.picture, [self._simulated(name, CloudErrors(), 1).cloud for name in ORGANS if ORGANS[name]])
             return
         for errors, name in track([(errors, name) for errors in self.errors for name in self.objects], "Proposing"):
             self._write(name, errors, [self._simulated(name, ERRORS[errors], seed) for seed in SEEDS])
+        trained: dict[tuple[str, str], list[Path]] = {}
         for folder in self.trained:
             truth = load_truth(folder / "session")
-            case = read_spectral_ply(folder / "point_cloud.ply"), TrueObject.of(truth)
-            self._write(truth.object, f"trained on {truth.intrinsics.w} px", [case])
+            cloud = f"trained on {len(truth.captures)} views of {truth.intrinsics.w} px"
+            trained.setdefault((truth.object, cloud), []).append(folder)
+        for (name, cloud), folders in track(trained.items(), "Proposing on trained clouds"):
+            self._write(name, cloud, [_trained(folder) for folder in folders], " ".join(one.name for one in folders))
 
-    def _write(self, name: str, errors: str, cases: list[tuple[SpectralCloud, TrueObject]]) -> None:
+    def _write(self, name: str, cloud: str, cases: list[Case], seed: str = "11 to 13") -> None:
         """As soon as an object is measured; what stops later loses nothing."""
-        rows = _rows(name, errors, cases)
-        write_results("organ_proposals", COLUMNS, rows, keys=3, seed="11 to 13", folder=self.results)
+        rows = _rows(name, cloud, cases)
+        write_results("organ_proposals", COLUMNS, rows, keys=3, seed=seed, folder=self.results)
 
-    def _simulated(self, name: str, errors: CloudErrors, seed: int) -> tuple[SpectralCloud, TrueObject]:
+    def _simulated(self, name: str, errors: CloudErrors, seed: int) -> Case:
         part = object_part(replace(load_scene(name.split()[0]), seed=seed))
         if name == UPSIDE_DOWN:
             part = _upside_down(part)
@@ -98,7 +118,7 @@ class OrganProposals:
         true = TrueObject(part.materials, part.mesh, part.weights, spectra, NM)
         cloud = cloud_of(true, SetDown(keeps_stem=name != UPSIDE_DOWN), errors, self.points, seed)
         placed = set_down(SetDown(), true.mesh.vertices)(true.mesh.vertices)
-        return cloud, replace(true, mesh=Mesh(placed, true.mesh.triangles))
+        return Case(cloud, replace(true, mesh=Mesh(placed, true.mesh.triangles)), ORGANS[name])
 
 
 def _upside_down(apple: Part) -> Part:
@@ -113,24 +133,41 @@ def _upside_down(apple: Part) -> Part:
     )
 
 
-def _rows(name: str, errors: str, cases: list[tuple[SpectralCloud, TrueObject]]) -> list[list[str]]:
+def _trained(folder: Path) -> Case:
+    """The cloud of a run, and what of `TRAINED` is on it."""
+    paths = (folder / "export" / "point_cloud.ply", folder / "point_cloud.ply")
+    cloud = points_of_page(read_spectral_ply(next((path for path in paths if path.is_file()), paths[0])))
+    truth = load_truth(folder / "session")
+    true, organs = TrueSurface.of(truth), TRAINED | ({STEM: STEMS[truth.object]} if truth.object in STEMS else {})
+    counts = dict(zip(true.materials, (true.nearest(cloud.points.astype(float))[1] > 0.5).sum(axis=0), strict=True))
+    return Case(cloud, true, {name: one for name, one in organs.items() if counts.get(one, 0) >= LEAST_POINTS})
+
+
+def _rows(name: str, cloud: str, cases: list[Case]) -> list[list[str]]:
     """A row for each organ. Overlap: points that are the organ's in both, over those in either."""
-    overlaps: dict[str, list[float]] = {material: [] for material in ORGANS[name].values()}
+    overlaps: dict[str, list[float]] = {}
+    there: dict[str, int] = {}
     false = 0
-    for cloud, true in cases:
-        proposed = {one.name: one.chosen for one in propose_regions(cloud)}
-        weights = true.nearest(points_of_page(cloud).points.astype(float))[1]
+    for case in cases:
+        proposed = {one.name: one.chosen for one in propose_regions(case.cloud)}
+        weights = case.true.nearest(points_of_page(case.cloud).points.astype(float))[1]
+        for material in case.organs.values():
+            there[material] = there.get(material, 0) + 1
         for organ, chosen in proposed.items():
-            material = ORGANS[name].get(organ)
+            material = case.organs.get(organ)
             if material is None:
                 false += organ not in (BODY, KERNELS)
                 continue
-            of_organ = weights[:, true.materials.index(material)] > 0.5
-            overlaps[material].append((chosen & of_organ).sum() / (chosen | of_organ).sum())
+            of_organ = weights[:, case.true.materials.index(material)] > 0.5
+            overlap = (chosen & of_organ).sum() / (chosen | of_organ).sum()
+            overlaps.setdefault(material, []).append(float(overlap))
+    if not there:
+        return [[name, cloud, "none", f"{len(cases)}", "", "", "", f"{false}"]]
     rows = []
-    for material, found in (overlaps or {"none": []}).items():
+    for material, count in there.items():
+        found = overlaps.get(material, [])
         told = [f"{len(found)}", f"{np.mean(found):.3f}", f"{min(found):.3f}"] if found else ["0", "", ""]
-        rows.append([name, errors, material, f"{len(cases)}", *(told if overlaps else [""] * 3), f"{false}"])
+        rows.append([name, cloud, material, f"{count}", *told, f"{false}"])
     return rows
 
 

@@ -14,6 +14,9 @@ from hsi_sc_nerf.analysis.calibrations import Calibration
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 
+OUTSIDE = "outside of what the classifier knows"
+"""Words for surface whose spectra it was not fitted on, which no class has as its name."""
+
 
 @dataclass(frozen=True, eq=False)
 class ClassMap:
@@ -37,7 +40,7 @@ class ClassMap:
     @cached_property
     def labels(self) -> Int[np.ndarray, "v"]:
         """The most probable class of each vertex; -1 for none."""
-        return _labels(self.probabilities)
+        return most_probable(self.probabilities)
 
     @property
     def column(self) -> str:
@@ -75,12 +78,12 @@ def class_map(surface: SpectralMesh, classifier: Calibration) -> ClassMap:
         scatter = surface.scatter if surface.lit is None else surface.scatter / surface.lit.irradiance
         noise = np.nan_to_num(scatter[seen])[:, None] * np.random.default_rng(0).standard_normal(spectra.shape)
         shaken = np.full(len(seen), UNCLASSIFIED)
-        shaken[seen] = _labels(classifier.predictions(classifier.resampled(spectra + noise, nm)))
+        shaken[seen] = most_probable(classifier.predictions(classifier.resampled(spectra + noise, nm)))
         shaken[np.isnan(probabilities[:, 0])] = UNCLASSIFIED
     found = ClassMap(classifier.name, classifier.classes, probabilities, shaken)
     known, changed = found.labels[seen] != UNCLASSIFIED, 0.0
     if (coarse := classifier.coarser(nm)) is not None and known.any():
-        other = _labels(classifier.predictions(classifier.resampled(spectra[:, coarse], nm[coarse])))
+        other = most_probable(classifier.predictions(classifier.resampled(spectra[:, coarse], nm[coarse])))
         weights = surface.areas_m2[seen][known]
         changed = float(weights @ (other != found.labels[seen])[known] / weights.sum()) / 3.0
     return replace(found, resampling_error=changed)
@@ -118,6 +121,7 @@ def class_areas(
     return ClassAreas(areas_m2[:-1], stds_m2, float(areas_m2[-1]))
 
 
-def _labels(probabilities: Float[np.ndarray, "n classes"]) -> Int[np.ndarray, "n"]:
+def most_probable(probabilities: Float[np.ndarray, "n classes"]) -> Int[np.ndarray, "n"]:
+    """Number of each row's most probable class; -1 where a probability is missing."""
     none = np.isnan(probabilities).any(axis=1)
     return np.where(none, UNCLASSIFIED, np.where(none[:, None], 0.0, probabilities).argmax(axis=1))

@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
@@ -29,7 +30,7 @@ _NEAR_WHITE = 0.97
 """Grey value of surface in no class."""
 _STRIPES, _STRIPES_PX = (0.45, 0.95), 12
 """Grey values of surface without a value, and the stripes' period."""
-NO_CLASS, OUTSIDE = "in no class", "outside of what the classifier knows"
+NO_CLASS = "in no class"
 
 
 class SideViews:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.class_maps import ClassAreas
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE, ClassAreas
 from hsi_sc_nerf.analysis.components import Components
 from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, RegionTraits, Traits
@@ -184,14 +184,15 @@ def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]
     rows = []
     for region, values in regions.items():
         for name, found in values["classifiers"].items():
-            for label, area in (found["areas_m2"] | {"outside": found["outside_m2"]}).items():
-                sd = found["area_sds_m2"].get(label)
+            sds = found["area_sds_m2"]
+            areas = [(label, area, sds.get(label)) for label, area in found["areas_m2"].items()]
+            for label, area, sd in (*areas, (OUTSIDE, found["outside_m2"], None)):
                 shown = f"{_CM2_PER_M2 * area:.2f}" if sd is None else _with_sd(_CM2_PER_M2 * area, _CM2_PER_M2 * sd)
                 rows.append([region, name, label, shown, f"{area / values['area_m2']:.1%}"])
     note = (
         "Area of the surface whose most probable class is each; ± is its standard deviation by the classifier's own "
         "doubt, the noise of the spectra and the size of the mesh, and is left out where the dataset (--data) is not "
-        "known. Outside: area whose spectra the classifier does not know."
+        "known. Areas outside have spectra that it was not fitted on."
     )
     for name, of in classifiers.items():
         if of["resampling_error"]:

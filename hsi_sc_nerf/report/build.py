@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, read_calibration
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
@@ -26,7 +27,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, html_page, read_known
+from hsi_sc_nerf.report.page import CloudViewer, Section, Table, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
     comparison_section,
@@ -136,7 +137,22 @@ def object_section(
         f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
     payload = cloud_payload(shown, spectra, indices, calibrations)
-    return Section("object", "The object", [CloudViewer(payload, caption)], judge_cloud(cloud))
+    blocks = [CloudViewer(payload, caption), *_class_tables(payload["classifiers"])]
+    return Section("object", "The object", blocks, judge_cloud(cloud))
+
+
+def _class_tables(classifiers: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """Areas of the classes on the points that the page shows."""
+    rows = [
+        [one["name"], label, f"{area:.2f}", f"{area / max(sum(one['areas_cm2']), 1e-12):.1%}"]
+        for one in classifiers
+        for label, area in zip((*one["classes"], OUTSIDE), one["areas_cm2"], strict=True)
+    ]
+    caption = (
+        "Area of the points whose most probable class is each. hsi-sc-nerf traits --calibration measures them on the "
+        "closed surface, region by region, with their uncertainty."
+    )
+    return [Table(caption, ["classifier", "class", "area, cm²", "part of the points' surface"], rows)] if rows else []
 
 
 def judge_cloud(cloud: SpectralCloud) -> list[Finding]:

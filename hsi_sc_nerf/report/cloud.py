@@ -13,6 +13,8 @@ from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.calibrations import Calibration
+from hsi_sc_nerf.analysis.class_maps import most_probable
+from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names, material_spectra
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
@@ -100,21 +102,43 @@ def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequen
 
 
 def _measures(
-    cloud: SpectralCloud, indices: Sequence[str], calibrations: Sequence[Calibration]
+    cloud: SpectralCloud, indices: Sequence[str], calibrated: Sequence[_Calibrated]
 ) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float]]]:
     """Name, meaning, values and ends of the colours of what spectra tell, of the material's where they are known."""
-    nm, material = cloud.wavelengths_nm, material_spectra(cloud)
-    spectra, of_what = (cloud.spectra, "") if material is None else (material, ", of the material")
+    nm, (spectra, of_what) = cloud.wavelengths_nm, _analysed(cloud)
     for index in find_indices(indices, nm):
         values = index_values(index, spectra, nm)
         drawn = index.drawn_range if index.has_range else usual_range(values)
         yield index.name, f"{index.expression}: {index.tells}{of_what}", values, drawn
-    for one in calibrations:
-        found = one.predictions(one.resampled(spectra, nm), only_inside=True)
+    for one, found in calibrated:
         for label, values in zip(one.classes or ("",), found.T, strict=True):
             drawn = (0.0, 1.0) if label else usual_range(values)
             tells = f"probability by {one.name}" if label else one.unit or "calibration"
             yield f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn
+
+
+_Calibrated = tuple[Calibration, Float[np.ndarray, "n outputs"]]
+"""A calibration, and what it says of each point."""
+
+
+def _analysed(cloud: SpectralCloud) -> tuple[Float[np.ndarray, "n bands"], str]:
+    """The spectra that indices and calibrations are computed from, and words for whose they are."""
+    material = material_spectra(cloud)
+    return (cloud.spectra, "") if material is None else (material, ", of the material")
+
+
+def _classified(one: _Calibrated, areas_m2: Float[np.ndarray, "n"]) -> dict[str, Any]:
+    """The class of each point, and the area of each class, then that which the classifier does not know."""
+    calibration, labels = one[0], most_probable(one[1])
+    every = np.ones(len(labels), bool)
+    areas_cm2 = 1e4 * class_areas_m2(labels, areas_m2, every, len(calibration.classes))
+    counts = np.where(labels == UNCLASSIFIED, _MISSING, labels).astype(np.uint16)
+    return {
+        "name": calibration.name,
+        "classes": list(calibration.classes),
+        "labels": _base64(counts),
+        "areas_cm2": areas_cm2.tolist(),
+    }
 
 
 def cloud_payload(
@@ -129,7 +153,7 @@ def cloud_payload(
         cloud: the points to show (`points_of_page`).
         spectra: of the same points.
         indices: to offer, as `find_indices` reads them.
-        calibrations: to offer; of a classifier the probability of each class.
+        calibrations: to offer; of a classifier the classes, and the probability of each.
 
     Raises:
         InputError: an index or a calibration cannot be computed.
@@ -139,9 +163,11 @@ def cloud_payload(
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
+    nm, (analysed, _) = cloud.wavelengths_nm, _analysed(cloud)
+    calibrated = [(one, one.predictions(one.resampled(analysed, nm), only_inside=True)) for one in calibrations]
     scalars = [
         _scalar(name, tells, values, drawn) | {"index": True}
-        for name, tells, values, drawn in _measures(cloud, indices, calibrations)
+        for name, tells, values, drawn in _measures(cloud, indices, calibrated)
     ]
     of_material = set(band_property_names(cloud.wavelengths_nm, "material"))
     scalars += [
@@ -167,5 +193,6 @@ def cloud_payload(
             for c in available_composites(cloud.wavelengths_nm)
         ],
         "scalars": scalars,
+        "classifiers": [_classified(one, areas_m2) for one in calibrated if one[0].classes],
         "colour_map": _base64(np.rint(255.0 * colormaps[INDEX_COLOURS](np.arange(256))[:, :3]).astype(np.uint8)),
     }

@@ -37,6 +37,7 @@ from hsi_sc_nerf.spectra import (
 )
 from hsi_sc_nerf.viewer.drawings import BrowserControl, ViewerMarkdown, colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.index_choice import IndexChoice, index_legend
+from hsi_sc_nerf.viewer.scale_bar import draw_scale_bar
 from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ class SpectralPanel(torch.nn.Module):
             hint="A click shows the spectrum of a point; while this is on, the mouse does not move the camera",
         )
         self.spectrum = ViewerMarkdown()
-        self.control = BrowserControl(lambda client: self._move_to(client, 0, _START_BEHIND))
+        self.control = BrowserControl(self._opened)
 
     def render(self, camera: Cameras, render: Callable[[Cameras], Outputs]) -> Outputs:
         """Render a camera; for the viewer's camera, replace the spectra by the images that the controls select.
@@ -239,6 +240,18 @@ class SpectralPanel(torch.nn.Module):
     def _shown(viewer: Viewer, output: str) -> bool:
         panel = viewer.control_panel
         return output == panel.output_render or (panel.split and output == panel.split_output_render)
+
+    def _opened(self, client: ClientHandle) -> None:
+        """Show a browser the object, with a scale bar that follows its camera."""
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        viewer = self._viewer()
+        assert viewer is not None
+        parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
+        centre = VISER_NERFSTUDIO_SCALE_RATIO * parsed.metadata["object_box"].mean(dim=0).double().numpy()
+        units_per_m = VISER_NERFSTUDIO_SCALE_RATIO * float(parsed.dataparser_scale)
+        client.camera.on_update(lambda _: draw_scale_bar(client, centre, units_per_m))
+        self._move_to(client, 0, _START_BEHIND)
 
     def _move_all_to(self, view: int) -> None:
         """Move the cameras of all browsers to a training view."""

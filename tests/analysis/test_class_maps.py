@@ -1,12 +1,13 @@
 """Areas of the classes of a classifier whose probabilities are known in closed form."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain, read_calibration
-from hsi_sc_nerf.analysis.class_maps import class_areas, class_map
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE, class_areas, class_map
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_content, trait_tables
 from hsi_sc_nerf.analysis.size import Size, size_of
@@ -119,6 +120,19 @@ def test_resampling_states_which_area_changes_its_class():
     assert class_map(surface_of(narrow[:, :6]), classifier(0.01)).resampling_error == 0.0
 
 
+def test_a_class_named_outside_is_not_what_the_classifier_does_not_know():
+    strange, right = MESH.vertices[:, 2] > 0.03, MESH.vertices[:, 0] > 0.01
+    surface = surface_of(np.where(strange[:, None], OTHER, np.where(right[:, None], BRUISED, SOUND)))
+    directions = np.linalg.svd(np.stack([SOUND, BRUISED]))[2][:2].T
+    domain = Domain(np.zeros(6), np.ones(6), directions, directions, np.full(2, np.inf), np.inf, 1e-6)
+    one = replace(classifier(0.01, domain=domain), classes=("inside", "outside"))
+    content = trait_content(size_of(MESH), {}, True, analyse(surface, class_maps=[class_map(surface, one)]), {})
+    (rows,) = (table.rows for table in trait_tables(content) if table.heading == "Classifiers")
+    masks = {"inside": ~strange & ~right, "outside": ~strange & right, OUTSIDE: strange}
+    expected = {label: 1e4 * surface.areas_m2[where].sum() for label, where in masks.items()}
+    assert {row[2]: float(row[3]) for row in rows} == pytest.approx(expected, abs=0.006)
+
+
 def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
     """Region by region, with the uncertainty of the mesh's size in it."""
     pytest.importorskip("onnxruntime")
@@ -146,9 +160,9 @@ def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
         np.testing.assert_allclose(list(areas["area_sds_m2"].values()), np.hypot(bare.stds_m2, shared))
     (rows,) = (one.rows for one in trait_tables(content) if one.heading == "Classifiers")
     assert [row[:3] for row in rows] == [
-        [region, "ripe", label] for region in ("whole surface", "side") for label in ("unripe", "ripe", "outside")
+        [region, "ripe", label] for region in ("whole surface", "side") for label in ("unripe", "ripe", OUTSIDE)
     ]
-    assert all("±" in row[3] for row in rows if row[2] != "outside")
+    assert all("±" in row[3] for row in rows if row[2] != OUTSIDE)
 
 
 def test_what_has_no_value_is_striped_in_pictures_and_the_rest_as_it_was():

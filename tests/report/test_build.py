@@ -10,7 +10,8 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
-from headless_browser import needs_browser, quiet_page
+from headless_browser import needs_browser
+from page_of_a_ball import ball, colour_at, go_round, opened
 from PIL import Image
 
 from hsi_sc_nerf.analysis.drawn_regions import (
@@ -25,7 +26,7 @@ from hsi_sc_nerf.analysis.report import trait_content
 from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -68,17 +69,6 @@ TRAITS = trait_content(
     ),
     {},
 )
-
-
-def ball(wavelengths_nm, count=4000):
-    """A ball of evenly spread points whose northern half has twice the reflectance of its southern."""
-    z, azimuth = 1.0 - 2.0 * (np.arange(count) + 0.5) / count, np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    wide = np.sqrt(1.0 - z**2)
-    normals = np.stack([wide * np.cos(azimuth), wide * np.sin(azimuth), z], axis=-1)
-    shape = np.linspace(0.2, 0.4, len(wavelengths_nm))
-    spectra = np.where(normals[:, 2:] > 0, 2.0, 1.0) * shape
-    colours = np.full((count, 3), 128, np.uint8)
-    return SpectralCloud(0.03 * normals, normals, colours, spectra, wavelengths_nm)
 
 
 @pytest.fixture(scope="module")
@@ -203,14 +193,6 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     assert not (tmp_path / "report.html").exists()
 
 
-@contextmanager
-def opened(browser, report, **window):
-    """The report in a window of its own, with the object drawn."""
-    with quiet_page(browser, report, **window) as page:
-        assert page.locator("#cloud").get_attribute("data-state") == "ready"
-        yield page
-
-
 def picked_mm(page):
     """Position of the last picked point."""
     return np.array(re.findall(r"-?[\d.]+", page.locator(".picked li").last.inner_text()), float)
@@ -225,21 +207,14 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(browser, report):
         canvas.scroll_into_view_if_needed()
         page.select_option("select[name=shown]", "band 0")
 
-        def colour_at(x, y):
-            """Of the drawing, at fractions of its width and height."""
-            read = """(canvas, [x, y]) => { const pixel = new Uint8Array(4), gl = canvas.getContext("webgl");
-                gl.readPixels(x * canvas.width, (1 - y) * canvas.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
-                return [...pixel]; }"""
-            return canvas.evaluate(read, [x, y])
-
         def click(x, y):
             box = canvas.bounding_box()
             page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
 
         # Viridis at its end for the bright half, at its middle for the other; nothing beside the ball.
-        np.testing.assert_allclose(colour_at(0.5, 0.25), [253, 231, 37, 255], atol=12)
-        np.testing.assert_allclose(colour_at(0.5, 0.72), [33, 145, 140, 255], atol=12)
-        assert colour_at(0.02, 0.02)[3] == 0
+        np.testing.assert_allclose(colour_at(page, 0.5, 0.25), [253, 231, 37, 255], atol=12)
+        np.testing.assert_allclose(colour_at(page, 0.5, 0.72), [33, 145, 140, 255], atol=12)
+        assert colour_at(page, 0.02, 0.02)[3] == 0
 
         click(0.5, 0.72)
         click(0.02, 0.02)
@@ -255,21 +230,6 @@ def test_the_object_turns_and_tells_its_spectra_in_a_browser(browser, report):
             page.click("button[name=save]")
         saved = np.loadtxt(download.value.path(), delimiter=",", skiprows=1)
         np.testing.assert_allclose(saved[:, 1], np.linspace(0.2, 0.4, len(saved)), atol=2e-3)
-
-
-def go_round(page, x, y, radius):
-    """Draw a circle on the object, at fractions of the drawing's size."""
-    canvas = page.locator("#cloud canvas")
-    canvas.scroll_into_view_if_needed()
-    box = canvas.bounding_box()
-    turn = np.linspace(0.0, 2.0 * np.pi, 25)
-    for step, (right, down) in enumerate(zip(np.cos(turn), np.sin(turn), strict=True)):
-        page.mouse.move(
-            box["x"] + (x + radius * right) * box["width"], box["y"] + (y + radius * down) * box["height"]
-        )
-        if step == 0:
-            page.mouse.down()
-    page.mouse.up()
 
 
 @pytest.mark.slow

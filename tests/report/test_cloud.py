@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE
 from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names
+from hsi_sc_nerf.report.build import object_section
 from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise
 
 
@@ -132,3 +134,30 @@ def test_calibrations_and_indices_are_of_the_material_where_it_is_known(tmp_path
         np.testing.assert_allclose(values(payload[1]), expected, atol=1e-3)
         np.testing.assert_allclose(values(payload[3]), 1.0 - spectra.mean(axis=1), atol=1e-3)
         assert payload[3]["drawn"] == (0.0, 1.0)
+
+
+def test_a_classifier_gives_each_point_its_class_and_each_class_its_area():
+    """Halves of a ball, less caps that the classifier does not know; also in a table. A class is named outside."""
+    cloud = ball()
+    height = cloud.points[:, 2] / np.abs(cloud.points[:, 2]).max()
+    marked = replace(cloud, spectra=np.repeat(height[:, None], 20, axis=1))
+    none, every = np.full(20, np.nan), np.ones(20, bool)
+    # The projection on the first band is the score, its square T².
+    known = Domain(np.zeros(20), np.ones(20), np.eye(20)[:, :1], np.eye(20)[:, :1], np.ones(1), 0.64, np.inf)
+
+    def predict(spectra):
+        return np.stack([spectra[:, 0] < 0.0, spectra[:, 0] >= 0.0], axis=1).astype(float)
+
+    one = Calibration("part", "", 0.0, cloud.wavelengths_nm, (), every, none, predict, known, ("lower", "outside"))
+    (found,) = cloud_payload(marked, compress_spectra(marked.spectra), (), [one])["classifiers"]
+    labels = np.frombuffer(base64.b64decode(found["labels"]), "<u2")
+    expected = np.where(np.abs(height) > 0.8, 65535, height >= 0.0)
+    np.testing.assert_array_equal(labels, expected)
+    areas_cm2 = 1e4 * point_areas_m2(cloud.points)
+    sums = [areas_cm2[labels == label].sum() for label in (0, 1, 65535)]
+    np.testing.assert_allclose(found["areas_cm2"], sums)
+    (table,) = object_section(marked, 500, (), [one]).blocks[1:]
+    assert [row[:3] for row in table.rows] == [
+        ["part", name, f"{area:.2f}"] for name, area in zip(("lower", "outside", OUTSIDE), sums, strict=True)
+    ]
+    assert object_section(marked, 500).blocks[1:] == []

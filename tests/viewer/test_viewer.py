@@ -80,8 +80,14 @@ class FakeServer:
     """What the panel uses of viser's server: one browser, a scene, a panel of texts."""
 
     def __init__(self):
-        self.camera = SimpleNamespace(aspect=1.5)
-        self.client = SimpleNamespace(camera=self.camera, atomic=contextlib.nullcontext, client_id=0)
+        self.moves = []
+        self.camera = SimpleNamespace(aspect=1.5, on_update=self.moves.append)
+        self.labels = {}
+        own_scene = SimpleNamespace(
+            add_spline_catmull_rom=lambda *_, **__: None,
+            add_label=lambda name, text, **_: self.labels.update({name: text}),
+        )
+        self.client = SimpleNamespace(camera=self.camera, scene=own_scene, atomic=contextlib.nullcontext, client_id=0)
         self.pointer = None
         self.points = {}
         self.scene = SimpleNamespace(
@@ -332,6 +338,20 @@ def test_a_browser_opens_behind_the_first_camera_and_turns_around_the_object(att
     assert (middle - looked_at) @ frame.camera_to_worlds[:, 2] == pytest.approx(0.0, abs=1e-4)
     viewer.init_scene("dataset", train_state="completed")
     assert viewer.calls == [("dataset", "completed"), "cameras hidden", "button switched"]
+
+
+def test_a_browser_has_a_scale_bar_in_metric_millimetres_that_follows_its_camera(attached, pipeline):
+    _, server, _ = attached
+    server.opened[0](server.client)
+    (moved,) = server.moves
+    parsed = pipeline.datamanager.train_dataparser_outputs
+    centre = 10.0 * parsed.metadata["object_box"].mean(0).numpy()
+    ahead = SO3(server.camera.wxyz).as_matrix()[:, 2]
+    for distance_m, words in ((0.4, "50 mm"), (0.1, "10 mm")):
+        server.camera.position = centre - 10.0 * parsed.dataparser_scale * distance_m * ahead
+        server.camera.fov = 2.0 * math.atan(0.3)
+        moved(server.camera)
+        assert list(server.labels.values()) == [words]
 
 
 def test_the_render_of_a_closed_browser_is_stopped(attached):

@@ -13,6 +13,10 @@ function seriesColour(index) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--s${index}`).trim();
 }
 
+function rgbOf(colour) {
+  return [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16) / 255);
+}
+
 /** A chart of `curves`, each with its `series` (colour), `spectrum` and, of a region, `sd`. */
 function spectraChart(wavelengths, curves) {
   const [width, height, left, bottom, top] = [340, 210, 40, 34, 8];

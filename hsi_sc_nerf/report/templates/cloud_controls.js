@@ -1,11 +1,8 @@
 // The controls beside the object: what is shown, how it is turned, which spectra were picked.
 
 const MOST_CURVES = 6;
+const CLASS_COLOURS = 7;
 const TURN_PER_SECOND = 0.35;
-
-function rgbOf(colour) {
-  return [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16) / 255);
-}
 
 function download(blob, name) {
   const href = URL.createObjectURL(blob);
@@ -33,6 +30,16 @@ function start(root, cloud) {
     legend.replaceChildren(bar, ends);
   }
 
+  /** A dot a class, and its area on the page's points. */
+  function showClasses({ name, classes, areas_cm2 }) {
+    const items = [...classes, UNKNOWN].map((label, i) => {
+      const item = element("span", { class: "class" }, `${label} ${areas_cm2[i].toFixed(2)} cm²`);
+      item.prepend(i < classes.length ? dot(i % CLASS_COLOURS) : element("span", { class: "dot unknown" }));
+      return item;
+    });
+    legend.replaceChildren(element("span", {}, `Most probable class by ${name}: `), ...items);
+  }
+
   /** Colours of the points, with the regions in their own. */
   function paint(rgb) {
     for (const { points, series } of regions) {
@@ -56,10 +63,14 @@ function start(root, cloud) {
       const band = Number(fields.band.value), values = cloud.band(band), high = quantile(values, 0.99);
       showBar(0, high, `reflectance at ${wavelength}`);
       paint(cloud.mapped(values, 0, high));
+    } else if (kind === "classes") {
+      const one = cloud.classifiers[index], colours = one.classes.map((_, i) => rgbOf(seriesColour(i % CLASS_COLOURS)));
+      showClasses(one);
+      paint(cloud.classed(one, colours));
     } else {
-      const { name, tells, drawn } = cloud.scalars[index];
-      showBar(...drawn, `${name} (${tells})`);
-      paint(cloud.mapped(cloud.scalar(index), ...drawn));
+      const { name, tells, drawn } = cloud.scalars[index], values = cloud.scalar(index);
+      showBar(...drawn, `${name} (${tells})${values.some(Number.isNaN) ? "; grey: no value" : ""}`);
+      paint(cloud.mapped(values, ...drawn));
     }
   }
 
@@ -123,10 +134,7 @@ function start(root, cloud) {
       const away = element("button", { type: "button", "aria-label": `Delete ${region.name}` }, "Delete");
       name.addEventListener("change", () => { region.name = name.value.trim() || region.name; showRegions(); });
       away.addEventListener("click", () => { regions.splice(regions.indexOf(region), 1); showRegions(); });
-      const means = region.indices.map(({ name: index, mean_sd: [mean, sd] }) => (
-        `${index} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)}`));
-      const size = `${region.points.length} points, ${region.area_cm2.toPrecision(3)} cm²`;
-      item.append(chosen, dot(region.series), name, away, element("p", {}, [size, ...means].join("; ")));
+      item.append(chosen, dot(region.series), name, away, element("p", {}, wordsOf(region)));
       return item;
     }));
     show();
@@ -167,19 +175,6 @@ function start(root, cloud) {
     stroke.setAttribute("stroke-width", 2 * r);
   }
 
-  function save() {
-    const places = picked.map(({ point }) => cloud.millimetres(point).map((mm) => mm.toFixed(1)).join(" "));
-    const quoted = (name) => `"${name.replaceAll('"', '""')}"`;
-    const names = [
-      ...regions.flatMap(({ name }) => [quoted(`mean of ${name}`), quoted(`standard deviation in ${name}`)]),
-      ...places.map((place) => `reflectance at ${place} mm`),
-    ];
-    const columns = [...regions.flatMap(({ spectrum, sd }) => [spectrum, sd]), ...picked.map(({ spectrum }) => spectrum)];
-    const rows = cloud.wavelengths.map((nm, i) => [nm, ...columns.map((column) => column[i].toFixed(5))]);
-    const csv = [["wavelength_nm", ...names], ...rows];
-    download(new Blob([csv.map((row) => row.join(",")).join("\n") + "\n"]), "spectra.csv");
-  }
-
   async function load(file) {
     try {
       const found = regionsOf(cloud, await file.text());
@@ -215,6 +210,7 @@ function start(root, cloud) {
   const groups = [
     ["Composites", "composite", cloud.composites.map(({ name }) => name)],
     ["One band", "band", ["reflectance at a wavelength"]],
+    ["Classes", "classes", cloud.classifiers.map(({ name }) => name)],
     ["Indices and columns", "scalar", cloud.scalars.map(({ name }) => name)],
   ];
   for (const [label, kind, names] of groups.filter(([, , names]) => names.length)) {
@@ -230,7 +226,10 @@ function start(root, cloud) {
   fields.shading.addEventListener("change", () => { renderer.shading = fields.shading.checked ? 1 : 0; renderer.draw(); });
   fields.size.addEventListener("input", () => { renderer.size = Number(fields.size.value); renderer.draw(); });
   fields.clear.addEventListener("click", () => { picked.length = 0; drawSpectra(); });
-  fields.save.addEventListener("click", () => { if (picked.length || regions.length) save(); });
+  fields.save.addEventListener("click", () => {
+    if (picked.length || regions.length) download(new Blob([spectraFile(cloud, regions, picked)]), "spectra.csv");
+    else say("Click on the object or draw a region first.");
+  });
   fields.saveRegions.addEventListener("click", () => {
     if (regions.length) download(new Blob([regionFile(cloud, regions)]), "regions.json");
     else say("There is no region yet; tick \"draw regions\" and draw one.");

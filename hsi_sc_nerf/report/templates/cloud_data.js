@@ -24,6 +24,7 @@ class Cloud {
     this.composites = payload.composites;
     const decoded = (scalar) => ({ ...scalar, counts: decode(scalar.data, Uint16Array) });
     this.scalars = payload.scalars.map(decoded);
+    this.classifiers = payload.classifiers.map((one) => ({ ...one, labels: decode(one.labels, Uint16Array) }));
     this.areas_cm2 = this.numbers(decoded(payload.areas_cm2));
     this.colours = decode(payload.colour_map, Uint8Array);
   }
@@ -91,6 +92,20 @@ class Cloud {
       rgb.set(this.colours.subarray(at, at + 3), 3 * i);
     }
     return rgb;
+  }
+
+  /** Red, green, blue (0 to 255) of the points of a classifier, by the colours of its classes (0 to 1). */
+  classed({ labels }, colours) {
+    const rgb = new Uint8Array(3 * this.count);
+    labels.forEach((label, i) => rgb.set((label === MISSING ? BLANK : colours[label]).map((part) => 255 * part), 3 * i));
+    return rgb;
+  }
+
+  /** Area (cm²) of each class of a classifier in some points, then that which it does not know. */
+  classAreas({ labels, classes }, points) {
+    const areas = Array(classes.length + 1).fill(0);
+    for (const point of points) areas[Math.min(labels[point], classes.length)] += this.areas_cm2[point];
+    return areas;
   }
 
   /** Red, green, blue (0 to 255) of three bands, `white` of reflectance at full brightness. */

@@ -3,6 +3,7 @@
 const FRONT_DEPTH = 0.05;
 const FILE_KIND = "hsi-sc-nerf regions";
 const FAR_SPACINGS = 2;
+const UNKNOWN = "outside of what the classifier knows";
 
 /** Whether a place lies inside a closed line, by the number of its sides to the right (even-odd rule). */
 function inside([x, y], line) {
@@ -37,17 +38,40 @@ function meanAndSd(values) {
   return [mean, Math.sqrt(finite.reduce((a, b) => a + (b - mean) ** 2, 0) / finite.length)];
 }
 
-/** Area (cm²), mean spectrum with its standard deviation, and the mean of each index, of points of the cloud. */
+/** Area (cm²), also of each class, mean spectrum with its standard deviation, and the mean of each index. */
 function measured(cloud, points) {
   const indices = cloud.scalars.map((scalar, i) => ({ ...scalar, i })).filter(({ index }) => index);
   return {
     area_cm2: points.reduce((area, point) => area + cloud.areas_cm2[point], 0),
     ...cloud.meanAndSd(points),
+    areas: cloud.classifiers.map((one) => ({ ...one, areas_cm2: cloud.classAreas(one, points) })),
     indices: indices.map(({ name, i }) => {
       const values = cloud.scalar(i);
       return { name, mean_sd: meanAndSd(Array.from(points, (point) => values[point])) };
     }),
   };
+}
+
+/** Size, indices and areas of classes of a region, in words; an index without any value is left out. */
+function wordsOf({ points, area_cm2, indices, areas }) {
+  const means = indices.filter(({ mean_sd: [mean] }) => Number.isFinite(mean)).map(({ name, mean_sd: [mean, sd] }) => (
+    `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)}`));
+  const classed = areas.map(({ name, classes, areas_cm2 }) => `${name}: ${[...classes, UNKNOWN].map((label, i) => (
+    `${label} ${areas_cm2[i].toFixed(2)} cm²`)).join(", ")}`);
+  return [`${points.length} points, ${area_cm2.toPrecision(3)} cm²`, ...means, ...classed].join("; ");
+}
+
+/** A line a band: mean and standard deviation of each region, then the picked points' reflectance. */
+function spectraFile(cloud, regions, picked) {
+  const quoted = (name) => `"${name.replaceAll('"', '""')}"`;
+  const places = picked.map(({ point }) => cloud.millimetres(point).map((mm) => mm.toFixed(1)).join(" "));
+  const names = [
+    ...regions.flatMap(({ name }) => [quoted(`mean of ${name}`), quoted(`standard deviation in ${name}`)]),
+    ...places.map((place) => `reflectance at ${place} mm`),
+  ];
+  const columns = [...regions.flatMap(({ spectrum, sd }) => [spectrum, sd]), ...picked.map(({ spectrum }) => spectrum)];
+  const rows = cloud.wavelengths.map((nm, i) => [nm, ...columns.map((column) => column[i].toFixed(5))]);
+  return [["wavelength_nm", ...names], ...rows].map((row) => row.join(",")).join("\n") + "\n";
 }
 
 /** All points of the page in metres, and which of them each region holds: its edge lies between points. */
