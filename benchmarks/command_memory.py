@@ -99,6 +99,8 @@ def main(
     bands: int = 204,
     steps: int = 100,
     points: int = 200_000,
+    only: str = "",
+    keep: Path | None = None,
     results: Path = RESULTS,
 ) -> None:
     """Run every command on a simulated session, and write a row for each; rows of other sessions are kept.
@@ -107,12 +109,17 @@ def main(
         frames, size_px, bands: of the session.
         steps: of the training.
         points: of the cloud.
+        only: part of the names of the commands to run, whose inputs lie in --keep; the other rows are kept.
+        keep: folder for the session and all results.
         results: folder of the table.
     """
     session = f"{frames} frames of {size_px} x {size_px} x {bands}"
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+        folder = (keep or Path(temporary)).absolute()
+        folder.mkdir(parents=True, exist_ok=True)
         for name, line in commands(folder, frames, size_px, bands, steps, points).items():
+            if only not in name:
+                continue
             with AnonymousMemory() as anonymous:
                 cost = run_step(name, typed_command(line.split()), folder / "log")
             row = [session, name, f"{cost.peak_memory_mib:.0f}", f"{anonymous.peak_mib:.0f}", f"{cost.seconds:.0f}"]

@@ -37,6 +37,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
     from hsi_sc_nerf.analysis.library import read_library
     from hsi_sc_nerf.analysis.size import scale_uncertainty
+    from hsi_sc_nerf.api.clouds import read_cloud
     from hsi_sc_nerf.batch.objects import read_object
     from hsi_sc_nerf.batch.plan import outdated, read_plan
     from hsi_sc_nerf.batch.session_steps import SessionSettings, is_up_to_date, session_steps
@@ -132,6 +133,11 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("bins of a resume", note.bins, lambda: read_cache(note, "made"), 0.5),
         Kind("point cloud (binary PLY)", files["binary"], lambda: every_point(files["binary"]), 3.0),
         Kind("point cloud (ASCII PLY)", files["ascii"], lambda: every_point(files["ascii"]), 2.0),
+        Kind("point cloud (NetCDF)", files["netcdf"], lambda: read_cloud(files["netcdf"]), 0.5),
+        *(
+            Kind(f"point cloud (Zarr: {at})", files["zarr"] / at, lambda: read_cloud(files["zarr"]), 0.3)
+            for at in ("zarr.json", "reflectance/zarr.json", "reflectance/c/0/0")
+        ),
         *(Kind(f"mesh ({s.upper()})", files[s], lambda s=s: read_surface(files[s]), 0.5) for s in ("obj", "stl")),
         *(
             Kind(

@@ -20,7 +20,8 @@ from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.config import hsi_sc_nerf
-from hsi_sc_nerf.export.cloud import SpectralCloud, write_spectral_ply
+from hsi_sc_nerf.export.cloud import SpectralCloud, stream, write_spectral_ply
+from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import look_at
 from hsi_sc_nerf.models.checkpoints import CHECKPOINT_KEYS, write_checkpoint
@@ -107,6 +108,7 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "steps": STEPS_NAME,
     }
     files |= {name: folder / file for name, file in others.items()}
+    files |= {kind: write_cloud(folder / "cloud", stream(cloud), kind) for kind in ("netcdf", "zarr")}
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
     names = ("x", "y", "z", "nx", "ny", "nz", "scalar_400.00nm", "scalar_500.00nm")
     properties = [

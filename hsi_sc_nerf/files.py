@@ -21,7 +21,7 @@ from hsi_sc_nerf.errors import InputError
 
 TEMPORARY_PREFIX = ".partial-"
 # Bytes that DEFLATE makes of one byte at most.
-_LARGEST_DEFLATION = 1032
+LARGEST_DEFLATION = 1032
 _MODES = {1: cv2.IMREAD_GRAYSCALE, 3: cv2.IMREAD_COLOR}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By PNG's numbers of the kinds of colour."""
@@ -182,7 +182,7 @@ def _is_whole_png(content: bytes) -> bool:
             return False
         at = end + 4
     width, height, depth, colour = struct.unpack(">IIBB", view[16:26])
-    return width * height * depth * _PNG_CHANNELS.get(colour, 4) // 8 <= _LARGEST_DEFLATION * len(content)
+    return width * height * depth * _PNG_CHANNELS.get(colour, 4) // 8 <= LARGEST_DEFLATION * len(content)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:

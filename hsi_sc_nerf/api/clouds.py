@@ -14,6 +14,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud, material_spectra, read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import format_of, write_cloud
 from hsi_sc_nerf.export.table import from_xarray, to_xarray
+from hsi_sc_nerf.export.trial_reading import require_readable, require_room
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
 
@@ -94,6 +95,8 @@ class Cloud(SpectralCloud):
 def read_cloud(path: Path | str) -> Cloud:
     """Read a cloud that was exported as PLY, NetCDF or Zarr.
 
+    A NetCDF file is read by a process of its own first (`export.trial_reading`).
+
     Raises:
         InputError: the file is missing, is none of these, or lacks something of a cloud.
 
@@ -108,12 +111,15 @@ def read_cloud(path: Path | str) -> Cloud:
         return Cloud.of(read_spectral_ply(path))
     if kind == "las":
         raise InputError(f"{path}: LAS is not read; give the cloud as PLY, NetCDF or Zarr.")
+    if kind == "netcdf":
+        require_readable(path)
     try:
         import xarray
 
         zarr = {"engine": "zarr", "backend_kwargs": {"consolidated": False}}
         options: dict[str, Any] = zarr if kind == "zarr" else {"engine": "h5netcdf"}
         with xarray.open_dataset(path, **options) as table:
+            require_room(table.nbytes, sum(part.stat().st_size for part in (path, *path.rglob("*"))))
             return Cloud.of(from_xarray(table.load()))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

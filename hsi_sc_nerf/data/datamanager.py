@@ -112,12 +112,8 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         """Open the held-out cubes."""
         self.eval_pixel_sampler = self._pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self._eval_rays = CameraRays(self.eval_dataset.cameras.to(self.device))
-        # A view without an object in its mask would score as perfect.
-        with_object = np.flatnonzero(self.eval_pixel_sampler.masks.any(axis=(1, 2))).tolist()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
-            input_dataset=self.eval_dataset,
-            image_indices=tuple(with_object or range(len(self.eval_dataset))),  # type: ignore[arg-type]
-            device=self.device,
+            input_dataset=self.eval_dataset, device=self.device
         )
         # Pictures in the logs show the same view every time, so that they can be compared.
         self.eval_dataloader = FixedIndicesEvalDataloader(  # type: ignore[assignment]

@@ -2,14 +2,13 @@
 
 ``predicted`` and ``target`` are images (h, w, bands); ``mask`` (h, w) selects the evaluated pixels Omega, all without
 one. The arithmetic is float64, in blocks, so that a large cube needs little memory beside itself; results are float32
-and finite for finite spectra.
+and finite for finite spectra, where there is anything to judge.
 
 ``valid`` (h, w, bands) tells which values of the target are measurements, all without it. Whatever number stands at
 the others counts nowhere: a pixel is judged by its valid bands, a band by its valid pixels.
 
-**An empty mask** holds nothing that could differ: it scores like identical images (angle and errors 0, SSIM 1, PSNR
-at its cap). That says nothing about a view; leave such a view out of a mean over views. So does a band without valid
-pixels, which is therefore left out of means over bands, unless all are such.
+**An empty mask** holds nothing that could be judged: every score is NaN, as it is where no value is valid. A band
+without valid pixels is left out of means over bands.
 
 Every function raises ValueError if the images differ in shape, if the mask is not boolean or not (h, w), or if
 ``valid`` is not boolean or not (h, w, bands).
@@ -24,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from hsi_sc_nerf.numerics import check_mask, masked_mean, narrow, safe_sqrt, select_pixels, spectral_angle
+from hsi_sc_nerf.numerics import check_mask, narrow, safe_sqrt, select_pixels, spectral_angle
 
 # The paper's delta under the logarithm has no printed value: this one caps the PSNR of identical bands at 100 dB.
 PSNR_DELTA = 1e-10
@@ -69,14 +68,14 @@ def metrics_of_regions(
     by_band = zip(*moment_scores(predicted, target, masks, valid), windowed, strict=True)
     found: dict[str, float] = {}
     for (name, mask), (pixels, mse, similarity, windows) in zip(regions.items(), by_band, strict=True):
-        counted = pixels > 0 if pixels.any() else np.ones_like(pixels, bool)
+        counted = pixels > 0
         values = {
             "sam": _pixel_mean(angles, mask, has_angles),
             "rmse": safe_sqrt(_pixel_mean(squares, mask, number)),
             "rmse_pixel_mean": _pixel_mean(safe_sqrt(squares), mask, has_any),
-            "ssim": torch.tensor(similarity[counted].mean()),
-            "ssim_windowed": torch.tensor(windows[counted].mean()),
-            "psnr": torch.tensor(decibel(mse)[counted].mean()),
+            "ssim": _band_mean(similarity[counted]),
+            "ssim_windowed": _band_mean(windows[counted]),
+            "psnr": _band_mean(decibel(mse)[counted]),
         }
         found |= {f"{name}{metric}": narrow(value, predicted).item() for metric, value in values.items()}
     return found
@@ -178,11 +177,14 @@ def cleared(values: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]) -> F
 def _pixel_mean(
     values: Float[Tensor, "h w"], mask: Mask | None, weights: Shaped[Tensor, "h w"] | None
 ) -> Float[Tensor, ""]:
-    """Weighted mean over the mask; what has weight 0 may be anything."""
-    if weights is None:
-        return masked_mean(values, mask)
-    values, weights = select_pixels(torch.stack([values.double(), weights.double()], -1), mask).unbind(-1)
-    return (torch.where(weights > 0, values, 0.0) * weights).sum() / weights.sum().clamp_min(1.0)
+    """Weighted mean over the mask, NaN over nothing; what has weight 0 may be anything."""
+    counted = torch.ones_like(values) if weights is None else weights
+    values, counted = select_pixels(torch.stack([values.double(), counted.double()], -1), mask).unbind(-1)
+    return (torch.where(counted > 0, values, 0.0) * counted).sum() / counted.sum()
+
+
+def _band_mean(scores: Float[np.ndarray, "bands"]) -> Float[Tensor, ""]:
+    return torch.tensor(scores.mean() if len(scores) else np.nan)
 
 
 def _blocks(

@@ -1,13 +1,18 @@
-"""nerfstudio's pipeline, which refuses weights of another dataset."""
+"""nerfstudio's pipeline, which refuses weights of another dataset and judges views that show something."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.models.occupancy_sampler import pixels_with_matter
@@ -68,12 +73,60 @@ class SpectralPipeline(VanillaPipeline):
         output_path: Path | None = None,
         get_std: bool = False,
     ) -> dict[str, float]:
-        """Mean and standard deviation of each metric over the views.
+        """Mean and standard deviation of each metric over the views that show something of the object.
 
-        The standard deviation over one view is 0; nerfstudio's is NaN, which JSON does not allow.
+        The standard deviation over one view is 0; nerfstudio's is NaN, which JSON does not allow. A training goes on
+        where no view can be judged, and gets no metrics.
+
+        Raises:
+            SystemExit: no view can be judged, and this is no training.
         """
-        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
-        # The length of nerfstudio's loader is that of its dataset, not of the views that it yields.
-        if get_std and len(getattr(data_loader, "image_indices", data_loader)) == 1:
+        views = _JudgedViews(data_loader)
+        metrics: dict[str, float] = {}
+        if views:
+            metrics = super().get_average_image_metrics(views, image_prefix, step, output_path, get_std)
+        if told := views.left_out():
+            if not metrics and self.test_mode != "val":  # nerfstudio's name for training
+                raise SystemExit(f"hsi-sc-nerf: {told}")
+            CONSOLE.print(f"[yellow]{told}", soft_wrap=True)
+        if get_std and views.judged == 1:
             metrics |= dict.fromkeys((name for name in metrics if name.endswith("_std")), 0.0)
-        return metrics
+        return {name: value for name, value in metrics.items() if not math.isnan(value)}
+
+
+class _JudgedViews:
+    """Those of a loader's held-out views that show something of the object that was measured, one at a time."""
+
+    def __init__(self, loader: Any) -> None:
+        self._loader = loader
+        self.judged, self._seen = 0, 0
+        self._views = self._each()
+        self._first = next(self._views, None)
+
+    def __bool__(self) -> bool:
+        return self._first is not None
+
+    def __len__(self) -> int:
+        return len(self._loader)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
+        first, self._first = self._first, None
+        return chain(() if first is None else (first,), self._views)
+
+    def _each(self) -> Iterator[tuple[Cameras, dict]]:
+        for camera, batch in self._loader:
+            self._seen += 1
+            shown = batch["mask"][..., 0].bool()
+            if (batch["valid"][shown] if "valid" in batch else shown).any():
+                self.judged += 1
+                yield camera, batch
+
+    def left_out(self) -> str:
+        """What to say of the views that were left out, once all were asked for."""
+        if self.judged == self._seen:
+            return ""
+        which = "none" if self.judged == 0 else f"{self.judged}"
+        return (
+            f"{which} of {self._seen} held-out views show anything of the object that was measured, and the others have "
+            "no score; look at their masks in the dataset's report/."
+        )

@@ -125,7 +125,8 @@ class RisenLossGuard:
 def stage_summary(name: str, metrics: Mapping[str, float]) -> str:
     """One line with a stage's metrics of the held-out views, inside the masks and (``full_``) of whole frames."""
     masked, full = (
-        ", ".join(text.format(metrics[prefix + key]) for key, text in _SUMMARY.items()) for prefix in ("", "full_")
+        ", ".join(text.format(metrics.get(prefix + key, math.nan)) for key, text in _SUMMARY.items())
+        for prefix in ("", "full_")
     )
     return f"{name} stage, held-out views: object {masked}; whole frame {full}"
 

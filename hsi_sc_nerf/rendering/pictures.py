@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -73,12 +74,17 @@ def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping
         InputError: the files cannot be written.
     """
     columns = {key: column for key, column in _COLUMNS.items() if key in rows[0]}
-    cells = [[row["view"], *(shown(row[key]) for key, (_, shown) in columns.items())] for row in rows]
+    # JSON has no word for the score of a frame that shows nothing of the object.
+    rows = [{key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()} for row in rows]
+    cells = [
+        [row["view"], *("-" if row[key] is None else shown(row[key]) for key, (_, shown) in columns.items())]
+        for row in rows
+    ]
     parts = [markdown_table(["view", *(title for title, _ in columns.values())], cells)]
     if "sam" in columns:
         parts.append("Metrics compare rendered and measured spectra on the object (masked).")
     parts += ["\n".join(f"- `{name}`: {legend}" for name, legend in legends.items())] if legends else []
-    write_json(path.with_suffix(".json"), {"views": [dict(row) for row in rows], "videos": dict(legends)})
+    write_json(path.with_suffix(".json"), {"views": rows, "videos": dict(legends)})
     with atomic_write(path.with_suffix(".md")) as (temporary,):
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 

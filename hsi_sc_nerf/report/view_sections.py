@@ -39,6 +39,8 @@ _METRICS = {
     "rmse_pixel_mean": ("RMSE, mean over pixels", "{:.4f}"),
     "ssim_windowed": ("SSIM, 11 px windows", "{:.3f}"),
 }
+_NO_SCORE = "no score"
+"""Of a view that shows nothing of the object that was measured."""
 _MARK_RGB = (213, 94, 0)
 _MARKED_PX = 480
 # Half of the angle that tells two materials apart, and that angle.
@@ -54,9 +56,11 @@ def metric_key_figures(views: Sequence[ViewScores]) -> dict[str, str]:
 
 
 def _over_views(views: Sequence[ViewScores], metric: str) -> tuple[str, str]:
-    """Mean with standard deviation, and range, of a metric of `ViewScores.metrics` over the views."""
+    """Mean with standard deviation, and range, of a metric of `ViewScores.metrics` over the views that have it."""
     _, pattern = _METRICS[metric.removeprefix("full_")]
-    values = np.array([[view.metrics[metric]] for view in views])
+    values = np.array([[view.metrics[metric]] for view in views if np.isfinite(view.metrics[metric])])
+    if not len(values):
+        return _NO_SCORE, _NO_SCORE
     mean, sd, low, high = (pattern.format(float(v[0])) for v in (*mean_and_sd(values), values.min(0), values.max(0)))
     return f"{mean} ± {sd}", f"{low} to {high}"
 
@@ -94,14 +98,19 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
             shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
             picture = to_8_bit(coloured(shown, drawn, colours).numpy())
             pictures.append(embedded_array(picture, f"{label} of {view.scores.name}"))
-        metrics = view.scores.metrics
-        caption = f"{view.scores.name}: SAM {metrics['sam']:.4f} rad, RMSE {metrics['rmse']:.4f}."
+        sam, rmse = (view.scores.metrics[key] for key in ("sam", "rmse"))
+        scored = f"SAM {sam:.4f} rad, RMSE {rmse:.4f}" if np.isfinite(sam) else _NO_SCORE
+        caption = f"{view.scores.name}: {scored}."
         blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
     return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
 
 
 def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
-    """The spectral angle of the held-out views."""
+    """The spectral angle of the held-out views that have one."""
+    views = [view for view in views if np.isfinite(view.metrics["sam"])]
+    if not views:
+        sentence = "No held-out view shows anything of the object that was measured; look at the masks."
+        return [Finding("spectral-angle", "red", sentence)]
     angles = np.array([view.metrics["sam"] for view in views])
     sentence = (
         f"The mean spectral angle is {angles.mean():.3f} rad (good up to {_SAM_RAD[0]:g}; {_SAM_RAD[1]:g} is another "

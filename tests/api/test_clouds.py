@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from random_cloud import BAND_NAMES, assert_equal, random_cloud
@@ -5,6 +7,7 @@ from random_cloud import BAND_NAMES, assert_equal, random_cloud
 import hsi_sc_nerf as hsn
 from hsi_sc_nerf.api.clouds import Cloud, read_cloud
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export import trial_reading
 
 
 @pytest.mark.slow
@@ -49,3 +52,28 @@ def test_a_table_of_something_else_names_the_file(tmp_path):
     xarray.Dataset({"a": ("point", np.zeros(3))}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
     with pytest.raises(InputError, match=r"other\.nc: the table has no reflectance"):
         read_cloud(tmp_path / "other.nc")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
+def test_a_file_that_cannot_be_read_to_its_end_is_one_sentence(tmp_path, monkeypatch):
+    """As some damaged ones; nothing ever writes to this pipe."""
+    pytest.importorskip("h5netcdf")
+    os.mkfifo(tmp_path / "cloud.nc")
+    monkeypatch.setattr(trial_reading, "_STARTS_S", 0.2)
+    with pytest.raises(InputError, match=r"cloud\.nc: [^\n]*no end"):
+        read_cloud(tmp_path / "cloud.nc")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cloud.nc", "cloud.zarr"])
+def test_a_cloud_that_claims_more_than_its_file_can_hold_is_refused(tmp_path, name):
+    path, shape, chunks = tmp_path / name, (10**10, 3), (1000, 3)
+    if name == "cloud.zarr":
+        group = pytest.importorskip("zarr").open_group(str(path), mode="w", zarr_format=3)
+        group.create_array("reflectance", shape=shape, chunks=chunks, dtype="<f4", dimension_names=("point", "band"))
+    else:
+        with pytest.importorskip("h5netcdf").File(path, "w") as file:
+            file.dimensions = {"point": shape[0], "band": shape[1]}
+            file.create_variable("reflectance", ("point", "band"), "<f4", chunks=chunks)
+    with pytest.raises(InputError, match=rf"{name}: [^\n]*claims 1200000000"):
+        read_cloud(path)

@@ -17,15 +17,50 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.packed.cube import FLAGGED
 
 
-@pytest.mark.parametrize(("views", "expected"), [([0], 0.0), ([0, 1], math.nan)])
-def test_spread_of_one_view_is_zero_and_nothing_else_is_touched(monkeypatch, views, expected):
-    found = {"sam": 0.1, "sam_std": math.nan}
-    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda *_: dict(found))
-    metrics = SpectralPipeline.get_average_image_metrics(
-        object.__new__(SpectralPipeline), views, "eval", get_std=True
-    )
-    assert metrics["sam"] == 0.1
-    assert metrics["sam_std"] == pytest.approx(expected, nan_ok=True)
+def view(pixels, valid=None):
+    shown = torch.zeros(2, 2, 1)
+    shown.view(-1)[:pixels] = 1.0
+    flags = {} if valid is None else {"valid": torch.full((2, 2, 3), valid)}
+    return None, {"mask": shown} | flags
+
+
+@pytest.fixture
+def average(monkeypatch):
+    """`get_average_image_metrics` of a pipeline in which nerfstudio's gives the number of views as ``sam``."""
+
+    def mean(self, views, *_):
+        seen = list(views)
+        return {"sam": float(len(seen)), "sam_std": math.nan if len(seen) == 1 else 0.5, "ssim": math.nan}
+
+    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", mean)
+
+    def averaged(views, test_mode="val"):
+        pipeline = object.__new__(SpectralPipeline)
+        torch.nn.Module.__init__(pipeline)
+        pipeline.test_mode = test_mode
+        return pipeline.get_average_image_metrics(views, "eval", get_std=True)
+
+    return averaged
+
+
+@pytest.mark.parametrize(("number", "std"), [(1, 0.0), (2, 0.5)])
+def test_spread_of_one_view_is_zero_and_what_has_no_value_is_left_out(average, capsys, number, std):
+    assert average([view(1)] * number) == {"sam": number, "sam_std": std}
+    assert capsys.readouterr().out == ""
+
+
+def test_views_that_show_nothing_that_was_measured_are_left_out_of_the_mean(average, capsys):
+    found = average([view(0), view(2), view(1, valid=False), view(4, valid=True), view(0, valid=True)])
+    assert found == {"sam": 2.0, "sam_std": 0.5}
+    assert "2 of 5 held-out views" in " ".join(capsys.readouterr().out.split())
+
+
+def test_no_view_to_judge_is_one_sentence_and_does_not_end_a_training(average, capsys):
+    views = [view(0), view(1, valid=False)]
+    assert average(views) == {}
+    assert "none of 2 held-out views" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: none of 2 held-out views [^\n]*\.$"):
+        average(views, test_mode="test")
 
 
 def pipeline_config(data):
@@ -89,15 +124,21 @@ def test_held_out_views_are_judged_by_their_measurements(pipeline):
 
 @pytest.mark.slow
 def test_a_view_without_its_object_is_not_judged(flagged_dataset, tmp_path):
-    """It would score as perfect."""
     data = shutil.copytree(flagged_dataset, tmp_path / "data")
     config = pipeline_config(data)
     config.datamanager.dataparser.train_split_fraction = 0.7
     held_out = config.setup(device="cpu").datamanager.eval_dataset.frames
     assert len(held_out) == 3
-    write_png(held_out[1].mask_path, np.zeros_like(held_out[1].mask(), np.uint8))
-    loader = config.setup(device="cpu").datamanager.fixed_indices_eval_dataloader
-    assert [batch["image_idx"] for _, batch in loader] == [0, 2]
+    for frame in held_out[:2]:
+        write_png(frame.mask_path, np.zeros_like(frame.mask(), np.uint8))
+    pipeline = config.setup(device="cpu")
+    _, alone = list(pipeline.datamanager.fixed_indices_eval_dataloader)[2]
+    found = pipeline.get_average_eval_image_metrics(get_std=True)
+    pipeline.eval()
+    camera = pipeline.datamanager.eval_dataset.cameras[2:3]
+    expected, _ = pipeline.model.get_image_metrics_and_images(pipeline.model.get_outputs_for_camera(camera), alone)
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+    assert found["sam_std"] == 0.0
 
 
 @pytest.mark.slow

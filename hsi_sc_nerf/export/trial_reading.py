@@ -1,0 +1,76 @@
+"""NetCDF clouds of others are read in a process of their own first.
+
+Some damaged files keep HDF5, the library that reads them, busy for ever, or end its process, and nothing in that
+process can stop it. What a process of its own has read to the end can be read here.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import LARGEST_DEFLATION
+
+_STARTS_S = 20.0
+"""A process takes a second to start, and some more where the machine is busy."""
+_BYTES_PER_S = 5e6
+"""Slower than any disk that a cloud is worked on from."""
+_BLOCK_VALUES = 1 << 22
+
+
+def require_readable(path: Path) -> None:
+    """Refuse a NetCDF file that cannot be read to its end, or claims more than it can hold.
+
+    Raises:
+        InputError: it is such a file, or h5netcdf is not installed.
+    """
+    try:
+        limit_s = _STARTS_S + path.stat().st_size / _BYTES_PER_S
+        words = [sys.executable, "-m", __name__, str(path)]
+        tried = subprocess.run(
+            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", timeout=limit_s
+        )
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file.") from error
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"{path}: is damaged, so that reading it came to no end in {limit_s:.0f} s; write it again."
+        ) from error
+    if tried.returncode != 0:
+        reason = (tried.stderr.strip().splitlines() or [f"HDF5 ended with status {tried.returncode}"])[-1]
+        raise InputError(
+            f"{path}: cannot be read ({reason}); check the file, and run `pip install 'hsi-sc-nerf[formats]'`."
+        )
+
+
+def require_room(claimed_bytes: int, stored_bytes: int) -> None:
+    """Refuse a table that claims more than was stored of it, however well it is compressed.
+
+    Raises:
+        InputError: it does.
+    """
+    if claimed_bytes > LARGEST_DEFLATION * stored_bytes:
+        raise InputError(f"it claims {claimed_bytes} bytes and has {stored_bytes}; write it again.")
+
+
+def _read(path: Path) -> None:
+    """Read all that a NetCDF file holds, a block at a time."""
+    import h5netcdf
+
+    with h5netcdf.File(path, "r") as file:
+        dict(file.attrs)
+        variables = list(file.variables.values())
+        claimed = sum(math.prod(variable.shape) * variable.dtype.itemsize for variable in variables)
+        require_room(claimed, path.stat().st_size)
+        for variable in variables:
+            dict(variable.attrs)
+            rows = max(1, _BLOCK_VALUES // max(1, math.prod(variable.shape[1:])))
+            for start in range(0, variable.shape[0] if variable.shape else 1, rows):
+                variable[start : start + rows] if variable.shape else variable[...]
+
+
+if __name__ == "__main__":
+    _read(Path(sys.argv[1]))
