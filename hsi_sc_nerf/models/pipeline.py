@@ -127,6 +127,6 @@ class _JudgedViews:
             return ""
         which = "none" if self.judged == 0 else f"{self.judged}"
         return (
-            f"{which} of {self._seen} held-out views show anything of the object that was measured, and the others have "
-            "no score; look at their masks in the dataset's report/."
+            f"{which} of {self._seen} held-out views show anything of the object that was measured, and the others "
+            "have no score; look at their masks in the dataset's report/."
         )

@@ -75,7 +75,10 @@ def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping
     """
     columns = {key: column for key, column in _COLUMNS.items() if key in rows[0]}
     # JSON has no word for the score of a frame that shows nothing of the object.
-    rows = [{key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()} for row in rows]
+    rows = [
+        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+        for row in rows
+    ]
     cells = [
         [row["view"], *("-" if row[key] is None else shown(row[key]) for key, (_, shown) in columns.items())]
         for row in rows
