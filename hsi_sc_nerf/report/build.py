@@ -27,7 +27,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     poses_section,
 )
 from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
-from hsi_sc_nerf.report.page import CloudViewer, Section, Table, html_page, read_known
+from hsi_sc_nerf.report.page import Block, CloudViewer, Section, Table, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
     comparison_section,
@@ -137,7 +137,7 @@ def object_section(
         f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
     payload = cloud_payload(shown, spectra, indices, calibrations)
-    blocks = [CloudViewer(payload, caption), *_class_tables(payload["classifiers"])]
+    blocks: list[Block] = [CloudViewer(payload, caption), *_class_tables(payload["classifiers"])]
     return Section("object", "The object", blocks, judge_cloud(cloud))
 
 
