@@ -203,7 +203,9 @@ def judge_bands(
     wavelengths_nm: Float[np.ndarray, "bands"],
     noise: Float[np.ndarray, "bands"] | None = None,
 ) -> list[Finding]:
-    """The band with the largest error, without the noise of the measurement where that is known."""
+    """The band with the largest error, without the noise of the measurement where that is known, if there is any."""
+    if np.isnan(rmse).all():
+        return []
     beyond = rmse if noise is None else np.sqrt(np.maximum(rmse**2 - noise**2, 0.0))
     worst = int(np.nanargmax(beyond))
     sentence = (
