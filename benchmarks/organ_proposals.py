@@ -68,7 +68,7 @@ class Case:
     """A cloud, the surface that it is of, and the materials of the parts that should be proposed."""
 
     cloud: SpectralCloud
-    true: TrueSurface
+    true: TrueObject
     organs: dict[str, str]
 
 
@@ -138,7 +138,7 @@ def _trained(folder: Path) -> Case:
     paths = (folder / "export" / "point_cloud.ply", folder / "point_cloud.ply")
     cloud = points_of_page(read_spectral_ply(next((path for path in paths if path.is_file()), paths[0])))
     truth = load_truth(folder / "session")
-    true, organs = TrueSurface.of(truth), TRAINED | ({STEM: STEMS[truth.object]} if truth.object in STEMS else {})
+    true, organs = TrueObject.of(truth), TRAINED | ({STEM: STEMS[truth.object]} if truth.object in STEMS else {})
     counts = dict(zip(true.materials, (true.nearest(cloud.points.astype(float))[1] > 0.5).sum(axis=0), strict=True))
     return Case(cloud, true, {name: one for name, one in organs.items() if counts.get(one, 0) >= LEAST_POINTS})
 
